@@ -101,10 +101,16 @@ class Policy:
 
     def after(self, steps: int) -> Policy:
         """Return the policy without its first steps."""
-        gain = None if self.gain is None else self.gain[steps:]
-        reference = None if self.reference is None else self.reference[steps:]
-        left = self.feedforward[steps:]
-        return replace(self, feedforward=left, gain=gain, reference=reference)
+        return self._of_steps(slice(steps, None))
+
+    def until(self, steps: int) -> Policy:
+        """Return the policy's first steps."""
+        return self._of_steps(slice(steps))
+
+    def _of_steps(self, steps: slice) -> Policy:
+        gain = None if self.gain is None else self.gain[steps]
+        reference = None if self.reference is None else self.reference[steps]
+        return replace(self, feedforward=self.feedforward[steps], gain=gain, reference=reference)
 
     @property
     def z_names(self) -> tuple[str, ...]:
@@ -189,32 +195,48 @@ class Policy:
         if self.gain is None or self.reference is None:
             return np.clip(asked, self.low, self.high)
         off = z_difference(states, self.reference[:T, :n], self.angles)
-        asked += np.einsum("tij,btj->bti", self.gain[:T, :, :n], off)
-        memory, newest = self.gain[:T, :, n:], np.cumsum([0, *self.depths[:-1]])
+        by_step = np.matmul(off.swapaxes(0, 1), self.gain[:T, :, :n].swapaxes(1, 2))
+        asked += by_step.swapaxes(0, 1)
+        memory, oldest = self.gain[:T, :, n:], max(self.depths)
         if not memory.any():
             return np.clip(asked, self.low, self.high)
         asked -= np.einsum("tij,tj->ti", memory, self.reference[:T, n:])
+        places = [(j, oldest - i) for j, d in enumerate(self.depths) for i in range(1, d + 1)]
         if sent is not None:
-            oldest = max(self.depths)
             held = np.broadcast_to(past, (len(sent), oldest, len(past)))
             held = np.concatenate([held, sent], axis=1)
-            places = [(j, oldest - i) for j, d in enumerate(self.depths) for i in range(1, d + 1)]
+            added = np.zeros((len(sent), T, len(past)))
             for k, (j, start) in enumerate(places):
-                asked += memory[:, :, k] * held[:, start : start + T, j, None]
-            return np.clip(asked, self.low, self.high)
-        z = np.repeat(np.repeat(past, self.depths)[None], len(states), 0)
-        low, high, together = self.low, self.high, z.shape[1] == len(past)  # one past value each
-        by_step = np.ascontiguousarray(asked.swapaxes(0, 1))
-        for now, gain in zip(by_step, memory.swapaxes(1, 2), strict=True):
-            now += z @ gain
-            np.maximum(now, low, out=now)  # clip takes twice as long
-            np.minimum(now, high, out=now)
-            if together:
-                z = now
-            else:
-                z[:, 1:] = z[:, :-1].copy()
-                z[:, newest] = now
-        return np.ascontiguousarray(by_step.swapaxes(0, 1))
+                added += memory[:, :, k] * held[:, start : start + T, j, None]
+            return np.clip(asked + added, self.low, self.high)
+        return self._on_own(asked, past, memory, places)
+
+    def _on_own(
+        self, asked: Array, past: Array, memory: Array, places: list[tuple[int, int]]
+    ) -> Array:
+        """Add the feedback from the policy's own past commands (B, T, m), step by step, and clip.
+
+        Args:
+            asked: (B, T, m) the commands without it.
+            past: (m,) the input held before the first step.
+            memory: (T, m, sum(depths)) gains on past inputs.
+            places: for each of these gains, its input, and its row among the last commands.
+        """
+        B, T, m = asked.shape
+        oldest = max(self.depths)
+        gains = np.zeros((T, m, oldest * m))  # on the last commands as they lie in `sent`
+        gains[:, :, [row * m + j for j, row in places]] = memory
+        sent = np.empty((oldest + T, m, B))
+        sent[:oldest] = past[:, None]
+        last = sent.reshape((oldest + T) * m, B)
+        low, high = (np.repeat(limit[:, None], B, 1) for limit in (self.low, self.high))
+        without, now = np.ascontiguousarray(asked.transpose(1, 2, 0)), np.empty((m, B))
+        for t in range(T):  # clip takes twice as long as minimum and maximum
+            np.dot(gains[t], last[t * m : (t + oldest) * m], out=now)  # less overhead than matmul
+            now += without[t]
+            np.maximum(now, low, out=now)
+            np.minimum(now, high, out=sent[oldest + t])
+        return np.ascontiguousarray(sent[oldest:].transpose(2, 0, 1))
 
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:

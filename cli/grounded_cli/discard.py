@@ -55,4 +55,5 @@ def _tell(done: SetAside, json_: bool) -> None:
             show(f"{name} was not set aside; nothing was changed")
     for name, why in done.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
-    show(f"\n{next_line(done.then)}")
+    show(f"\nrun {done.run}, record a log, then" if done.run else "")
+    show(next_line(done.then))

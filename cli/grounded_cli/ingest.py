@@ -122,12 +122,14 @@ def _best(workspace: Workspace, one: Ingested) -> Tried | None:
 
 
 def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
+    if one.known:
+        sentence(f"{name} was stored before as {one.trial}: nothing is new. Its result again:")
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     for note in one.notes:
         remark("note", f"{name}: {note}")
-    known = "was stored before as" if one.known else "is stored as"
-    sentence(f"{name} {known} {one.trial}")
+    if not one.known:
+        sentence(f"{name} is stored as {one.trial}")
     if not one.candidate:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:

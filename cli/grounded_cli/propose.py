@@ -80,7 +80,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", _predicted(proposed), "  "))
     if candidate.sample_age:
-        show(field("samples", _samples(candidate), "  "))
+        show(field("samples", _samples(candidate, standing, workspace.task), "  "))
     if standing.incumbent is not None:
         from grounded_trials.workspace.identity import estimated_in
 
@@ -108,14 +108,17 @@ def _predicted(proposed: Proposed) -> str:
     return f"{text}; off target: {errors}" if errors else text
 
 
-def _samples(candidate: Candidate) -> str:
+def _samples(candidate: Candidate, standing: Standing, task: Task) -> str:
     """Return how old the samples are that the robot acts on."""
-    late, age = candidate.sample_age > 0, with_unit(f"{1e3 * abs(candidate.sample_age):.2g}", "ms")
-    return (
-        f"the commands of {candidate.base} fit samples {age} {'older' if late else 'newer'} than "
-        f"its log has at that time (stamps may tell less: what passes before a stamp or after a "
-        f"command is not in them); {candidate.id} allows for it"
-    )
+    from grounded.search.feedback.sample_age import different, run_ages
+
+    ages = run_ages(task, standing.history)
+    span = f"{1e3 * min(ages, default=0):.2g} to {1e3 * max(ages, default=0):.2g} ms"
+    old = with_unit(f"{1e3 * abs(candidate.sample_age):.2g}", "ms")
+    old += " old" if candidate.sample_age > 0 else " newer than in its log"
+    if ages and different(task, min(ages), max(ages)):
+        return f"{candidate.id} is planned for samples {old}; in the runs so far: {span}"
+    return f"{candidate.base} acted on samples {old}; {candidate.id} is planned for that"
 
 
 def _otherwise(candidate: Candidate, best: Tried) -> bool:

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from grounded.search.candidate import Tried
-from grounded_cli.propose import _came_true, _what
+from grounded_cli.propose import _came_true, _samples, _what
 
 
 def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
@@ -30,3 +30,23 @@ def test_gentler_gains_promise_no_gain_and_steps_from_them_say_why_they_are_gent
     task = SimpleNamespace(horizon=100, dt=0.01)
     for step.caution, told in ((0.0, False), (0.4, True)):
         assert ("as low as ran without oscillating" in _what(step, None, task)) == told
+
+
+def test_how_old_samples_are_is_one_short_sentence(monkeypatch):
+    """Its four clauses took four readings, and one candidate's age was not that of the next run."""
+    made = SimpleNamespace(id="c0003", base="c0002", sample_age=0.0093)
+    now, task = SimpleNamespace(history=()), SimpleNamespace(dt=0.02)
+    ages = list[float]()
+    monkeypatch.setattr(
+        "grounded.search.feedback.sample_age.run_ages", lambda task, history: [*ages]
+    )
+    said = "c0002 acted on samples 9.3 ms old; c0003 is planned for that"
+    assert _samples(made, now, task) == said
+    ages += [0.0093, 0.0085]
+    assert _samples(made, now, task) == said
+    ages += [0.0027]
+    assert _samples(made, now, task) == (
+        "c0003 is planned for samples 9.3 ms old; in the runs so far: 2.7 to 9.3 ms"
+    )
+    made.sample_age, ages[:] = -0.004, []
+    assert "4 ms newer than in its log" in _samples(made, now, task)

@@ -362,3 +362,22 @@ def test_the_robot_needs_numpy_alone(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("depths", [(1, 1), (1, 2), (3, 1)])
+@pytest.mark.parametrize("limit", [50.0, 0.8])
+def test_commands_on_its_own_past_ones_are_those_of_the_law_step_by_step(depths, limit):
+    H, rng = 10, np.random.default_rng(1)
+    one = policy(H, depths=depths, low=np.full(2, -limit), high=np.full(2, limit))
+    states = rng.normal(size=(4, H, 2))
+    found = one.commands(states, one.past)
+    for run, expected in zip(states, found, strict=True):
+        sent = [one.past] * max(depths)
+        for t in range(H):
+            z = [*run[t], *(sent[-1 - i][j] for j in (0, 1) for i in range(depths[j]))]
+            off = z_difference(np.array(z), one.reference[t], one.angles)
+            sent.append(np.clip(one.feedforward[t] + one.gain[t] @ off, one.low, one.high))
+        np.testing.assert_allclose(expected, sent[max(depths) :], rtol=1e-9)
+    first = one.until(4)
+    np.testing.assert_array_equal(first.commands(states[:, :4], one.past), found[:, :4])
+    assert first.after(1).horizon == 3

@@ -25,11 +25,13 @@ def record(
     late=0,
     noise=(0.002, 0.01),
     differs=0,
+    turned=False,
 ):
     """Run a policy on the model against a load, and log everything as a table.
 
     `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
-    `differs`: rows over which the program differentiates x, in place of the speed.
+    `differs`: rows over which the program differentiates x, in place of the speed. `turned`: the
+    motor is wired the wrong way round.
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -51,7 +53,7 @@ def record(
         if k < begin:
             force = jog * np.sin(k / rate * 4) if k < 0.4 * begin else 0.0
         rows.append([1000 + k / rate, *felt, force])
-        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
+        push = (-0.7 if turned else 0.7) * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
         z = model.system.step(z[None], np.array([[push]]), model.values, 1 / rate)[0]
     np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
     return path

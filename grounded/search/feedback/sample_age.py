@@ -13,6 +13,9 @@ So a policy pi is taken to see x - age dx/dt. The age is that of the incumbent's
 to first order, from the commands and states in its logs. Predicted runs see the states so late
 (`Problem.age`), and the reference of a new policy is late by as much, so that it runs on the robot
 as planned. Logs of what the policy itself saw (all simulated ones) give an age of 0.
+
+A timer that starts at random against the sensor's gives each run another age. The incumbent's is
+then one draw, and a plan for it is off by as much as the next run's differs: plan for the mean.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.candidate import Candidate
+from grounded.search.candidate import Candidate, Tried
 from grounded.solve.bias import WINDOW, hann_smoothed
 from grounded.task import Task
 from grounded.trial import Trial
@@ -30,6 +33,8 @@ from grounded.trial import Trial
 PROBED = 0.1  # age for the derivative of the commands, in steps
 OLDEST = 2.0  # largest age, in steps; a program that acts on older samples needs another remedy
 CLEAR = 0.25  # smallest share of the squares of the commands' differences that an age explains
+# ages differ if by more than both, in s and in steps: less costs little, and noise gives it too
+DIFFERENT_S, DIFFERENT = 3e-3, 0.1
 NOTHING = 1e-6  # rms difference of commands, relative to their size, that is rounding
 
 
@@ -66,6 +71,35 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
     age = float(np.vdot(g, e)) / steep
     clear = explains > CLEAR * squares and abs(age) <= OLDEST * task.dt
     return age if clear else 0.0
+
+
+def planned_age(task: Task, incumbent: Tried, history: Sequence[Tried]) -> float:
+    """Return the age of samples to plan for [s]: that of the incumbent's runs, or of all runs.
+
+    Args:
+        task: the manoeuvre.
+        incumbent: the best candidate, with its trials.
+        history: all candidates with their trials.
+    """
+    ages = run_ages(task, history)
+    if ages and different(task, min(ages), max(ages)):
+        return float(np.mean(ages))
+    return sample_age(task, incumbent.candidate, incumbent.trials)
+
+
+def run_ages(task: Task, history: Sequence[Tried]) -> list[float]:
+    """Return the age of the samples in each whole run of a policy with feedback [s]."""
+    return [
+        sample_age(task, one.candidate, [trial])
+        for one in history
+        for trial in one.trials
+        if one.candidate.policy.gain is not None and trial.finite_steps >= task.horizon
+    ]
+
+
+def different(task: Task, age: float, other: float) -> bool:
+    """Return whether two ages [s] differ by so much that it matters."""
+    return abs(age - other) > max(DIFFERENT_S, DIFFERENT * task.dt)
 
 
 def rates(task: Task, trial: Trial) -> Array:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -128,9 +127,10 @@ def _any_factor(
     best, found, policy = min(most, CLOSE), (tuple[str, ...](), 1.0), own.policy
     trial = trial.until(min(trial.finite_steps, policy.horizon))
     least = (FAR if plain.alike else ONE) if least is None else least
-    for names in _scaled_together(model):
-        for start in (1.0, -1.0):
-            by = _factor(policy, trial, names, start)
+    groups = list(_scaled_together(model))
+    factors = [_factors(policy, trial, groups, start) for start in (1.0, -1.0)]
+    for names, *each in zip(groups, *factors, strict=True):
+        for by in each:
             if not 1 / LARGEST < abs(by) < LARGEST or abs(by - 1) < least:
                 continue
             fit = follows(policy, mended := multiplied(trial, names, by), late)
@@ -156,8 +156,7 @@ def any_offset(
     trial = trial.until(min(trial.finite_steps, task.horizon, policy.horizon))
     most = ALL if plain.alike else LEAVES
     best, found = min(most * _left(plain), CLOSE), None
-    for name in names:
-        by = _solved(partial(_off_from, policy, trial, name), 0.0, 1e-4)
+    for name, by in zip(names, _offsets(policy, trial, names), strict=True):
         if not np.isfinite(by):
             continue
         fit = follows(policy, mended := _less(trial, name, by), late)
@@ -198,39 +197,74 @@ def _of_one_unit(model: Model) -> list[tuple[str, ...]]:
     return [tuple(n for n, own in model.inputs.items() if own == unit) for unit in every]
 
 
-def _factor(policy: Policy, trial: Trial, names: Sequence[str], start: float) -> float:
-    """Return the factor of columns with which the policy sends the logged commands best."""
-    return _solved(lambda by: _off(policy, multiplied(trial, names, by)), start, 1e-4 * start)
+def _factors(
+    policy: Policy, trial: Trial, groups: Sequence[Sequence[str]], start: float
+) -> list[float]:
+    """Return for each group of columns the factor with which the policy sends the commands best."""
+    states, inputs = (
+        np.array([[name in names for name in every] for names in groups])[:, None]
+        for every in (trial.state_names, trial.input_names)
+    )
+
+    def off(which: Array, by: Array) -> Array:
+        factor = by[:, None, None]
+        scaled = trial.states * np.where(states[which], factor, 1.0)
+        return _off(policy, trial, scaled, trial.inputs * np.where(inputs[which], factor, 1.0))
+
+    return _solved(off, np.full(len(groups), start), 1e-4 * start)
 
 
-def _solved(off: Callable[[float], Array], start: float, small: float) -> float:
-    """Minimise residuals over one number by Gauss-Newton; return NaN if they don't depend on it."""
-    by = start
+def _offsets(policy: Policy, trial: Trial, names: Sequence[str]) -> list[float]:
+    """Return for each state the offset without which the policy sends the commands best."""
+    columns = np.array([[name == one for one in trial.state_names] for name in names])
+
+    def off(which: Array, by: Array) -> Array:
+        shifted = trial.states - by[:, None, None] * columns[which][:, None]
+        return _off(policy, trial, shifted, trial.inputs[None])
+
+    return _solved(off, np.zeros(len(names)), 1e-4)
+
+
+def _solved(off: Callable[[Array, Array], Array], start: Array, small: float) -> list[float]:
+    """Minimise the residuals of B problems, over one number each, by Gauss-Newton.
+
+    Args:
+        off: returns the residuals (B, T, m) of the problems with given indices, at given numbers.
+        start: (B,) where to start.
+        small: the step of the finite differences.
+
+    Returns:
+        The numbers; NaN where the residuals don't depend on it.
+    """
+    by, left = np.array(start), np.arange(len(start))
     for _ in range(ROUNDS):
-        here, near = off(by), off(by + small)
-        slope = (near - here) / small
-        size = float((slope**2).sum())
-        if size <= 0:
-            return np.nan
-        step = -float((slope * here).sum()) / size
-        by += step
-        if not np.isfinite(by) or abs(step) < 1e-6 * abs(by):
+        if not len(left):
             break
-    return by
+        both = off(np.tile(left, 2), np.concatenate([by[left], by[left] + small]))
+        here = both[: len(left)]
+        slope = (both[len(left) :] - here) / small
+        size = (slope**2).sum(axis=(1, 2))
+        step = -(slope * here).sum(axis=(1, 2)) / np.where(size > 0, size, np.nan)
+        by[left] += step
+        left = left[np.isfinite(by[left]) & ~(np.abs(step) < 1e-6 * np.abs(by[left]))]
+    return [float(one) for one in by]
 
 
-def _off(policy: Policy, trial: Trial) -> Array:
-    """Return the logged commands minus the policy's, in units of the largest, (T, m)."""
+def _off(policy: Policy, trial: Trial, states: Array, inputs: Array) -> Array:
+    """Return the logged commands minus the policy's, in units of the largest, (B, T, m).
+
+    Args:
+        policy: the policy.
+        trial: the trial, for the inputs held before it.
+        states: (B, T, n) its states, as they are assumed to have been.
+        inputs: (B or 1, T, m) its inputs likewise.
+    """
     past = policy.past if trial.start_inputs is None else trial.start_inputs
-    asked = policy.commands(trial.states[None, : trial.steps], past)[0]
-    off: Array = (np.clip(trial.inputs, policy.low, policy.high) - asked) / np.maximum(
-        np.abs(asked).max(axis=0), 1e-12
+    asked = policy.commands(states[:, : trial.steps], past)
+    off: Array = (np.clip(inputs, policy.low, policy.high) - asked) / np.maximum(
+        np.abs(asked).max(axis=1, keepdims=True), 1e-12
     )
     return off
-
-
-def _off_from(policy: Policy, trial: Trial, name: str, zero: float) -> Array:
-    return _off(policy, _less(trial, name, zero))
 
 
 def _less(trial: Trial, name: str, constant: float) -> Trial:

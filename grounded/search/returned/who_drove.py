@@ -73,8 +73,10 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         return None
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
-    states = np.stack([_earlier(trial.states[:T], back, policy.angles) for back in BACK])
-    free = policy.commands(states, policy.past if past is None else past)
+    earlier = [_earlier(trial.states[:T], back, policy.angles) for back in BACK]
+    states = np.stack([*earlier, _noisy(policy, trial.states[:T])])
+    *_, with_noise = asked = policy.commands(states, policy.past if past is None else past)
+    free = asked[:-1]
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
     fits = {}
@@ -94,7 +96,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     within = free[near, start : start + len(sent)]
     off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
-    noise = _noise_sent(policy, trial.states[:T], free[0])  # at samples, where it is largest
+    noise = (with_noise - free[0]) ** 2  # at samples, where it is largest
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // LEAST)))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
@@ -261,13 +263,12 @@ def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
     return earlier
 
 
-def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
-    """Return the squared effect of the states' noise on the commands, (T, m), by adding noise."""
+def _noisy(policy: Policy, states: Array) -> Array:
+    """Return the states with once more the noise that they seem to have, (T, n)."""
     change = second_differences(states, policy.angles)
     power = (change**2).mean(axis=0) / 6  # of white noise
-    noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
-    squares: Array = (policy.commands(noisy[None], policy.past)[0] - asked) ** 2
-    return squares
+    noise = np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
+    return np.asarray(states + noise)
 
 
 def second_differences(states: Array, angles: Sequence[bool] | Array) -> Array:

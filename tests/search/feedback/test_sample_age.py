@@ -7,7 +7,8 @@ import pytest
 
 from grounded.policy import z_difference
 from grounded.rollout import for_late_samples, simulate
-from grounded.search.feedback.sample_age import sample_age
+from grounded.search.candidate import Tried
+from grounded.search.feedback.sample_age import different, planned_age, run_ages, sample_age
 from grounded.search.improve import propose
 from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
@@ -84,3 +85,21 @@ def test_a_policy_for_late_samples_runs_as_planned():
     again = simulate(late, for_late_samples(planned, late))
     np.testing.assert_allclose(again.states, fresh.states, atol=1e-6)
     assert np.abs(simulate(late, planned).states - fresh.states).max() > 0.01
+
+
+def test_a_plan_is_for_the_mean_age_if_it_differs_from_run_to_run():
+    """A timer's phase was drawn anew each time: each plan was for the age of one run, and lost."""
+    task = rover_task()
+    made = first(task)
+
+    def tried(*ages):
+        trials = tuple(driven(task, made, age) for age in ages)
+        return Tried(made, trials, tuple(task.utility(one) for one in trials), accepted=True)
+
+    steady, other = tried(0.014, 0.016), tried(0.002)
+    alone = sample_age(task, made, steady.trials)
+    assert planned_age(task, steady, [steady]) == alone
+    ages = run_ages(task, [steady, other])
+    assert ages == pytest.approx([0.014, 0.016, 0.002], abs=0.003)
+    assert planned_age(task, steady, [steady, other]) == pytest.approx(np.mean(ages))
+    assert not different(task, 0.010, 0.0145) and different(task, 0.010, 0.016)  # dt is 50 ms

@@ -101,6 +101,7 @@ class _Walk:
         self.defined: dict[tuple[type, int], Schema | Channel] = {}
         self.small: list[bytes] = []  # the contents of small chunks, and the messages in them
         self.small_size, self.positions = 0, list[int]()
+        self.messages = False  # a message, or a chunk of them, has begun
 
     @property
     def offset(self) -> int:
@@ -108,6 +109,14 @@ class _Walk:
 
     def damaged(self, found: str, offset: int | None = None) -> DamagedFile:
         return DamagedFile(self.name, self.offset if offset is None else offset, found)
+
+    def cut_off(self, what: str) -> DamagedFile:
+        """Return the error for a file that ends too early: there is nothing to save before data."""
+        if self.messages:
+            return self.damaged(f"the file ends inside {what}", self.size)
+        found = f"it holds no message: the file ends inside {what}"
+        advice = "did the recorder, or the program that it recorded, stop at once? Record again"
+        return DamagedFile(self.name, self.size, found, advice)
 
     def fold(self) -> int:
         """Return the CRC of everything used so far."""
@@ -120,7 +129,7 @@ class _Walk:
         if len(self.buffer) - self.pos >= count:
             return
         if self.offset + count > self.size:
-            raise self.damaged(f"the file ends inside {what}", self.size)
+            raise self.cut_off(what)
         self.fold()
         self.base += self.pos
         parts = [self.buffer[self.pos :]]
@@ -129,7 +138,7 @@ class _Walk:
         while have < count:
             block = self.stream.read(max(BLOCK, count - have))
             if not block:
-                raise self.damaged(f"the file ends inside {what}", self.size)
+                raise self.cut_off(what)
             parts.append(block)
             have += len(block)
         self.buffer, self.pos, self.crc_pos = b"".join(parts), 0, 0
@@ -140,6 +149,7 @@ class _Walk:
             step()
             self.need(9, "a record's head; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
+            self.messages |= opcode in (CHUNK, MESSAGE)
             self.need(9 + self._allowed(length), _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:
                 if opcode != CHUNK:

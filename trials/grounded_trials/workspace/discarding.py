@@ -32,6 +32,7 @@ class SetAside(Result):
     discarded: dict[str, str]  # t0004 -> why
     unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
     then: NextCommand = STATUS
+    run: str = ""  # the candidate to run before `then`, "" if that is not for its log
 
     def summary(self) -> str:
         """Return all trials that are set aside."""
@@ -69,7 +70,8 @@ def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
     done = set_aside(workspace, "discard", trials, why)
     with suppress(GroundedError):  # of files that are damaged: `status` names them
         if then := _instead(workspace, done.trials[-1]):
-            return replace(done, then=then)
+            waits = standing_in(workspace).outstanding if then.verb == "next" else None
+            return replace(done, then=then, run=waits.id if waits else "")
     return done
 
 

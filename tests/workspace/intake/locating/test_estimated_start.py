@@ -8,7 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from facts import holds
 from grounded.errors import GroundedError
+from grounded_trials.workspace.intake.locating.missed_steps import _waits
+from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from recorded import LOGGED, RATE, record, waiting
 
 ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
@@ -109,3 +112,31 @@ def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path)
     why = r"Perhaps v, which \[estimate\] finds here, is not what"
     with pytest.raises(GroundedError, match=why):
         w.ingest(path)
+
+
+@pytest.mark.parametrize("after", [0.0, 1.0])
+def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after):
+    """A ball ran off its beam: "its first row is 1.46 s after c0003 began", in a log from before.
+
+    `next` asked for the same command again, and --candidate let the candidate count as failed.
+    """
+    policy = blind.candidate("c0002")[0].policy
+    wild = replace(policy, gain=40 * policy.gain)  # the commands don't tell where the run begins
+    path = record(blind, tmp_path / "a.csv", wild, 0.5, turned=True, after=after)
+    with pytest.raises(GroundedError, match="force acted the other way round") as error:
+        blind.ingest(path)
+    assert holds(str(error.value), "run c0002 again", "scale = -1 in [log.input.force]")
+    assert (error.value.then.verb, error.value.then.arguments) == ("export", ("c0002", "--runner"))
+    forced = blind.ingest(path, candidate="c0002")
+    assert any("force acted the other way round" in one for one in forced.warnings)
+    assert not any("after c0002 began" in one for one in forced.warnings)
+    assert (forced.then.verb, forced.then.arguments) == ("discard", (forced.trial,))
+
+
+def test_a_log_that_begins_at_rest_does_not_begin_after_the_run(blind, tmp_path):
+    path = record(blind, tmp_path / "a.csv", blind.candidate("c0002")[0].policy, 0.5)
+    log = read_foreign(blind, path, mapping_of(blind, path)).recording
+    assert _waits(log)
+    cut = np.loadtxt(path, delimiter=",", skiprows=1)[60:]  # 0.1 s after it began
+    np.savetxt(path, cut, "%.5f", ",", header="t,x,v,force", comments="")
+    assert not _waits(read_foreign(blind, path, mapping_of(blind, path)).recording)

@@ -690,3 +690,36 @@ def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w,
     (note,) = [one for one in found.notes if "begins" in one]
     assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - before) < 1.5 / RATE
     assert not any("seem to be" in one for one in found.warnings)
+
+
+def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
+    """`run c0003 again`, said `propose`, and then: `none is waiting: name it with --candidate`."""
+    w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
+    now = w.status()
+    best = now.standing.incumbent.candidate.id
+    other = {"c0001": "c0002", "c0002": "c0001"}[best]
+    assert now.standing.outstanding is None
+    log = record(w, tmp_path / "b.csv", w.candidate(best)[0].policy, 0.5, seed=3)
+    done = w.ingest(log)
+    assert done.candidate == best and len(w.trials()) == 3
+    assert holds(done.notes[0], "no candidate is waiting", best, "another run")
+    log = record(w, tmp_path / "c.csv", w.candidate(other)[0].policy, 0.5, seed=4)
+    with pytest.raises(GroundedError, match="none is waiting") as error:
+        w.ingest(log)
+    assert error.value.then == NextCommand("ingest", (str(log), "--candidate", other))
+    assert len(w.trials()) == 3
+
+
+def test_a_stored_log_says_so_first_and_a_discard_what_to_run(w, tmp_path, monkeypatch):
+    """An old log's result looked new; after `discard`, one had to remember which file to run."""
+    monkeypatch.chdir(w.folder)
+    toml = w.folder / "grounded.toml"
+    toml.write_text(re.sub(r"\[system\]\n(?:\w.*\n)*", "", toml.read_text()))
+    log = record(w, w.folder / "a.csv", w.candidate("c0002")[0].policy, 0.5)
+    assert grounded("ingest", log.name).out.startswith("a.csv is stored as t0002")
+    before = "a.csv was stored before as t0002: nothing is new. Its result again:"
+    again = grounded("ingest", log.name).out
+    assert again.startswith(before) and "is stored as" not in again
+    assert grounded("export", "c0002", "--runner").code == 0
+    done = grounded("discard", "t0002").out
+    assert done.endswith("\nrun c0002, record a log, then\nnext: grounded next LOG\n")

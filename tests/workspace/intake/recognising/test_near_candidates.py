@@ -12,6 +12,7 @@ import pytest
 
 from facts import holds
 from grounded.errors import GroundedError
+from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.who_drove import evidence, follows, suspicion
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
@@ -215,6 +216,11 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     assert not old_samples(w, made, replace(run, states=near), np.zeros(2))
     far = near + 10.0
     assert not old_samples(w, made, replace(run, states=far), old)
+    aged = sample_age(w.task, made, [run])
+    assert not old_samples(w, replace(made, sample_age=aged + 0.004), run, old)
+    (note,) = old_samples(w, replace(made, sample_age=aged - 0.012), run, old)
+    planned = f"planned for {1e3 * aged - 12:.2g} ms"
+    assert holds(note, f"{1e3 * aged:.2g} ms old", planned, "timer", "from run to run")
 
 
 @pytest.mark.parametrize("late", ["v", "x+v"])

@@ -9,6 +9,7 @@ from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
+from grounded_trials.workspace.intake.locating.run_start import Recording
 from recorded import LOGGED, record, waiting
 
 
@@ -187,3 +188,26 @@ def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path
     said = str(refused(w, record(w, tmp_path / "a.csv", called_in_mm, 0.5)))
     assert holds(said, "c0002", "x and v", "`runner.action`", "in mm", "pass m and m/s")
     assert "somebody" not in said and "[log" not in said
+
+
+def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, tmp_path):
+    """A 22 s hand drive was refused after 3.5 minutes: each unit was searched as for a run."""
+    policy, count = w.candidate("c0002")[0].policy, list[str]()
+    hand = replace(policy, gain=None, reference=None, feedforward=_by_hand(policy))
+    log = record(w, tmp_path / "hand.csv", hand, 1.0)
+    thorough = Recording._by_its_samples
+
+    def counted(self, policy, strays):
+        count.append("thorough")
+        return thorough(self, policy, strays)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recording, "_by_its_samples", counted)
+        assert holds(str(refused(w, log)), "did not run c0002", "somebody, or another controller")
+    assert 1 <= len(count) <= len(w.candidate_ids()) + 1
+
+
+def _by_hand(policy):
+    """Commands that nobody planned, (H, m)."""
+    k = np.arange(policy.horizon)
+    return (4 * np.sin(k / 3) * np.sin(k / 11))[:, None]

@@ -41,7 +41,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     repeated,
     what_repeats,
 )
-from grounded_trials.workspace.intake.recognising.recognise import by_its_commands, recognised
+from grounded_trials.workspace.intake.recognising.recognise import best_run_again, recognised
 from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
 from grounded_trials.workspace.intake.remarks.control_loop import steps_skipped, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
@@ -125,7 +125,7 @@ def ingest_log(
         try:
             read = read_log_file(workspace, path, candidate, data)
         except NoneWaits as error:
-            raise by_its_commands(workspace, path, error) from None
+            read = best_run_again(workspace, path, error)
     read = copied(workspace, path, read, "" if data else candidate)
     read = recognised(workspace, path, read, candidate)
     if read.log and (other := estimated_otherwise(workspace, read.log)):
@@ -163,7 +163,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow) or (elsewhere is not None and elsewhere.again)
+    wrong = bool(slow) or read.aside or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 MOST = 5  # largest number of missed steps that is tried
 COARSE = 100  # steps of a run at which a log may begin, first tried
 ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
+WAITS = 3.5  # steps without a change of commands at the beginning of a log, before any run
 BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
 
 
@@ -84,7 +85,7 @@ def begins_late(log: Recording, policy: Policy) -> float:
         policy: the policy, for the states and inputs of the log.
     """
     trial = log.trial_from(log.first)
-    if trial is None:
+    if trial is None or _waits(log):
         return 0.0
     past = policy.past if trial.start_inputs is None else trial.start_inputs
     most = min(trial.finite_steps, policy.horizon)
@@ -101,6 +102,13 @@ def begins_late(log: Recording, policy: Policy) -> float:
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
     sure = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
     return best * policy.dt if sure else 0.0
+
+
+def _waits(log: Recording) -> bool:
+    """Return whether a log begins before any run: with the input held then, for some steps."""
+    changed = log.changes[log.changes > log.first].min(initial=np.inf)
+    held = bool((log.whole.inputs[0] == log.past).all())
+    return held and changed - log.first > WAITS * log.dt
 
 
 def not_sent(task: Task, ran: str, missed: int) -> str:

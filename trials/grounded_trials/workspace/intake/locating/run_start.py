@@ -51,6 +51,7 @@ QUIET_S = 1.0  # time without a change of commands before a run that is cut shor
 SHORT = 4  # at least 1 / SHORT of a run must be in the log
 EXACTLY = 0.02  # mean difference, relative to an input's size, below which commands are alike
 BATCH = 256  # instants compared at once
+UNRELATED = 0.3  # mean difference, relative to an input's size, above which commands aren't alike
 
 # adds the estimated states to the samples of a log
 Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
@@ -124,20 +125,23 @@ class Recording:
         held = np.diff(self.changes, prepend=-np.inf)
         return [float(at) for at in self.changes[held > HELD * self.dt]]
 
-    def start_of(self, policy: Policy) -> Start | None:
+    def start_of(self, policy: Policy, *, only_alike: bool = False) -> Start | None:
         """Find where a policy's run begins; return None if the log is too short.
 
         Args:
             policy: the policy, for the states and inputs of this log.
+            only_alike: look no further for a start from which only the first commands are alike,
+                which takes as long as all the rest.
         """
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        apart, until, strays = instants_apart(self.whole, self.parts, policy)
+        wanted = self._related(policy) if only_alike else None
+        apart, until, strays = instants_apart(self.whole, self.parts, policy, wanted)
         whole = self._starts(policy, apart)
         if (found := self._surest(policy, whole)) is None:
             begun = [one for one in self._starts(policy, until) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
-        if found is None or not found.alike:
+        if not only_alike and (found is None or not found.alike):
             found = self._by_its_samples(policy, strays) or found
         found = found and self._exactly(policy, found)
         first, _ = self._on_step(policy, self.first)
@@ -146,6 +150,13 @@ class Recording:
             return found
         apart_s = found.apart if found else np.inf
         return Start(first - missed * self.dt, apart_s, True, True, missed=missed)
+
+    def _related(self, policy: Policy) -> list[int]:
+        """Return the instants from which the first commands are not those of something else."""
+        least, count = least_of(policy.horizon), len(self.whole.inputs)
+        enough = [k for k in range(count) if k + self.parts * (least - 1) < count]
+        begun = _off(self.whole, self.parts, policy.until(least), enough)
+        return [int(k) for ks, off, _ in begun for k in ks[off.mean(axis=1) < UNRELATED]]
 
     def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
         """Choose among likely starts where most commands are the policy's; None if there is none.
@@ -260,17 +271,26 @@ class Recording:
         if abs(phase) < dt / 4:
             return start + phase, room
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return min(tried, key=lambda one: self._misfit(policy, one)), room
+        return tried[int(np.argmin(self._misfits(policy, tried)))], room
 
-    def _misfit(self, policy: Policy, start: float) -> float:
-        """Return the mean difference of the commands from a start on, in units of their size."""
-        trial = self.trial_from(start)
-        T = 0 if trial is None else min(trial.finite_steps, policy.horizon)
-        if trial is None or T < LEAST:
-            return np.inf
-        sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-        asked = policy.commands(trial.states[None, :T], policy.past)[0]
-        return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
+    def _misfits(self, policy: Policy, starts: Sequence[float]) -> list[float]:
+        """Return the mean difference of the commands from each start on, in units of their size."""
+        found = [self.trial_from(start) for start in starts]
+        trials = {k: one for k, one in enumerate(found) if one and one.finite_steps >= LEAST}
+        misfits = [np.inf] * len(found)
+        if not trials:
+            return misfits
+        lasting = {k: min(one.finite_steps, policy.horizon) for k, one in trials.items()}
+        every = np.zeros((len(trials), max(lasting.values()), len(policy.state_names)))
+        for states, (k, one) in zip(every, trials.items(), strict=True):
+            states[: lasting[k]] = one.states[: lasting[k]]
+        for asked, (k, one) in zip(
+            policy.commands(every, policy.past), trials.items(), strict=True
+        ):
+            sent = np.clip(one.inputs[: lasting[k]], policy.low, policy.high)
+            size = np.abs(sent).max(axis=0) + 1e-12
+            misfits[k] = float((np.abs(asked[: lasting[k]] - sent) / size).mean())
+        return misfits
 
     def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
         """Move a start back by less than a row, to where the feedback commands fit best.

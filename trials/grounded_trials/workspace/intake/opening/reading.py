@@ -54,6 +54,7 @@ class Read:
     copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
+    aside: bool = False  # to be set aside unless the user goes on: an input was reversed
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
     fell: bool = False  # it failed before the log ends, as a warning says

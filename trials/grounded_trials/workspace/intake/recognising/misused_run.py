@@ -25,7 +25,7 @@ from grounded_trials.workspace.intake.locating.run_start import BATCH, TRIED, Re
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
-MANY = 1_000_000  # largest number of commands that are computed for a misuse, roughly
+MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
 

@@ -180,7 +180,7 @@ def _exchange(
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
         if (mended := recording({**log.logged, **back}, task, log.complete)) is None:
             continue
-        begun = mended.start_of(policy)
+        begun = mended.start_of(policy, only_alike=True)
         run = mended.trial_from(begun.seconds) if begun and begun.alike else None
         fit = run and follows(policy, run.until(policy.horizon), 0)
         if not begun or not run or not fit or not fit.error < NEARLY:
@@ -214,7 +214,7 @@ def offset_in(log: Recording, task: Task, own: Candidate) -> tuple[str, float] |
 
 def _run_in(log: Recording | None, policy: Policy) -> Trial | None:
     """Return the run of a policy in a log, or None if there is none."""
-    found = log.start_of(policy) if log else None
+    found = log.start_of(policy, only_alike=True) if log else None
     return log.trial_from(found.seconds) if log and found and found.alike else None
 
 

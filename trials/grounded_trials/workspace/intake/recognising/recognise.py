@@ -64,18 +64,29 @@ NEAR = 0.05  # largest mean difference from the policy's commands, relative to a
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
-def by_its_commands(workspace: Folder, path: Path, error: NoneWaits) -> GroundedError:
-    """Return the error with the command that fits the log: the best, another candidate, or data."""
+def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
+    """Return a log as another run of the best candidate, if it clearly is one.
+
+    Raises:
+        GroundedError: `error` if it is not, with the command that fits the log: another candidate,
+            or data.
+    """
     if not error.best:
-        return error
+        raise error
     try:
         read = read_log_file(workspace, path, error.best, False)
-        recognised(workspace, path, read, None, remedies=False)
-    except OfEarlierTask as refused:
-        return refused
+        seen = recognised(workspace, path, read, None, remedies=False)
+    except OfEarlierTask:
+        raise
     except GroundedError as refused:
-        return GroundedError(str(error), refused.then)
-    return error
+        raise GroundedError(str(error), refused.then) from None
+    if set(seen.warnings) - {*read.warnings}:  # where it begins, or whose it is, is in doubt
+        raise error
+    note = (
+        f"no candidate is waiting for a trial; its commands are those of {error.best}, the best: "
+        "it counts as another run of it"
+    )
+    return replace(read, notes=(note, *read.notes))
 
 
 def recognised(
@@ -152,10 +163,13 @@ def recognised(
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"multiply the stamps by {slow:g} and ingest it again"
     )
+    turned = ""
+    if log and whole.inputs.any() and not (units or slow or other or (found and found.opens_alike)):
+        turned = turned_in(workspace, log, ran)
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
-        also = gone or misled(None if other else log, task, own)
+        also = turned or gone or misled(None if other else log, task, own)
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
             read, assumed = _from_first_change(read, log, task)
@@ -167,7 +181,7 @@ def recognised(
                 f"{longer * (WHOLE * _lasting_s(log) > run)}; set another with [log.span] start = "
                 "SECONDS"
             )
-        return replace(read, warnings=(*read.warnings, *doubts), doubted=True)
+        return replace(read, warnings=(*read.warnings, *doubts), doubted=True, aside=bool(turned))
     if units:
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):
@@ -185,6 +199,12 @@ def recognised(
         )
     if not other:
         _refuse_earlier(workspace, path, log, whole)
+    if turned:
+        raise GroundedError(
+            f"{path} can't be read as a run of {ran}: {turned}. Ingest it with --candidate {ran} "
+            "only if that is how the robot should be",
+            NextCommand("export", (ran, "--runner")),
+        )
     known = replace(read.trial, id="").until(read.trial.known_steps)
     odd = []
     if not seen.silent:  # without them the model can't tell what moves the robot
@@ -230,6 +250,32 @@ def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial:
             "and diagnosis, and run a candidate of this task",
             NextCommand("ingest", (str(path), "--data")),
         )
+
+
+def turned_in(workspace: Folder, log: Recording, ran: str) -> str:
+    """Return that an input acted the other way round in a log without a run of its candidate.
+
+    Feedback with the wrong sign drives the states away from the prediction, so that the commands
+    soon stay at their limits and do not tell where the run began.
+
+    Args:
+        workspace: the workspace with the model.
+        log: the log.
+        ran: the candidate that it is said to have run.
+
+    Returns:
+        What shows it, and what to do: the end of a sentence; "" if nothing does.
+    """
+    from grounded.search.returned.reversed_input import reversed_input
+
+    trial = log.trial_from(log.first)
+    if trial is None or not (found := reversed_input(workspace.planner, trial)):
+        return ""
+    return (
+        f"{found.said}. Is it wired the wrong way round? Then mend that and run {ran} again: with "
+        f"the feedback reversed this was not its run. If only the log has the other sign, set "
+        f"scale = -1 in [log.input.{found.input}] and ingest it again"
+    )
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:

@@ -22,7 +22,7 @@ from grounded.places import velocities
 from grounded.result import figure, listed, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
-from grounded.search.feedback.sample_age import PROBED, rates, sample_age
+from grounded.search.feedback.sample_age import PROBED, different, rates, sample_age
 from grounded.search.returned.who_drove import LEAST
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -32,6 +32,7 @@ from grounded_trials.workspace.folder import Folder
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
+NAMED = 2  # largest number of states that are named
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
 
@@ -89,8 +90,10 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
     delayed = [str(e["name"]) for e in effects if str(e["name"]).startswith("sensor_delay:")]
     allowed = {n for name in delayed for n in name.partition(":")[2].split("+")}
     states = trial.states[: task.horizon + 1]
-    if own.policy.gain is None or own.sample_age or len(states) < 2:
+    if own.policy.gain is None or len(states) < 2:
         return []
+    if own.sample_age:
+        return _of_another_age(task, own, trial, old)
     by, what = "by the stamps", "samples"
     if old.any() and not np.ptp(old):
         old = _late_velocities(task, own, trial, old)
@@ -117,6 +120,39 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
     return [
         f"{by}, its program acted on {what} that were {span} ms old on average; by then "
         f"{listed(cost)} had moved on. {then}"
+    ]
+
+
+def _of_another_age(task: Task, own: Candidate, trial: Trial, old: Array) -> list[str]:
+    """Return a note if the samples of a run were not as old as its candidate was planned for.
+
+    Args:
+        task: the manoeuvre.
+        own: the candidate that was run, planned for `sample_age`.
+        trial: its run.
+        old: mean age of each state's samples when commands were sent [s], (n,).
+    """
+    assert own.policy.gain is not None
+    age, planned = sample_age(task, own, [trial]) or float(np.median(old)), own.sample_age
+    if not different(task, age, planned):
+        return []
+    states = trial.states[: task.horizon + 1]
+    error = task.model.difference(states, task.target[: len(states)])
+    moved_on = task.model.difference(states[1:], states[:-1]) / task.dt
+    off, speed = (np.sqrt((e**2).mean(axis=0)) for e in (error, moved_on))
+    by = abs(age - planned) * speed
+    fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0
+    names, units = task.model.state_names, list(task.model.states.values())
+    counts, cost = np.flatnonzero(fed & (task.reward.state > 0) & (by > LEADS * off)), []
+    for i in sorted(counts, key=lambda i: off[i] / by[i])[:NAMED]:
+        moved, missed = measured_alike([by[i], off[i]], units[i])
+        cost.append(f"{names[i]} by {moved} (its error in this run: {missed} rms)")
+    ms = 1e3 * abs(age - planned)
+    told = f": in the {ms:.2g} ms between {listed(cost)} moved on" * bool(cost)
+    return [
+        f"its program acted on samples that were {1e3 * age:.2g} ms old, {own.id} was planned for "
+        f"{1e3 * planned:.2g} ms{told}. If the timer of the program starts at random against the "
+        "sensor's, that differs from run to run: send each command when a new sample arrives"
     ]
 
 
