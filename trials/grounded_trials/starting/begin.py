@@ -54,6 +54,7 @@ from grounded_trials.starting.kinds import (
     skeleton,
 )
 from grounded_trials.starting.own_model import OwnModel, own_model
+from grounded_trials.starting.pushed import with_gain
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import count
 from grounded_trials.workspace.folder import Folder
@@ -205,19 +206,19 @@ def _begin(
             "every row. Was the robot switched off? init needs a log in which it moves"
         )
     report, notes = _one_run(report)
-    joints = joint_names(report)
+    joints, plain = joint_names(report), None
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
     if own:
         why, found = "your model", own.bring(folder)
     else:
-        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
-        found = _model_in(folder, text)
+        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
+        found = _model_in(folder, plain.source())
     states, inputs = _matched(report, found, joints)
     if not (kind or own or any(g.path for g in states)):
         why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
-        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
-        found = _model_in(folder, text)
+        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
+        found = _model_in(folder, plain.source())
         states, inputs = _matched(report, found, joints)
     if chosen == "generic" and not own:
         states, inputs = (
@@ -238,6 +239,9 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
+    if plain is not None:
+        full = with_gain(plain, {g.name: g for g in (*states, *inputs)}, report)
+        found = found if full is plain else _model_in(folder, full.source())
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     inputs = in_degrees(inputs, units, ranges)
     slow = () if states_time_unit(files[0]) else _in_seconds(report)
