@@ -340,6 +340,40 @@ def test_a_target_says_what_it_leaves_free(tmp_path):
     assert "free" not in grounded("-C", folder, "target", "line", *ends).out
 
 
+ROLLED = """
+from grounded import Model
+
+def rate(s, a, p):
+    return {"x": s.v, "v": -7.0 * s.th, "th": s.w, "w": (0.4 * a.volt - s.w) / 0.07}
+
+model = Model(states={"x": "m", "v": "m/s", "th": "rad", "w": "rad/s"}, inputs={"volt": "V"},
+              derivative=rate)
+"""
+
+
+def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
+    """`--to th=0` alone was advised, whose weight holds the beam under a ball all the way."""
+    (tmp_path / "ball.py").write_text(ROLLED)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "ball.py", "--dt", "0.02").code == 0
+    line = ("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "2", "--hold", "0.5")
+    said = " ".join(grounded(*line).out.split())
+    assert holds(said, "at the end only", "--to th=0", "[reward] state", "th = 1000, w = 100")
+    plain_line = Workspace(w).propose().candidate
+    assert grounded(*line, "--to", "th=0").code == 0
+    held = Workspace(w).propose().candidate
+    file = w / "grounded.toml"
+    state = "state = { x = 11.1, v = 3.7 }\nterminal = { th = 1000, w = 100 }"
+    without = re.sub(r"(?m)^terminal = .*$", "", file.read_text())
+    file.write_text(re.sub(r"(?m)^state = .*$", state, without))
+    ended = Workspace(w).propose().candidate
+    wanted = Workspace(w).task.target[:, 0]
+    runs = [one.predicted_states for one in (plain_line, held, ended)]
+    off = [np.abs(run[:, 0] - wanted).mean() for run in runs]
+    assert off[2] < 1.5 * off[0] + 1e-3 and off[1] > 1.4 * off[2]
+    assert abs(runs[2][-1, 2]) < 2e-3
+
+
 def test_a_line_keeps_the_rest_of_a_position_where_it_starts(tmp_path):
     """A line to x = 2 left the height free: the first plan of a quadrotor fell."""
     folder, file = planar(tmp_path)
