@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
 STRAIGHT = 1e3  # times --size: larger turning radii are those of a straight line
-SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
@@ -98,7 +97,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
-    from grounded_trials.workspace.off_target import rates_beside
+    from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import without_range
 
@@ -142,7 +141,7 @@ def command(
         show_json(found)
         return
     planar = shape in PATHS and has_plane(model)
-    fastest, tightest = _driven(model, columns, dt) if planar else (math.nan, math.inf)
+    fastest, tightest = driven(model, columns, dt) if planar else (math.nan, math.inf)
     if speed is not None and not ends and fastest < REACHED * speed:
         by = f"--accel {drive.accel:g} and --lateral {lateral:g} m/s^2"
         remark(
@@ -243,22 +242,6 @@ def _tell_undo(
         f"candidates, copy {old.target}.bak and grounded.toml.bak over {old.target} and "
         "grounded.toml"
     )
-
-
-def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, float]:
-    """Return the highest speed [m/s] and the smallest turning radius [m] of a path in a plane."""
-    import numpy as np
-
-    x, y = (columns[name] for name in model.roles["position"][:2])
-    v = np.diff(np.stack([x, y]), axis=1) / dt
-    speed = np.hypot(*v)
-    turn = v[0, :-1] * v[1, 1:] - v[1, :-1] * v[0, 1:]  # speed^2 times the sine of the turn
-    both, mean = speed[:-1] * speed[1:], (speed[:-1] + speed[1:]) / 2
-    fast = np.minimum(speed[:-1], speed[1:]) > SLOW * speed.max()
-    rate = np.arcsin(np.clip(turn[fast] / both[fast], -1, 1)) / dt
-    with np.errstate(divide="ignore"):
-        radius = mean[fast] / np.abs(rate)
-    return float(speed.max()), float(radius.min(initial=math.inf))
 
 
 def _rest_of(model: Model, free: list[str]) -> str:
