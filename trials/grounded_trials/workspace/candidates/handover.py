@@ -376,12 +376,15 @@ class Check:
         used = np.abs(gain[:, :, : len(names)]).max(axis=(0, 1)) > 0
         told = [n for n, u in zip(names, used, strict=True) if u and n not in mapped.states]
         if told:
-            it = "them" if len(told) > 1 else "it"
+            many = len(told) > 1
+            it = "them" if many else "it"
             yield (
                 f"{self.candidate.id} feeds back {listed(told)}, of which the log has no column: "
                 f"your program has to compute {it} while it runs (differences, a filter). Let it "
-                f"log {it}, and map {it} in [log] too: a run is recognised by the commands that "
-                "follow from these values"
+                f"log {it}, by hand too, map {it} in [log], and add {it} to [estimate] measured, "
+                "with the scatter at standstill: a run is recognised by the commands that follow "
+                f"from these values, and `diagnose` finds how late {'they are' * many or 'it is'}, "
+                "which plans then allow for"
             )
 
     def _too_long(self) -> Iterator[str]:

@@ -183,8 +183,8 @@ class ForeignLog:
         guessed, columns = last.get("estimated", "").split(","), last.get(READ_BY, "")
         return tuple(
             f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
-            f"but the trial has an estimate in its place. To use the logged one add {name} = its "
-            "scatter at standstill there"
+            f"but the trial has an estimate in its place, and `diagnose` can't find how late the "
+            f"logged one is. To use that one add {name} = its scatter at standstill there"
             for name in self._beside
             if name not in guessed or f"{json.dumps(name)}:" not in columns
         )
