@@ -128,3 +128,28 @@ def test_an_imu_comes_after_the_odometry_in_a_generic_model(tmp_path, posed):
         names = ["x", "y", "yaw", "linear_x", "angular_z"]
         assert list(paths)[: len(names)] == names
         assert all(paths[name].startswith("/odom.") for name in names)
+        (v,) = (g for g in begin(tmp_path / "car", log, kind="car").states if g.name == "v")
+        assert any("speed forwards" in why for why in v.reasons)  # linear.y is in m/s as well
+
+
+@pytest.mark.parametrize("speeds", [True, False])
+def test_init_says_where_a_run_starts_or_why_that_is_open(tmp_path, speeds):
+    """One planned from -0.10 and ran from -0.15: `start` is empty for logs without speeds."""
+    (tmp_path / "cart.py").write_text(
+        "from grounded import Model\n"
+        "model = Model(states={'x': 'm', 'v': 'm/s'}, inputs={'force': 'N'},\n"
+        "    derivative=lambda s, a, p: {'x': s.v, 'v': a.force})\n"
+    )
+    t = np.arange(300) * 0.02
+    since = np.clip(t - 1, 0, None)
+    x, v, force = -0.1 + 1 - np.cos(since), np.sin(since), np.cos(since) * (t > 1)
+    columns, head = [t, x, force], "t,x,force"
+    if speeds:
+        columns, head = [t, x, v, force], "t,x,v,force"
+    log = tmp_path / "a.csv"
+    np.savetxt(log, np.column_stack(columns), "%.5f", ",", header=head, comments="")
+    done = grounded("init", tmp_path / "w", "--from", log, "--model", tmp_path / "cart.py")
+    said = " ".join(done.out.split())
+    told = "start x = -0.1, where it stood" if speeds else "start empty, no rest is seen without v"
+    assert told in said
+    assert Workspace(tmp_path / "w").config.task.start == ({"x": -0.1} if speeds else {})
