@@ -135,6 +135,7 @@ def _tell(begun: Begun) -> None:
     show(field("model", what, "  "))
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
+    show(field("start", begun.start, "  "))
     show("")
     both, known = (*begun.states, *begun.inputs), estimating(begun.states)
     aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 SECONDS = 5.0  # default duration of a step or a swing-up
 REACHED = 0.95  # of --speed: a path that stays below it brings a note
 STRAIGHT = 1e3  # times --size: larger turning radii are those of a straight line
-SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
@@ -98,7 +97,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
-    from grounded_trials.workspace.off_target import rates_beside
+    from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import without_range
 
@@ -142,7 +141,7 @@ def command(
         show_json(found)
         return
     planar = shape in PATHS and has_plane(model)
-    fastest, tightest = _driven(model, columns, dt) if planar else (math.nan, math.inf)
+    fastest, tightest = driven(model, columns, dt) if planar else (math.nan, math.inf)
     if speed is not None and not ends and fastest < REACHED * speed:
         by = f"--accel {drive.accel:g} and --lateral {lateral:g} m/s^2"
         remark(
@@ -166,7 +165,11 @@ def command(
     if free:
         resting = _rest_of(model, free) * (shape == "line")
         reading = _reading_at_rest(workspace, resting)
-        show(field("free", _free(free, reward, resting, reading, velocities(model)), "  "))
+        text = _free(free, reward, velocities(model)) if resting else _free(free, reward)
+        if resting:
+            begins = start.get(resting, 0.0)
+            text += _at_the_end(model, columns, resting, begins, reading)
+        show(field("free", text, "  "))
     if ran:
         _tell_undo(old, before, reward, rows - 1)
     if rest:
@@ -241,22 +244,6 @@ def _tell_undo(
     )
 
 
-def _driven(model: Model, columns: dict[str, Array], dt: float) -> tuple[float, float]:
-    """Return the highest speed [m/s] and the smallest turning radius [m] of a path in a plane."""
-    import numpy as np
-
-    x, y = (columns[name] for name in model.roles["position"][:2])
-    v = np.diff(np.stack([x, y]), axis=1) / dt
-    speed = np.hypot(*v)
-    turn = v[0, :-1] * v[1, 1:] - v[1, :-1] * v[0, 1:]  # speed^2 times the sine of the turn
-    both, mean = speed[:-1] * speed[1:], (speed[:-1] + speed[1:]) / 2
-    fast = np.minimum(speed[:-1], speed[1:]) > SLOW * speed.max()
-    rate = np.arcsin(np.clip(turn[fast] / both[fast], -1, 1)) / dt
-    with np.errstate(divide="ignore"):
-        radius = mean[fast] / np.abs(rate)
-    return float(speed.max()), float(radius.min(initial=math.inf))
-
-
 def _rest_of(model: Model, free: list[str]) -> str:
     """Return the first free state that has a rate among the states, else the first free state."""
     from grounded_trials.logs.inspection.inspect_pairs import velocities
@@ -270,33 +257,58 @@ def _reading_at_rest(workspace: Workspace, name: str) -> float:
     return biases.get(f"sensor_bias:{name}", 0.0)
 
 
-def _free(
-    names: list[str],
-    reward: dict[str, dict[str, float]],
-    rest: str,
-    at: float,
-    rates: Sequence[str],
+def _at_the_end(
+    model: Model, columns: dict[str, Array], rest: str, begins: float, at: float
 ) -> str:
+    """Say how to ask for rest of a free state, at the end only.
+
+    A column alone would get a weight at every step, and hold there what the run needs to move.
+
+    Args:
+        model: the model of the states.
+        columns: the target without that state.
+        rest: the state.
+        begins: its value in [task] start.
+        at: what its sensor shows at rest.
+    """
+    import numpy as np
+
+    from grounded_trials.logs.inspection.inspect_pairs import velocities
+    from grounded_trials.workspace.off_target import usual_weights
+    from grounded_trials.workspace.user_files.config import OFFERED
+    from grounded_trials.workspace.user_files.task_file import LEAST
+
+    rows = len(next(iter(columns.values())))
+    added = {rest: np.linspace(min(begins, at - LEAST), at, rows)}
+    if (rate := velocities(model).get(rest)) is not None and rate not in columns:
+        added[rate] = added[rest]  # only for its usual weight
+    usual = usual_weights(model, {**columns, **added})
+    named, it = listed(added), "them" if len(added) > 1 else "it"
+    told = ", ".join(f"{name} = {OFFERED * usual[name]:.4g}" for name in added)
+    return (
+        f". To ask for rest there, but at the end only: add `--to {rest}={at:.3g}`, then remove "
+        f"{named} from [reward] state, where a weight holds {it} all the way, and give {it} to "
+        f"terminal in [reward]: {told}"
+    )
+
+
+def _free(names: list[str], reward: dict[str, dict[str, float]], rates: Sequence[str] = ()) -> str:
     """Explain what it means that the target has no column for some states.
 
     Args:
         names: the states.
         reward: the tables of [reward].
-        rest: the state to suggest bringing to rest with --to, "" for no suggestion.
-        at: what its sensor shows there.
-        rates: the model's velocities, which end at 0 where a line comes to rest.
+        rates: the model's velocities if the target is a line, which ends at rest.
     """
     weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
     it = "them" if len(names) > 1 else "it"
-    ends = [f"--to {n}={'0' if rest and n in rates else 'VALUE'}" for n in weighed]
+    ends = [f"--to {n}={'0' if n in rates else 'VALUE'}" for n in weighed]
     text = f"{listed(names)}: no column in the target, so a run may take {it} anywhere"
     if weighed:
         text += (
             f". [reward] weighs {listed(weighed)}, and `propose` refuses weights without a column: "
             f"add a column (`{' '.join(ends)}`), or remove the weight"
         )
-    if rest:
-        text += f". Add `--to {rest}={at:.3g}` to ask for rest there"
     return text
 
 

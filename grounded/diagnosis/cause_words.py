@@ -19,8 +19,9 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 
 AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
 TURNED = (
-    ": flip its sign in model.py, or, if only the log has it so, set {log} scale = -1, discard the "
-    "trials and ingest their logs again"
+    ": flip its sign in model.py, or, if only the log has it so, multiply the scale in {log} by -1 "
+    "(a missing one is 1), and {limits} if they were taken from the log, discard the trials and "
+    "ingest their logs again"
 )
 LARGE = 1e3  # values from here on have no power of ten that a few digits would give them
 MOST_DIGITS = 6  # significant digits of a value
@@ -120,7 +121,13 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     axes = [*model.roles.get("position", ())][:2]
     axes = axes if len(axes) == 2 else ["the first axis", "the second"]
     words |= {"axis_1": axes[0], "axis_2": axes[1]}
-    words |= {"log": "[log]", "driven": called(model, driven), "source": called(model, source)}
+    inputs = [f"[log.input.{name}]" for name in targets if name in model.inputs]
+    words |= {
+        "log": listed(inputs),
+        "limits": "[limits]",
+        "driven": called(model, driven),
+        "source": called(model, source),
+    }
 
     if driven in model.inputs and len(targets) > 1:  # a wheel's: several velocities at once
         words["source"] = "its speed"

@@ -26,8 +26,9 @@ AT_BOUNDS = (  # the same if every parameter that moved is at its bound
 AS_A_RATIO = (  # the same if an input acts the other way round as well
     "None is needed yet: {flip} acts the other way round. Its strength and the parameters that "
     "stopped at their bounds are known as a ratio only: flip its sign in model.py, or, if only the "
-    "log has it so, set [log] scale = -1, discard the trials and ingest their logs again. Then "
-    "diagnose again."
+    "log has it so, multiply the scale in [log.input.{flip}] by -1 (a missing one is 1), and "
+    "[limits] if they were taken from the log, discard the trials and ingest their logs again. "
+    "Then diagnose again."
 )
 
 

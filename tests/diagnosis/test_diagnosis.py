@@ -223,7 +223,8 @@ def test_sentences_are_english():
     )
     assert said("input_gain:throttle", g=-2.1) == (
         "The throttle acts the other way round: flip its sign in model.py, or, if only the log "
-        "has it so, set [log] scale = -1, discard the trials and ingest their logs again."
+        "has it so, multiply the scale in [log.input.throttle] by -1 (a missing one is 1), and "
+        "[limits] if they were taken from the log, discard the trials and ingest their logs again."
     )
     assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == (

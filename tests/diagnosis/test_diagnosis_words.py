@@ -135,7 +135,9 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert holds(said, "flip the sign of force", "diagnose again") and "adopt" not in said
     assert "Widen the bounds" in next_trial(claims, "", (), ended=True)
     said = next_trial(claims, "", (), ended=True, flip="force")  # `diagnose` asked for wider ones
-    assert holds(said, "force acts the other way round", "ratio", "model.py", "scale = -1")
+    assert holds(
+        said, "force acts the other way round", "ratio", "model.py", "[log.input.force] by -1"
+    )
     assert "bounds in the model file" not in said
 
 

@@ -283,7 +283,9 @@ def _said(model: Model, change: Change, *, log: bool) -> str:
     if change.swap:
         return exchanged(listed(names))
     if change.factor == -1.0:
-        return f"{listed(names)}: the sign looks wrong, set scale = -1"
+        tables = listed(f"[log.state.{name}]" for name in names)
+        how = f"multiply the scale in {tables} by -1" if log else "reverse it"
+        return f"{listed(names)}: the sign looks wrong, {how}"
     return ", ".join(described(model, i, change.factor, log=log) for i in change.states)
 
 

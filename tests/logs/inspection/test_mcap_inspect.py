@@ -225,3 +225,21 @@ def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, 
     path.write_bytes(stream.getvalue())
     _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
     assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)
+
+
+@pytest.mark.parametrize("step", [0.00153, 0.0044, 1e-7])
+def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, step: float) -> None:
+    """An angle in steps of 0.00153 rad got a standard deviation of 3e-05."""
+    t = np.arange(1000) * 0.02
+    rng = np.random.default_rng(0)
+    true = 0.05 * np.sin(0.8 * t) * (t > 3)
+    beam = np.round(step * np.round(true / step), 7 if step < 1e-6 else 5)
+    x = 0.1 * np.cos(t) + rng.normal(0, 1e-3, len(t))
+    columns = np.column_stack([t, x, beam, true])
+    np.savetxt(tmp_path / "h.csv", columns, "%.7f", ",", header="t,x,beam,volt", comments="")
+    report = inspect_log(tmp_path / "h.csv")
+    states, inputs = guess_mapping(report, ["x", "v", "beam"], ["volt"])
+    measured = tomllib.loads(mapping_toml(states, inputs))["estimate"]["measured"]
+    assert 0.8e-3 < measured["x"] < 1.3e-3
+    low, high = (0.95 * step / np.sqrt(12), step) if step > 1e-6 else (1e-6, 1e-4)
+    assert low < measured["beam"] < high

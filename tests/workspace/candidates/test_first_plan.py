@@ -340,6 +340,74 @@ def test_a_target_says_what_it_leaves_free(tmp_path):
     assert "free" not in grounded("-C", folder, "target", "line", *ends).out
 
 
+STEERED = """
+from grounded import Model
+import numpy as np
+
+def rate(s, a, p):
+    return {"x": s.v * np.cos(s.psi), "y": s.v * np.sin(s.psi), "psi": s.v * np.tan(a.steer) / 0.3,
+            "v": (a.speed - s.v) / 0.3}
+
+model = Model(states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"}, angles=("psi",),
+              inputs={"steer": "rad", "speed": "m/s"}, derivative=rate,
+              roles={"position": ("x", "y"), "heading": "psi", "speed": "v"})
+"""
+
+
+@pytest.mark.parametrize(("size", "tight"), [(1, True), (3, False)])
+def test_a_target_that_turns_tighter_than_the_model_can_is_told(tmp_path, size, tight):
+    """A figure-8 with turns of 0.4 m for a car that needs 0.8 m was only off by 134 mm."""
+    (tmp_path / "car.py").write_text(STEERED)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "car.py", "--dt", "0.05").code == 0
+    file = w / "grounded.toml"
+    limits = "[limits]\nsteer = [-0.36, 0.36]\nspeed = [0, 3]"
+    file.write_text(re.sub(r"(?m)^\[limits\].*$", limits, file.read_text()))
+    drawn = grounded("-C", w, "target", "figure-8", "--size", f"{size}", "--speed", "1.5")
+    radius = 1e3 * float(re.search(r"turning radius ([\d.]+) m", drawn.out)[1])
+    assert radius == pytest.approx(417 * size, rel=0.1)
+    notes = [n for n in Workspace(w).propose().proposal.notes if "tighter than the model" in n]
+    assert len(notes) == tight
+    for note in notes:
+        asked, able = (float(mm) for mm in re.findall(r"([\d.]+) mm", note))
+        assert asked == pytest.approx(radius, rel=0.01) and able > 0.9 * 0.3e3 / np.tan(0.36)
+        assert holds(note, "steer is at its limits", "[limits]", f"{able / asked:.2g} times")
+
+
+ROLLED = """
+from grounded import Model
+
+def rate(s, a, p):
+    return {"x": s.v, "v": -7.0 * s.th, "th": s.w, "w": (0.4 * a.volt - s.w) / 0.07}
+
+model = Model(states={"x": "m", "v": "m/s", "th": "rad", "w": "rad/s"}, inputs={"volt": "V"},
+              derivative=rate)
+"""
+
+
+def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
+    """`--to th=0` alone was advised, whose weight holds the beam under a ball all the way."""
+    (tmp_path / "ball.py").write_text(ROLLED)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "ball.py", "--dt", "0.02").code == 0
+    line = ("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "2", "--hold", "0.5")
+    said = " ".join(grounded(*line).out.split())
+    assert holds(said, "at the end only", "--to th=0", "[reward] state", "th = 1000, w = 100")
+    plain_line = Workspace(w).propose().candidate
+    assert grounded(*line, "--to", "th=0").code == 0
+    held = Workspace(w).propose().candidate
+    file = w / "grounded.toml"
+    state = "state = { x = 11.1, v = 3.7 }\nterminal = { th = 1000, w = 100 }"
+    without = re.sub(r"(?m)^terminal = .*$", "", file.read_text())
+    file.write_text(re.sub(r"(?m)^state = .*$", state, without))
+    ended = Workspace(w).propose().candidate
+    wanted = Workspace(w).task.target[:, 0]
+    runs = [one.predicted_states for one in (plain_line, held, ended)]
+    off = [np.abs(run[:, 0] - wanted).mean() for run in runs]
+    assert off[2] < 1.5 * off[0] + 1e-3 and off[1] > 1.4 * off[2]
+    assert abs(runs[2][-1, 2]) < 2e-3
+
+
 def test_a_line_keeps_the_rest_of_a_position_where_it_starts(tmp_path):
     """A line to x = 2 left the height free: the first plan of a quadrotor fell."""
     folder, file = planar(tmp_path)

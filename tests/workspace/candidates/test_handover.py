@@ -194,6 +194,7 @@ def test_speeds_that_are_fed_back_but_not_logged_are_told_with_the_first_candida
     made = w.propose()
     assert np.abs(made.proposal.candidate.policy.gain[:, :, 1]).max() > 0
     (note,) = [n for n in made.proposal.notes if "feeds back" in n]
+    assert holds(note, "[log]", "[estimate] measured", "diagnose", "how late")
     assert (
         holds(note, "c0001", "v", "no column")
         and note in w.export("c0001", tmp_path / "c.json").notes

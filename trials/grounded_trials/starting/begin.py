@@ -54,6 +54,8 @@ from grounded_trials.starting.kinds import (
     skeleton,
 )
 from grounded_trials.starting.own_model import OwnModel, own_model
+from grounded_trials.starting.pushed import with_gain
+from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import count
 from grounded_trials.workspace.folder import Folder
@@ -81,6 +83,7 @@ class Begun(Result):
     states: tuple[Guess, ...]
     inputs: tuple[Guess, ...]
     target: str  # description of target.csv
+    start: str = ""  # description of [task] start
     notes: tuple[str, ...] = ()
     again: tuple[str, ...] = ()  # arguments of `init` once the log's time column is renamed
 
@@ -205,19 +208,19 @@ def _begin(
             "every row. Was the robot switched off? init needs a log in which it moves"
         )
     report, notes = _one_run(report)
-    joints = joint_names(report)
+    joints, plain = joint_names(report), None
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
     if own:
         why, found = "your model", own.bring(folder)
     else:
-        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
-        found = _model_in(folder, text)
+        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
+        found = _model_in(folder, plain.source())
     states, inputs = _matched(report, found, joints)
     if not (kind or own or any(g.path for g in states)):
         why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
-        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
-        found = _model_in(folder, text)
+        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
+        found = _model_in(folder, plain.source())
         states, inputs = _matched(report, found, joints)
     if chosen == "generic" and not own:
         states, inputs = (
@@ -238,6 +241,9 @@ def _begin(
             tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
             for some in (states, inputs)
         )
+    if plain is not None:
+        full = with_gain(plain, {g.name: g for g in (*states, *inputs)}, report)
+        found = found if full is plain else _model_in(folder, full.source())
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     inputs = in_degrees(inputs, units, ranges)
     slow = () if states_time_unit(files[0]) else _in_seconds(report)
@@ -254,8 +260,12 @@ def _begin(
     rates = velocities(found)
     table = mapping_toml(states, inputs, simulated=is_simulated(report), rates=rates)
 
+    stood: dict[str, float] = {}
+
     def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
         name, held = Path(log).name, held_first(found, columns, sent, step, ranges)
+        stood.clear()
+        stood.update(held)
         write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name, held)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
@@ -270,6 +280,7 @@ def _begin(
         states=states,
         inputs=inputs,
         target=target,
+        start=_start(found, stood, states),
         notes=(*notes, *[note] * bool(note), *more),
         again=again if slow else (),
     )
@@ -424,6 +435,18 @@ def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
         return replace(guess, sure=bool(path))
     why = ("as you specified",)
     return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
+
+
+def _start(model: Model, stood: Mapping[str, float], states: Sequence[Guess]) -> str:
+    """Say what [task] start holds, or why it is empty and what to enter."""
+    if stood:
+        told = ", ".join(f"{name} = {value:.4g}" for name, value in stood.items())
+        return f"{told}, where it stood in the log's first rows"
+    if has_plane(model):
+        return "empty: a run begins where the target does"
+    lost = [guess.name for guess in states if not guess.path]
+    why = f"no rest is seen without {listed(lost)} in the log" if lost else "the log shows no rest"
+    return f"empty, {why}: enter where a run begins in [task] start"
 
 
 def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:

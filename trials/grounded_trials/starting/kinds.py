@@ -22,6 +22,7 @@ from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, 
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
 from grounded_trials.logs.stated_units import factor_between, unit_in_name
+from grounded_trials.starting.pushed import pushed, pushed_by
 from grounded_trials.starting.skeletons import (
     BALANCE,
     BOAT,
@@ -67,14 +68,16 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     """Return the numbers of a log that change, by their names in a generic model.
 
     Of several with one name, such as the x of a position and of a speed, the others are named after
-    their group, too: linear_x.
+    their group, too: linear_x. What an IMU measures comes after all others, and its accelerations
+    are never named x, y, z.
     """
-    fields = [one for t in log.topics for one in t.fields if one.low != one.high]
+    topics = sorted(log.topics, key=lambda t: t.type.endswith("/Imu"))
+    fields = [one for t in topics for one in t.fields if one.low != one.high]
     fields = [one for one in fields if not PARTS.search(one.path)]
     found: dict[str, FieldReport] = {}
     for one in fields:
         name, grouped = _word(one.path), _in_group(one.path)
-        name = grouped if grouped.startswith("angular_") else name
+        name = grouped if grouped.startswith(("angular_", "linear_acceleration_")) else name
         if name not in found:
             found[name] = one
         elif not (one.path.count("@") or grouped in found):
@@ -388,18 +391,21 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
     return any(re.search(word, everything) for word in words)
 
 
-def _car(log: LogReport) -> Skeleton:
-    """Return the car skeleton: driven by speed or throttle, steered in rad or unitless."""
-    throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
+def _car(log: LogReport, units: Units) -> Skeleton:
+    """Return the car skeleton: driven by the log's own command, steered in rad or unitless."""
     numbers = [one.path for topic in log.topics for one in topic.fields]
     said = {unit_in_name(path) for path in numbers if "steer" in _word(path).lower()} - {""}
     angle = any(factor_between(unit, "rad") is not None for unit in said)
     part = any(factor_between(unit, "1") is not None for unit in said)
+    throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
     unit = "rad" if angle or not (throttle or part) else "1"
-    if not throttle:
-        return replace(CAR, inputs={**CAR.inputs, "steering": unit})
-    lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
-    return replace(CAR, inputs={"steering": unit, "throttle": "1"}, lines=lines)
+    plain = replace(CAR, inputs={**CAR.inputs, "steering": unit})
+    return pushed_by(plain, "throttle", "1") if throttle else pushed(plain, sent_in(log), units)
+
+
+def sent_in(log: LogReport) -> dict[str, str]:
+    """Return the paths of the numbers that are named like commands, by their names."""
+    return {name: one.path for name, one in moving(log).items() if called_input(name, one.path)}
 
 
 def skeleton(
@@ -415,7 +421,9 @@ def skeleton(
         return arm(from_base(next(iter(joints.values()))) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
     if kind == "car" and not ackermann:
-        return _car(log)
+        return _car(log, units or {})
+    if kind == "rover":
+        return pushed(ROVER, sent_in(log), units or {})
     fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BOAT, BALANCE, PENDULUM)}
     if kind in ("differential", "boat") and (both := _both_sides(log)):
         plain = fixed[kind]

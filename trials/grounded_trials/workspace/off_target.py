@@ -7,6 +7,7 @@ at the end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -37,6 +38,7 @@ NARROW = 0.25  # of the median gap of repeated values: one beside an interpolate
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
+SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,6 +184,20 @@ def usual_weights(model: Model, columns: Mapping[str, Array]) -> dict[str, float
     """Return the weights on the states of a target that nobody chose, see `equal_weights`."""
     rates = rates_beside(model, columns)
     return equal_weights(columns, model.states, position_names(model), rates)
+
+
+def driven(model: Model, columns: Mapping[str, Array], dt: float) -> tuple[float, float]:
+    """Return the highest speed [m/s] and the smallest turning radius [m] of a path in a plane."""
+    x, y = (columns[name] for name in model.roles["position"][:2])
+    v = np.diff(np.stack([x, y]), axis=1) / dt
+    speed = np.hypot(*v)
+    turn = v[0, :-1] * v[1, 1:] - v[1, :-1] * v[0, 1:]  # speed^2 times the sine of the turn
+    both, mean = speed[:-1] * speed[1:], (speed[:-1] + speed[1:]) / 2
+    fast = np.minimum(speed[:-1], speed[1:]) > SLOW * speed.max()
+    rate = np.arcsin(np.clip(turn[fast] / both[fast], -1, 1)) / dt
+    with np.errstate(divide="ignore"):
+        radius = mean[fast] / np.abs(rate)
+    return float(speed.max()), float(radius.min(initial=math.inf))
 
 
 def roles_of(model: Model) -> dict[str, list[int]]:

@@ -177,5 +177,7 @@ def test_a_command_in_percent_of_its_limit_is_told(tmp_path, before, by, named):
     np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
-    assert holds(str(refused.value), "ran c0001", "force", named, f"by {1 / by:g}", "[log]")
+    assert holds(
+        str(refused.value), "ran c0001", "force", named, f"by {1 / by:g}", "[log.input.force]"
+    )
     assert refused.value.then.arguments == (str(log),)

@@ -228,3 +228,18 @@ def test_what_a_task_has_already_is_not_advised(tmp_path, rests, weighed):
     assert ("let the target rest at its end" in said) == (not rests)
     assert ("[reward] terminal" in said) == (not weighed)
     assert ("for longer" in said) == (rests and weighed)
+
+
+@pytest.mark.parametrize("scale", [-1, 1])
+def test_limits_of_a_log_whose_sign_was_wrong_are_to_be_turned_too(tmp_path, scale):
+    """[limits] were taken from the log before `scale = -1` was set in [log.input.force]."""
+    table = LOG.replace("/csv.force", f'/csv.force", scale = {scale}, clock = "log')
+    w = Workspace(make(tmp_path / "w", config=NARROW + table).folder)
+    trial = driven(-1.1)
+    states, log = trial.states[:-1], tmp_path / "d.csv"
+    rows = np.column_stack([T, states + 0.01 * np.sin(T)[:, None], trial.inputs / scale])
+    np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(log, data=True).warnings if "beyond its [limits]" in one]
+    assert len(told) == 1
+    assert ("multiply these limits by -1" in told[0]) == (scale < 0)
+    assert ("widen" in told[0]) == (scale > 0)

@@ -9,6 +9,7 @@ from grounded.result import extent
 from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
 from grounded_trials.toml_table import key
 
+LESS = 0.8  # of a value: a rounded one below it has two digits
 DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
 
 
@@ -91,7 +92,7 @@ def _estimate(states: Sequence[Guess], rates: Mapping[str, str]) -> list[str]:
     if not missing or not known:
         return []
     deviations = ", ".join(
-        f"{guess.name} = {abs(guess.scale) * _deviation(guess):.1g}" for guess in known
+        f"{guess.name} = {_short(abs(guess.scale) * _deviation(guess))}" for guess in known
     )
     return [
         "",
@@ -111,6 +112,12 @@ def _deviation(guess: Guess) -> float:
     assert guess.field is not None
     low, high = guess.field.low or 0.0, guess.field.high or 0.0
     return max(guess.field.noise, DRIFT * (high - low), 1e-6)
+
+
+def _short(value: float) -> str:
+    """Format a value with one digit, or two where one would be much less."""
+    text = f"{value:.1g}"
+    return text if float(text) > LESS * value else f"{value:.2g}"
 
 
 def _quote(path: str) -> str:

@@ -65,6 +65,7 @@ from grounded_trials.logs.stated_units import Stated, factor_between, may_be, un
 
 LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
 JOINT = re.compile(r"\.(position|velocity)\[\d+\]$")  # numbers of a JointState
+AHEAD = re.compile(r"\.linear\.x$")  # of a Twist or an Odometry
 FEW = 3  # command topics named in a reason
 MOST = 20  # largest number of candidates
 
@@ -170,7 +171,8 @@ def _unit(guess: Guess, unit: str, joints: Mapping[str, str]) -> Guess:
     if known == unit and others != guess.others:  # rivals with another unit don't count
         guess = replace(guess, others=others, sure=not others)
     if known == unit:
-        return replace(guess, reasons=(*guess.reasons, f"its unit is {unit}"))
+        role = "in ROS messages linear.x is the speed forwards; " * bool(AHEAD.search(guess.path))
+        return replace(guess, reasons=(*guess.reasons, f"{role}its unit is {unit}"))
     fits = [path for path in guess.others if unit_of(path, joints) == unit]
     if fits:
         rest = tuple(p for p in guess.others if p != fits[0])

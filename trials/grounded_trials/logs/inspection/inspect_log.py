@@ -46,6 +46,8 @@ GAP = 10.0  # intervals; longer gaps are reported
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 SAME = 0.95  # correlation above which two signals show the same motion
 LEAST = 30  # fewest samples
+REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
+STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
 KINDS = (
     *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
     *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
@@ -61,7 +63,7 @@ class FieldReport:
     low: float | None  # smallest and largest finite value; None if there is none
     high: float | None
     not_finite: int
-    noise: float = 0.0  # standard deviation of the white noise
+    noise: float = 0.0  # standard deviation of the white noise; at least a third of its steps
     held: float = 0.0  # share of nonzero samples that repeat the one before
 
 
@@ -355,8 +357,17 @@ def _field(path: str, found: _Range) -> FieldReport:
 
 
 def _noise(values: Floats) -> float:
-    """Return a robust standard deviation of a signal's white noise, from second differences."""
-    return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
+    """Return a robust standard deviation of a signal's white noise, from second differences.
+
+    Those are mostly 0 of a sensor that comes in steps and often repeats its value: its noise is
+    then STEP of one.
+    """
+    noise = float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
+    if not (np.diff(values) == 0).mean() > REPEATS:
+        return noise
+    from grounded.instruments.single import quantum
+
+    return max(noise, STEP * quantum([values]))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ from grounded_trials.wording import rendered, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
     cost_of_inputs,
+    driven,
+    position_names,
     reaches,
     still_logged,
     tracked,
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
 
 MOSTLY = 0.9  # share of the cost due to inputs above which a note says so
 HELD = 0.8  # share of the steps at a limit above which an input counts as limited
+TIGHTER = 0.9  # of the plan's smallest turning radius: a target below it turns too tightly
+ROUND = 0.05  # of that radius by which a plan must be off
+TURNING = 0.1  # share of the steps at a limit above which that limit is the reason
 SHORT = 0.25  # share of the target's extent by which a plan may end away from the target's end
 MISSED = 0.1  # share of the target's extent above which an error is reported
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
@@ -104,7 +109,9 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
     found += in_another_unit(workspace)
     found += _of_other_limits(workspace)
     if first is not None:
-        short = _held_back(task, first) or _falls_short(task, first)
+        short = (
+            _turns_wide(task, first, off) or _held_back(task, first) or _falls_short(task, first)
+        )
         if not short and astray and extent:
             short = _outweighed(workspace, first, off)
         found += short
@@ -270,6 +277,42 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
     return [
         f"{' and '.join(held)}, and still {missed}: the target seems to require more "
         "than [limits] allow. Widen them if the robot can take more, or draw a slower target"
+    ]
+
+
+def _turns_wide(task: Task, first: Candidate, off: float) -> list[str]:
+    """Return a note if the target turns tighter than a plan can with an input at its limits.
+
+    Args:
+        task: its target and limits.
+        first: the plan.
+        off: how far it is off its path, an rms.
+    """
+    model = task.model
+    places = [model.state_names.index(n) for n in position_names(model) if n in model.states]
+    if len(places) != 2 or not {*places} <= {*tracked(task)}:
+        return []
+    radii = []
+    for run in (task.target, first.predicted_states):
+        columns = {model.state_names[i]: run[:, i] for i in places}
+        radii.append(driven(model, columns, task.dt)[1])
+    asked, able = radii
+    if not asked < TIGHTER * able < np.inf or off < ROUND * asked:
+        return []
+    sent, shares = first.predicted_inputs, list[tuple[float, str]]()
+    for j, name in enumerate(model.input_names):
+        ends = [end for end in (task.low[j], task.high[j]) if np.isfinite(end) and end != 0]
+        at = [np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9) for end in ends]
+        shares.append((float(np.any(at, axis=0).mean()) if at else 0.0, name))
+    share, name = max(shares)
+    if not share > TURNING:
+        return []
+    a, b = measured_alike([asked, able], model.states[model.state_names[places[0]]])
+    return [
+        f"the target turns with a radius of {a}, tighter than the model can within [limits]: "
+        f"{name} is at its limits for {percent(share)} of the plan, whose tightest turn has {b}. "
+        f"Draw it {able / asked:.2g} times as large (or slower, if the model turns tighter then), "
+        f"or widen the limits of {name} if the robot can take more"
     ]
 
 

@@ -5,6 +5,7 @@ changed since a candidate was proposed, so everything is checked again:
 
     the file      holds the candidate it is named after, as it was proposed (never overridden)
     the robot     state and input names (never overridden), units, dt
+    [log]         maps every input, if it maps anything: else no one knows what an input is there
     the task      the task hash; another task's candidate is only exported, if a trial ran it
     [limits]      the policy's own limits, and what it sends and holds, are inside the current ones
     the model     a candidate that no trial ran is void once the model was changed
@@ -41,6 +42,7 @@ from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
 
+INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
 NEAREST = 2  # number of [safety] bounds reported: the nearest, relative to the state's range
 NEAR = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
 NEARER = 0.01  # fraction of that range by which a run must approach a bound from its start
@@ -94,17 +96,55 @@ def checked_candidate(
 
     Raises:
         Void: if it must not be handed over, unless `anyway`.
-        GroundedError: if its file is damaged, rewritten, renamed, or for another robot.
+        GroundedError: if its file is damaged, rewritten, renamed, or for another robot; also if
+            [log] lacks an input, unless `anyway`.
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = intact(data, identity)
     check = Check(workspace, candidate, meta, other_task, now)
     check.refuse_foreign(sha256(data))
+    if not anyway:
+        refuse_unmapped(workspace)
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
+    reasons = (*([lost] if (lost := unmapped(workspace)) else []), *reasons)
     _note(workspace, identity, data)
     return Handed(candidate, meta, data, check, reasons)
+
+
+def unmapped(workspace: Folder) -> str:
+    """Return which inputs [log] lacks although it maps others; "" for none, or without [log].
+
+    What such an input is on the robot was never compared with a log: a speed in m/s may arrive as
+    the duty of a motor. A system that `run` reaches gets the model's inputs, and needs no [log].
+    """
+    mapping = workspace.log_mapping
+    if mapping is None or not (mapping.states or mapping.inputs):
+        return ""
+    if workspace.config.system.reachable:
+        return ""
+    lost = [name for name in workspace.base_model.input_names if name not in mapping.inputs]
+    return f"[log] maps no {listed([repr(name) for name in lost])}" if lost else ""
+
+
+def refuse_unmapped(workspace: Folder) -> None:
+    """Refuse to plan for inputs that [log] lacks, see `unmapped`.
+
+    Raises:
+        GroundedError: if there is such an input.
+    """
+    if not (lost := unmapped(workspace)):
+        return
+    file = workspace.config.model.file or workspace.config.model.module
+    raise GroundedError(
+        f"{lost}, though {file} has that as an input: which command of the robot that is, and in "
+        "which unit, was never compared with a log, so the robot may take it for something else. "
+        "Every input must be logged: map it in [log]. If the robot is driven by another command (a "
+        f"duty instead of a speed), put that one into {file} under its own name and unit, and map "
+        "it",
+        INSPECT,
+    )
 
 
 def _note(workspace: Folder, identity: str, data: bytes) -> None:
@@ -336,12 +376,15 @@ class Check:
         used = np.abs(gain[:, :, : len(names)]).max(axis=(0, 1)) > 0
         told = [n for n, u in zip(names, used, strict=True) if u and n not in mapped.states]
         if told:
-            it = "them" if len(told) > 1 else "it"
+            many = len(told) > 1
+            it = "them" if many else "it"
             yield (
                 f"{self.candidate.id} feeds back {listed(told)}, of which the log has no column: "
                 f"your program has to compute {it} while it runs (differences, a filter). Let it "
-                f"log {it}, and map {it} in [log] too: a run is recognised by the commands that "
-                "follow from these values"
+                f"log {it}, by hand too, map {it} in [log], and add {it} to [estimate] measured, "
+                "with the scatter at standstill: a run is recognised by the commands that follow "
+                f"from these values, and `diagnose` finds how late {'they are' * many or 'it is'}, "
+                "which plans then allow for"
             )
 
     def _too_long(self) -> Iterator[str]:

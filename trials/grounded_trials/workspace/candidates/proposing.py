@@ -11,7 +11,14 @@ from grounded.result import Result
 from grounded.search.scatter import noise_missed, sensor_noise
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.candidates.exporting import to_run
-from grounded_trials.workspace.candidates.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.candidates.handover import (
+    INSPECT,
+    Void,
+    checked_candidate,
+    outside_limits,
+    refuse_unmapped,
+    unmapped,
+)
 from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
@@ -112,7 +119,7 @@ def propose_in(workspace: Folder) -> Proposed:
 
     Raises:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
-            damaged, or the task can't be planned.
+            damaged, the task can't be planned, or [log] lacks an input (see `unmapped`).
     """
     if not workspace.config.task.target:
         raise GroundedError(
@@ -120,6 +127,7 @@ def propose_in(workspace: Folder) -> Proposed:
             "target`; `fit` and `diagnose` need none",
             NextCommand("target", ("SHAPE",)),
         )
+    refuse_unmapped(workspace)
     before, told = workspace.candidate_ids(), bool(workspace.noted.since)
     proposal, void = _handed_over(workspace)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
@@ -271,6 +279,8 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     found = readable_diagnosis(workspace.reports)
     since = since_diagnosis(workspace, found, usable) if found else None
     then = next_command(workspace, standing, found, usable)
+    if lost := unmapped(workspace):
+        then = INSPECT
     return Status(
         _asking(workspace, standing, then),
         then,
@@ -278,6 +288,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.sentence if since else "",
         (
             *notes,
+            *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
             *(_disowned(standing) if standing.phase != "propose" else ()),
             *_namesakes(workspace),
             *not_counted(uncounted(workspace, workspace.trials(), standing)),

@@ -126,13 +126,14 @@ class ForeignLog:
         units = {**model.states, **model.inputs}
         for name, one in self.series.items():  # including that of [log.span]
             path, wanted = one.spec.path, units.get(name, "")
+            kind = "input" if name in model.inputs else "state"
             factor = said.factor(path, wanted)
             if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
                 named = f"whose name says {said.unit(path)}"
                 column = f"in {said.unit(path)}" if path in said.heads else named
                 found.append(
                     f"{name} is read without a scale from a column {column}, but the model has "
-                    f"{wanted}: [log] scale = {factor:.6g} would convert it"
+                    f"{wanted}: scale = {factor:.6g} in [log.{kind}.{name}] would convert it"
                 )
         return tuple(found)
 
@@ -182,8 +183,8 @@ class ForeignLog:
         guessed, columns = last.get("estimated", "").split(","), last.get(READ_BY, "")
         return tuple(
             f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
-            f"but the trial has an estimate in its place. To use the logged one add {name} = its "
-            "scatter at standstill there"
+            f"but the trial has an estimate in its place, and `diagnose` can't find how late the "
+            f"logged one is. To use that one add {name} = its scatter at standstill there"
             for name in self._beside
             if name not in guessed or f"{json.dumps(name)}:" not in columns
         )

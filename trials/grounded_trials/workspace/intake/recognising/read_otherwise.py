@@ -236,16 +236,16 @@ def units_told(task: Task, names: Sequence[str], by: float, mapped: bool) -> str
         by: the factor that corrects them.
         mapped: whether the log is read through a [log] table.
     """
-    which = listed(names)
+    which, states = listed(names), task.model.states
+    tables = listed(f"[log.{'state' if n in states else 'input'}.{n}]" for n in names)
     if by == -1:
-        its = "its scale" if len(names) == 1 else "the scale of each"
-        mend = f"multiply {its} by -1 in {FILE}'s [log] (a missing scale is 1)"
+        mend = f"multiply the scale in {tables} of {FILE} by -1 (a missing scale is 1)"
         alone = f"write {which} times -1 and run it again, or ingest it with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
     size += " and of the other sign" * (by < 0)
     unit = unit_named(task.model, names, by) or of_full_scale(task, names, by)
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (a missing scale is 1)"
+    mend = f"multiply the scale in {tables} of {FILE} by {by:.6g} (a missing scale is 1)"
     if not unit and by not in THOUSAND:
         mend += "; if the log is right, the robot's program measures it wrong"
     if not mapped:

@@ -18,6 +18,7 @@ from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
 
 LATEST = 3  # largest number of steps by which late inputs are reported
+FLIP = "its scale in [log] is negative, so multiply these limits by -1 too, if they are of the log"
 WIDEN = "no plan will use that; widen them if the robot can take it"
 
 
@@ -54,7 +55,7 @@ def warnings_about(
             "as ended there"
         )
     if not trial.candidate:
-        return (*found, *_still(whole), *_beyond(task, whole, scaled))
+        return (*found, *_still(whole), *_beyond(workspace, whole, scaled))
     if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
@@ -145,14 +146,18 @@ def _still(trial: Trial) -> list[str]:
     ]
 
 
-def _beyond(task: Task, trial: Trial, scaled: Sequence[str]) -> list[str]:
+def _beyond(workspace: Folder, trial: Trial, scaled: Sequence[str]) -> list[str]:
     """Return warnings if logged inputs exceed [limits] that were taken from another log."""
     from grounded.instruments.inputs import beyond_limits, in_percent, limits_of, span
 
+    task, mapping = workspace.task, workspace.log_mapping
     past = np.any(beyond_limits(task, trial.inputs), axis=0)
+    turned = [n for n, one in mapping.inputs.items() if one.scale < 0] if mapping else []
+    inside = ~np.any(beyond_limits(task, -trial.inputs), axis=0)
     return [
         f"{name} goes from {span(trial.inputs[:, i])} in this log, beyond its [limits], "
-        f"{limits_of(task, i)}: {in_percent(task, trial.inputs, i) or WIDEN}"
+        f"{limits_of(task, i)}: "
+        + (in_percent(task, trial.inputs, i) or (FLIP if inside[i] and name in turned else WIDEN))
         for i, name in enumerate(trial.input_names)
         if past[i] and name not in scaled
     ]
