@@ -246,8 +246,8 @@ def _teaching(
         same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
         way = f"{words}{', run twice' * again}"
         sentence = (
-            f"no candidate inside the limits teaches much: after the best, {way}, {called} would be "
-            f"known to {ends[0]} ({same})"
+            f"no candidate inside the limits teaches much: after the best, {way}, {called} would "
+            f"be known to {ends[0]} ({same})"
         )
         little = True
     elif well[k]:

@@ -271,7 +271,8 @@ def _below_noise(
     if gain > 0:
         sentence += (
             f"promises {figure(gain)}, less than the standard error of a trial's gain, "
-            f"{error:.2g} (it takes {runs_needed(gain, best)} of each candidate to show such a gain)"
+            f"{error:.2g} (it takes {runs_needed(gain, best)} of each candidate to show such a "
+            "gain)"
         )
     else:
         sentence += "promises no gain over its runs"

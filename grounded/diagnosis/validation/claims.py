@@ -312,7 +312,8 @@ class Claims:
         """
         score, best = self.search.score, self.best
         imitated = fit is with_mechanism(self.search, best)
-        if score(best) - score(fit) < TIE or imitated:  # predictions may have refused one that is likelier
+        if score(best) - score(fit) < TIE or imitated:
+            # predictions may have refused one that is likelier
             likelier = score(fit) - score(best) > TIE and self.ruler.held_out
             return not (likelier and self.ruler.gain(fit, best).beyond(*BETTER))
         if not self.ruler.held_out or not self._one_thing(name, other):

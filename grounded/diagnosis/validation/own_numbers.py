@@ -44,7 +44,7 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
 
 
 def with_mechanism(search: HypothesisSearch, fit: Fitted) -> Fitted | None:
-    """Return the likeliest fit with a mechanism in place of a coupling, if that is not far likelier.
+    """Return the likeliest fit with a mechanism in place of a coupling that is not far likelier.
 
     A state may act on any rate, so there are many couplings, and they imitate other causes: a
     position that is measured d late is, to first order, a coupling of -d times the model's own
