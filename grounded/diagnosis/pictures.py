@@ -20,7 +20,7 @@ WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
 SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
 SPARED = "All but: with every cause of this diagnosis except one, fitted again."
-OFFSET = f" Causes may offset each other: all but one are worse than the model {BEFORE}."
+OFFSET = f" Where such a bar is longer than that of the model {BEFORE}, causes offset each other."
 CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
@@ -152,7 +152,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
-    caption = (SPARED + OFFSET * _longer(panels[1:])) if len(panels) > 1 else ""
+    caption = (SPARED + OFFSET * _longer(panels[1:])) * (len(panels) > 1 and len(credit) > 1)
     return Figure("credit", "What each is worth", caption, tuple(panels))
 
 
@@ -185,7 +185,7 @@ def worth_figure(
             hidden.append(credit.of)
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
     known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
-    caption = (SPARED + OFFSET * _longer(panels)) * bool(diagnosis.credit)
+    caption = (SPARED + OFFSET * _longer(panels)) * (len(diagnosis.credit) > 1)
     caption += (
         " A cause is claimed for the mean over all states and horizons. If predictions of one "
         "state are better without it, its bar is shorter than that of all."
@@ -238,7 +238,8 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows += [(("model", f"model {said}"), error.crude)]
     if diagnosis.credit:  # else nothing was found: the same error once more
         rows += [(("best", "with all causes"), error.with_effects)]
-    rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
+    if len(diagnosis.credit) > 1:  # without the only one, it is the model before
+        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
     bars = _in_unit([(n, v, role) for (role, n), v in found if math.isfinite(v)], unit)

@@ -345,21 +345,27 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
         with_effects={"x": 0.1, "v": 0.05},
         noise_floor={"x": 0.05, "v": 0.04},
     )
-    credit = (Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4}),)
-    found = Diagnosis(Verdict("effect"), credit=credit, prediction_error=(row,))
+    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
+    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
+    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
     figure = credit_figure(found)
     assert figure is not None
     share, worth = figure.panels
-    assert [bar.label for bar in share.bars] == ["delay:u"] and share.bars[0].value == 0.9
+    assert [bar.label for bar in share.bars] == ["delay:u", "dead_zone:u"]
+    assert share.bars[0].value == 0.9
     assert share.bars[0].text == "2.4 times"
     assert worth.title == "v: error 1 s ahead"  # what predictions improved most
-    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.04]
-    names = ["model before these causes", "with all causes", "all but delay:u", "noise alone"]
+    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
+    names = ["model before these causes", "with all causes", "all but delay:u"]
+    names += ["all but dead_zone:u", "noise alone"]
     assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
     assert "except one" in figure.caption and "offset" not in figure.caption
-    worse = replace(credit[0], without_it={"x": 0.15, "v": 0.6})
-    figure = credit_figure(replace(found, credit=(worse,)))  # longer than the model's
+    worse = replace(late, without_it={"x": 0.15, "v": 0.6})
+    figure = credit_figure(replace(found, credit=(worse, dry)))  # longer than the model's
     assert "offset each other" in figure.caption
+    alone = credit_figure(replace(found, credit=(late,)))  # without it, it is the model before
+    assert [bar.label for bar in alone.panels[1].bars] == [*names[:2], "noise alone"]
+    assert not alone.caption
     later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
     settled = replace(found, credit=(), prediction_error=(later,))
     (bars,) = worth_figure(settled, [(["v"], "v")]).panels  # was `1.2 mm` twice, without 142 mm

@@ -121,7 +121,8 @@ def error_table(findings: Findings) -> list[Block]:
     columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
     columns |= {f"bias in 1 s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
-    return [table("errors", ("state", "unit", *columns), rows)]
+    words = f"bias: what the {findings.plain} misses in one step, per second"
+    return [table("errors", ("state", "unit", *columns), rows), Block("soft", f"{words}.")]
 
 
 def forecast_table(findings: Findings) -> list[Block]:
