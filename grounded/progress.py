@@ -33,15 +33,18 @@ class Stages:
 
     How many stages follow is not known: whether a diagnosis looks for one more effect depends on
     what the last one left. But a stage begins when at least a known share of the whole is done. So
-    the most time that may be left is told, once `SEEN` of the whole is surely done.
+    the most time that may be left is told, once `SEEN` of the whole is surely done; it is no bound
+    if the whole is open-ended.
 
     Args:
         tell: shows a line; None for no output.
         done: the least share of the whole that is done when a stage begins for the k-th time.
+        open_ended: whether what is found may ask for more stages than those shares were learnt on.
     """
 
     tell: Callable[[str], None] | None
     done: Callable[[str, int], float]
+    open_ended: bool = False
     began: float = field(default_factory=time.monotonic)
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
     beside: str = ""  # what all further stages are for
@@ -60,7 +63,9 @@ class Stages:
             return
         text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
         if self.end is not None and (left := _round(self.end - taken)) > 0:
-            text += f", up to about {duration(left).replace('.0 ', ' ')} left"
+            left_ = duration(left).replace(".0 ", " ")
+            text += f", {'about' if self.open_ended else 'up to about'} {left_}"
+            text += " or more left" if self.open_ended else " left"
         self.tell(text)
 
 

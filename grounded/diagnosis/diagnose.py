@@ -142,7 +142,7 @@ def diagnose(
         )
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress, _done)
+    options, tick = options or DiagnosisOptions(), Stages(progress, _done, open_ended=True)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:
         raise GroundedError(

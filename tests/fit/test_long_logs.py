@@ -65,11 +65,15 @@ def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
     assert replace(data, records=data.records[:1]).batch(at.theta).count < at.count
 
 
-def clocked(monkeypatch, stages):
+SHARES = (0.01, 0.1, 0.3)
+
+
+def clocked(monkeypatch, stages, **options):
     """What is told at each (stage, time) by `Stages` that know the least share done."""
     clock, told = [0.0], []
     monkeypatch.setattr("grounded.progress.time.monotonic", lambda: clock[0])
-    tell = Stages(told.append, lambda stage, k: {"scan": (0.01, 0.1, 0.3)[k - 1]}.get(stage, 0.0))
+    done = lambda stage, k: SHARES[k - 1] if stage == "scan" else 0.0  # noqa: E731
+    tell = Stages(told.append, done, **options)
     tell.began = 0.0
     for name, clock[0] in stages:
         tell(name)
@@ -86,6 +90,8 @@ def test_the_most_time_that_may_be_left_follows_from_the_least_share_done(monkey
     assert told[4].endswith("up to about 60 s left")  # 24 / 0.3 - 24
     assert told[5].endswith("up to about 1 s left")
     assert told[6] == "refine, 90 s so far"  # it took longer: nothing is known
+    more = clocked(monkeypatch, run, open_ended=True)  # after a gap, 6 s became 90
+    assert more[2] == "scan, 10 s so far, about 90 s or more left"
 
 
 def test_a_part_of_a_stage_counts_as_another_one():
