@@ -695,7 +695,11 @@ def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w,
 def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
     """`run c0003 again`, said `propose`, and then: `none is waiting: name it with --candidate`."""
     w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace("max_trials = 12", "max_trials = 2"))
+    w = Workspace(w.folder)
     now = w.status()
+    assert now.standing.phase == "stopped"
     best = now.standing.incumbent.candidate.id
     other = {"c0001": "c0002", "c0002": "c0001"}[best]
     assert now.standing.outstanding is None

@@ -61,15 +61,16 @@ from grounded_trials.workspace.intake.remarks.log_faults import (
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
+ENDED = ("stopped", "converged")  # phases of a search
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
 def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
-    """Return a log as another run of the best candidate, if it clearly is one.
+    """Return a log as another run of the best candidate, if the search ended and it clearly is one.
 
     Raises:
-        GroundedError: `error` if it is not, with the command that fits the log: another candidate,
-            or data.
+        GroundedError: `error` if not, with the command that fits the log: the best, another
+            candidate, or data.
     """
     if not error.best:
         raise error
@@ -80,7 +81,8 @@ def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
         raise
     except GroundedError as refused:
         raise GroundedError(str(error), refused.then) from None
-    if set(seen.warnings) - {*read.warnings}:  # where it begins, or whose it is, is in doubt
+    doubts = set(seen.warnings) - {*read.warnings}  # about where it begins, or whose it is
+    if doubts or standing_in(workspace, ahead=True).phase not in ENDED:
         raise error
     note = (
         f"no candidate is waiting for a trial; its commands are those of {error.best}, the best: "
