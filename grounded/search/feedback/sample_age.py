@@ -46,9 +46,9 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
     Args:
         task: the manoeuvre, whose states the robot measures.
         candidate: the one whose policy acted.
-        trials: its whole trials.
+        trials: its trials; of one that ended early, what there is counts.
     """
-    policy, H = candidate.policy, task.horizon
+    policy = candidate.policy
     if policy.gain is None:
         return 0.0
     angles = tuple(map(bool, task.model.angle_mask))
@@ -56,13 +56,18 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
     size = np.abs(policy.feedforward).max(axis=0) + 1e-12
     off, by_age = list[Array](), list[Array]()
     for trial in trials:
-        x, sent = trial.states[:H], trial.inputs[:H]
+        T = min(task.horizon, trial.finite_steps)
+        if T < WINDOW:
+            continue
+        x, sent = trial.states[:T], trial.inputs[:T]
         past = policy.past if trial.start_inputs is None else trial.start_inputs
         probed = PROBED * task.dt
-        seen = np.stack([x, x - probed * rates(task, trial)])
+        seen = np.stack([x, x - probed * rates(task, trial.until(T))])
         now, later = policy.commands(seen, past, sent[None])
         off.append((sent - now) / size)
         by_age.append((later - now) / probed / size)
+    if not off:
+        return 0.0
     e, g = np.concatenate(off), np.concatenate(by_age)
     squares = float(np.vdot(e, e))
     if not squares > NOTHING**2 * e.size or not (steep := float(np.vdot(g, g))) > 0:
@@ -103,7 +108,7 @@ def different(task: Task, age: float, other: float) -> bool:
 
 
 def rates(task: Task, trial: Trial) -> Array:
-    """Return the rate of each state along a trial's first H steps, (H, n).
+    """Return the rate of each state along a trial's first H steps, (H, n), or all that it has.
 
     Its noise does not correlate with that of the state itself, which would give an age.
     """

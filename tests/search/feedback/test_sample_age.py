@@ -49,6 +49,19 @@ def test_the_age_is_found_from_commands_and_states(age, seed):
     assert found == pytest.approx(age, abs=0.003 if seed is None else 0.005)
 
 
+@pytest.mark.parametrize("share", [0.4, 0.9])
+def test_the_age_is_found_in_a_run_that_was_stopped(share):
+    """`next` of a run that was stopped half way ended in a traceback."""
+    task = rover_task()
+    made = first(task)
+    stopped = driven(task, made, 0.04).until(round(share * task.horizon))
+    assert sample_age(task, made, [stopped]) == pytest.approx(0.04, abs=0.004)
+    padded = replace(stopped, states=stopped.whole(task.horizon).states)
+    padded = replace(padded, inputs=stopped.whole(task.horizon).inputs)
+    assert sample_age(task, made, [padded]) == sample_age(task, made, [stopped])
+    assert sample_age(task, made, [stopped.until(2)]) == 0.0
+
+
 @pytest.mark.parametrize("seed", [None, 0, 1])
 def test_fresh_samples_have_no_age_though_logs_are_noisy(seed):
     task = rover_task()
