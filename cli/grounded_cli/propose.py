@@ -349,7 +349,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if not gain < max(missed):
         doubt = f"{promise}, less than its likely error, {number(candidate.likely_off)}"
     blind = missed[-1] > MISSED * abs(last[-1].utility)
-    if blind or candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say it
+    little = gain < LITTLE * abs(best.utility) and not best.is_unsteady
+    if blind or candidate.doubtful or not little:  # a note may say it
         return doubt
     return f"{doubt}: run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
 

@@ -96,7 +96,7 @@ def command(
         step_target,
         swing_up,
     )
-    from grounded_trials.workspace.candidates.at_rest import rest_of_trials
+    from grounded_trials.workspace.candidates.at_rest import rest_of_trials, rest_value
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import without_range
@@ -164,10 +164,11 @@ def command(
         show(field(name, text, "  "))
     if free:
         resting = _rest_of(model, free) * (shape == "line")
-        reading = _reading_at_rest(workspace, resting)
         text = _free(free, reward, velocities(model)) if resting else _free(free, reward)
         if resting:
-            begins = start.get(resting, 0.0)
+            begins, last = start.get(resting, 0.0), {n: float(c[-1]) for n, c in columns.items()}
+            last |= {n: 0.0 for n in velocities(model) if n in last}
+            reading = rest_value(workspace, last, resting)
             text += _at_the_end(model, columns, resting, begins, reading)
         show(field("free", text, "  "))
     if ran:
@@ -249,12 +250,6 @@ def _rest_of(model: Model, free: list[str]) -> str:
     from grounded_trials.logs.inspection.inspect_pairs import velocities
 
     return next((name for name in free if name in velocities(model)), free[0])
-
-
-def _reading_at_rest(workspace: Workspace, name: str) -> float:
-    """Return what the sensor of a state shows at 0, by the adopted effects."""
-    biases = {str(e["name"]): float(e.get("b", 0.0)) for e in workspace.config.model.effects}
-    return biases.get(f"sensor_bias:{name}", 0.0)
 
 
 def _at_the_end(

@@ -33,6 +33,7 @@ Slopes = Literal[
 
 LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
 SURE = 0.95  # probability of an improvement from which it counts as one
+UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ class Candidate(Result):
         off = f"{self.likely_off:.3g}"  # beyond the base's whole cost the size means nothing
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
-        if best and self.predicted_gain < LITTLE * abs(best.utility):
+        if best and not best.is_unsteady and self.predicted_gain < LITTLE * abs(best.utility):
             stop = (
                 f". Run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
             )
@@ -197,6 +198,15 @@ class Tried(Result):
     def promised(self) -> float:
         """Predicted utility of its logs, including all of the sensor noise that these contain."""
         return self.candidate.predicted_utility - self.noise_missed
+
+    @property
+    def is_unsteady(self) -> bool:
+        """Whether its runs scatter by about as much as they cost.
+
+        Noise in many samples scatters far less than it costs. So something else decides how a run
+        goes, such as where dry friction holds, and another policy may well be steadier.
+        """
+        return bool(self.deviation > UNSTEADY * abs(self.utility))
 
     @cached_property
     def standard_error(self) -> float:

@@ -33,7 +33,6 @@ PART = 0.3  # share of a gain due to different start states from which on it is 
 ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
-UNSTEADY = 0.5  # standard deviation of its runs, as a share of its cost
 MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
 FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
 
@@ -228,15 +227,6 @@ def runs_to_show(gain: float, best: Tried) -> int:
     return math.ceil(2 * (SHOWN * best.deviation / gain) ** 2)
 
 
-def is_unsteady(best: Tried) -> bool:
-    """Return whether a candidate's runs scatter by about as much as they cost.
-
-    Noise in many samples scatters far less than it costs. So something else decides how a run goes,
-    such as where dry friction holds, and another policy may well be steadier.
-    """
-    return bool(best.deviation > UNSTEADY * abs(best.utility))
-
-
 def runs_needed(gain: float, best: Tried) -> str:
     """Say how many runs show a gain: "22 runs", or that it takes more than anyone makes."""
     runs = runs_to_show(gain, best)
@@ -250,7 +240,7 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
     if not 0 < gain < least:
         return ""
     stop = f". If that is too many, stop with {own}" * (not made.doubtful)  # else `doubt` says it
-    if is_unsteady(best):
+    if best.is_unsteady:
         stop = (
             f". But that is about as much as {own} costs, and {made.id} may be steadier, which its "
             "first runs would show"

@@ -32,7 +32,7 @@ from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import BY_STEP, Candidate, Tried
-from grounded.search.certainty import is_unsteady, one_trial_error, runs_needed
+from grounded.search.certainty import one_trial_error, runs_needed
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
@@ -124,7 +124,7 @@ def propose(
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":
             return made
-        note = f"the plan is not optimal in the model: {plan.sentence}"
+        note = f"the plan is not optimal in the model: {plan.sentence}. It can be run all the same"
         return replace(made, notes=(*made.notes, note))
     found = _improvement(make, now.incumbent, options)
     if found.candidate is None:
@@ -264,7 +264,7 @@ def _below_noise(
     gain = made.promised_over(best)
     if not (options.damps and lost and made.grounded and gain < error):
         return None
-    if gain > 0 and is_unsteady(best):
+    if gain > 0 and best.is_unsteady:
         return None
     own = best.candidate.id
     sentence = f"{_steps_lost(make, own)} did not improve, and the next "

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 
 MOST = 3  # effects that are looked for if not all trials are used: each more takes 20 s
-STEPS = 1600  # total steps of the diagnosed trials, so that a demo ends within a minute or two
+MANY = 1.5  # times as many trials as fit into STEPS: fewer are all used
+STEPS = 800  # total steps of the diagnosed trials, so that a demo ends within a minute or two
 
 
 @click.command("demo")
@@ -105,7 +106,7 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
     last = sorted((t for one in standing.history for t in one.trials), key=lambda t: t.id)[-1:]
     repeats = [*best.trials] if best else []  # they show how far runs scatter
     chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *last, *repeats, *tried)))
-    return chosen[:most] if standing.trials > most else []
+    return chosen[:most] if standing.trials > MANY * most else []
 
 
 def _tell(document: dict[str, Any], verdict: list[str]) -> None:

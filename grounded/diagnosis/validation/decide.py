@@ -60,7 +60,8 @@ OVERRULES = (3.0, 0.1)  # the same for a rival that is likely under another nois
 FROM_NONE = (3.0, 0.3)  # the same if the likeliest hypothesis has no cause: that noise is all
 SEEN = 0.08  # log gain of a claim, in some channel at some horizon, below which it is not made
 SLIGHTLY = (4.0, 0.04)  # scatters and largest log gain from which it may be less, if likely
-NO_HELP = 0.005  # mean log gain below which predictions are as good without a cause
+NO_HELP = 0.005  # mean log gain below which predictions are as good without a cause, or
+SPECK = 0.01  # share of what all causes gain
 SLIGHT = 0.02  # smallest share of the total gain, in some channel, of a cause that is named
 AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gains,
 FAR = 1.5  # of at most this log gain (errors down to a quarter) if it has another noise structure
@@ -353,7 +354,7 @@ def _pruned(
                 name
                 for name, less in without.items()
                 if gains[name].channels.max() < least
-                or (some and gains[name].mean < NO_HELP)
+                or (some and gains[name].mean < max(NO_HELP, SPECK * least / SLIGHT))
                 or not _pays(search, ruler, less, fit, white)
             ]
         )

@@ -10,10 +10,12 @@ from cli import grounded
 from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.candidates.first_plan import in_another_unit
 from grounded_trials.workspace.folder import Folder
 from workspaces import make
 
+DRY = '{name = "coulomb_friction:v", c = 0.04, width = 0.001}'
 LIFTED = """
 from grounded import Model, Param
 
@@ -83,6 +85,27 @@ def test_a_start_that_a_target_gives_is_told_for_each_target_where_its_sensor_ha
         assert told() == ""  # once
     file.write_text(file.read_text().replace("start = { }", "start = { th = 0.0174, u = 0 }"))
     assert told() == ""
+
+
+@pytest.mark.parametrize(
+    ("effects", "shown"),
+    [
+        ("", 0.0),
+        ('{name = "offset:v", c = 0.1214}', -0.1214 / 7.0),
+        ('{name = "sensor_bias:beam", b = -0.0173}', -0.0173),
+        (f'{{name = "offset:v", c = 0.1214}}, {DRY}', -0.1214 / 7.0),
+        ('{name = "offset:v", c = 0.1214}, {name = "sensor_lag:v", tau = 0.06}', -0.1214 / 7.0),
+    ],
+)
+def test_a_free_state_rests_where_the_adopted_effects_let_it(tmp_path, effects, shown):
+    """A ball was to stop on a beam at 0 rad, which the adopted offset says is not level."""
+    ball = BALANCED.replace("a.u,", "7.0 * s.beam,").replace("10 * s.th - a.u", "8 * (a.u - s.w)")
+    (tmp_path / "mine.py").write_text(ball.replace('"th"', '"beam"'))
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "mine.py")
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text().replace("[task]", f"effects = [{effects}]\n[task]", 1))
+    found = rest_value(Folder(w.folder), {"x": 0.15}, "beam")
+    assert found == pytest.approx(shown, abs=2e-4)
 
 
 def test_an_arm_that_its_friction_holds_needs_no_input_before_the_start(tmp_path):

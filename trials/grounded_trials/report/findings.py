@@ -27,7 +27,7 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
-from grounded_trials.workspace.next_step import outlook
+from grounded_trials.workspace.next_step import EXPORT, nothing_to_do, outlook
 from grounded_trials.workspace.off_target import (
     WITHIN,
     rates_among,
@@ -120,8 +120,12 @@ class Findings:
     @property
     def next_trial(self) -> str:
         """The trial that the last diagnosis asks for; "" if it is outdated, see `Since`."""
-        fresh = self.diagnosis is not None and not self.since.sentence
-        return self.diagnosis.next_trial if self.diagnosis is not None and fresh else ""
+        if self.diagnosis is None or self.since.sentence:
+            return ""
+        best = self.standing.incumbent
+        if self.then == EXPORT and best is not None and self.diagnosis.kind != "none":
+            return nothing_to_do(self.diagnosis, best.candidate.id)
+        return self.diagnosis.next_trial
 
     @property
     def ahead_s(self) -> float:

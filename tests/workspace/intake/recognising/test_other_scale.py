@@ -149,7 +149,7 @@ def test_a_log_whose_scale_is_wrong_is_told_so(tmp_path, before):
     np.savetxt(path, table, delimiter=",", header=head, comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "ran c0002", "v 2 times", "small", "[log]", "program")
+    assert holds(str(refused.value), "ran c0002", "v 2 times", "small", "[log.state.v]", "program")
 
 
 @pytest.mark.parametrize("before", [0.0, 0.7])

@@ -94,7 +94,7 @@ def candidate_table(findings: Findings) -> list[Block]:
             "iter.": str(c.iteration),
             "alpha": f"{c.alpha:g}",
             "damping": figure(c.damping, 2) if c.base else "-",
-            "predicted utility": figure(c.predicted_utility),
+            "predicted utility": figure(tried.promised),
             "real utility": figure(tried.utility),
             "std. error": spread(tried.standard_error),
             "verdict ": findings.standing.verdict(tried),

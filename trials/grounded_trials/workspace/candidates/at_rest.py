@@ -10,6 +10,7 @@ gravity). A position that may be anywhere is for the user to choose.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,7 @@ BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slo
 STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
 LEAST = 3  # steps of it
 STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
+NEWTON, PROBE = 10, 1e-4  # iterations for a state at rest, difference for its slope
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
@@ -177,6 +179,46 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
             if (moved <= STILL * away).all():
                 return np.append(x, u)
     return None
+
+
+def rest_value(workspace: Folder, at: Mapping[str, float], name: str) -> float:
+    """Return what the sensor of one state shows where the robot rests; 0 if that is not found.
+
+    Adopted effects count: on a beam that is not level, or whose sensor has a bias, a ball rests at
+    another angle than 0. Dry friction would hold it at many, so it is softened.
+
+    Args:
+        workspace: the workspace with the model.
+        at: the other states there, by name; those that are not given are 0.
+        name: the state.
+    """
+    try:
+        task = workspace.planner.loose
+    except GroundedError:  # [reward] still weighs what the target has no column for
+        return 0.0
+    names = task.model.state_names
+    logged = {i: names[k] for i, k in true_values(names, names[workspace.task.model.n :]).items()}
+    x = np.array([at.get(logged.get(i, own), 0.0) for i, own in enumerate(names)])
+    problem, k = task.problem(), names.index(name)
+    still = np.array([is_clock(own) for own in names])
+
+    def moved(value: float) -> Array:
+        begun = x.copy()
+        begun[[k, *(i for i, own in logged.items() if own == name)]] = value
+        u = task.past[None]
+        with np.errstate(all="ignore"):
+            after = problem.system.step(begun[None], u, problem.p, problem.dt, problem.smoothing)
+        return np.where(still, 0.0, task.model.difference(after[0], begun))
+
+    value, first = 0.0, float(np.abs(moved(0.0)).max())
+    for _ in range(NEWTON):
+        now = moved(value)
+        slope = (moved(value + PROBE) - now) / PROBE
+        if not (steep := float(slope @ slope)) > 0 or not np.isfinite(steep):
+            return 0.0
+        value -= float(slope @ now) / steep
+    rests = np.abs(moved(value)).max() <= STILL * first
+    return value if rests and abs(value) > NOTHING else 0.0
 
 
 def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:

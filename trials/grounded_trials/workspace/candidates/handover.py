@@ -305,7 +305,9 @@ class Check:
         if not self.same_task:
             yield f"{name} was made for a different task from that in grounded.toml"
         elif self._changed:
-            again = "it was predicted again" if self._predictable else "its prediction is outdated"
+            again = "its prediction is outdated"
+            if self._predictable:
+                again += ", and its run was predicted again only to check it against the limits"
             yield f"the model was changed since {name} was made; {again}"
         if self.same_task and not self.standing.trials:
             yield from self._untried()
