@@ -64,8 +64,7 @@ class Stages:
         text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
         if self.end is not None and (left := _round(self.end - taken)) > 0:
             left_ = duration(left).replace(".0 ", " ")
-            text += f", {'about' if self.open_ended else 'up to about'} {left_}"
-            text += " or more left" if self.open_ended else " left"
+            text += f", {'about' if self.open_ended else 'up to about'} {left_} left"
         self.tell(text)
 
 

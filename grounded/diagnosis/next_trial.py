@@ -91,7 +91,9 @@ def next_trial(
     if not claims.names and look:
         return look
     if not claims.names and not claims.blamed:
-        return "None is needed: nothing is tied and nothing needs adopting."
+        if adopted:  # in the diagnosis that they are from, some may have tied with others
+            return "None is needed: nothing more is found beside what was adopted."
+        return "None is needed: nothing is found, so nothing is tied or to be adopted."
     if worse:
         return f"Adopt nothing yet: {worse}. To settle that, run another trial and diagnose again."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):

@@ -150,7 +150,7 @@ def test_a_stage_that_lasts_is_not_said_twice_in_the_same_words(capsys, monkeypa
     first, second = capsys.readouterr().err.splitlines()
     assert first == "planning ..." and re.fullmatch(r"planning, \d s so far \.\.\.", second)
     with terminal.stages() as tell:
-        tell("scan (one more effect), 13 min so far, about 2 min or more left")
+        tell("scan (one more effect), 13 min so far, about 2 min left")
         time.sleep(1.0)
     _, second = capsys.readouterr().err.splitlines()  # `13 min so far, 810 s so far`
     assert re.fullmatch(r"scan \(one more effect\), \d s so far \.\.\.", second)

@@ -168,7 +168,11 @@ def begin(
     if kind is not None and kind not in KINDS:
         raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
     if inputs and (model is not None or kind not in (None, "generic")):
-        raise GroundedError("--inputs needs a skeleton of kind generic: others have fixed inputs")
+        raise GroundedError(
+            "--inputs needs a skeleton of kind generic: others know their inputs, and a car or a "
+            "rover takes the motor command that the log has: leave --inputs out, or set --kind "
+            "generic"
+        )
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
     options = {"--model": model, "--kind": kind, "--dt": dt, "--inputs": ",".join(inputs)}

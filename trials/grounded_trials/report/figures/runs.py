@@ -133,7 +133,8 @@ def bias_figure(findings: Findings) -> Figure | None:
         drawn: list[tuple[Array, str, str, float]] = []
         for k, run in enumerate(runs):
             role = "model" if k == 0 else "best" if k == len(runs) - 1 else STEPS[(k - 1) % 3]
-            drawn.append((run.residual[:, i], role, f"iteration {run.candidate.iteration}", 1.0))
+            words = f"{run.candidate.id}, iteration {run.candidate.iteration}"
+            drawn.append((run.residual[:, i], role, words, 1.0))
         best = findings.best
         if best is not None and best.explained is not None and findings.better is not None:
             words = f"last iteration, model {findings.better.name}"
