@@ -63,8 +63,8 @@ class Stages:
             return
         text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
         if self.end is not None and (left := _round(self.end - taken)) > 0:
-            left_ = duration(left).replace(".0 ", " ")
-            text += f", {'about' if self.open_ended else 'up to about'} {left_} left"
+            most = "" if self.open_ended else "up to "
+            text += f", {most}about {duration(left).replace('.0 ', ' ')} left"
         self.tell(text)
 
 

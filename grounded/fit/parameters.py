@@ -105,11 +105,11 @@ def fit(
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
             if tied:
-                tied[[*tied][-1]] += [n for n in before if n not in unidentified(found)]
+                tied[[*tied][-1]] += [n for n in before if n not in unidentified(found.params)]
             least = least_known(model, found)
             if least is None or unknowns.k == 1:
                 return _of(found.beside(asked, tied), given)
-            before = [name for name in unidentified(found) if name != least]
+            before = [name for name in unidentified(found.params) if name != least]
             tied[least] = []
             unknowns = unknowns.less(unknowns.names.index(least))
 

@@ -157,9 +157,9 @@ class Fit(Result):
         return found
 
 
-def unidentified(found: Fit) -> list[str]:
+def unidentified(params: Mapping[str, FittedValue]) -> list[str]:
     """Return the names of the unknowns that the data do not tell."""
-    return [name for name, e in found.params.items() if not e.identified]
+    return [name for name, e in params.items() if not e.identified]
 
 
 def least_known(model: Model, found: Fit) -> str | None:
@@ -171,7 +171,7 @@ def least_known(model: Model, found: Fit) -> str | None:
         param = model.params.get(name)
         return 0.0 if param is None else param.spread / max(abs(param.value), 1e-9)
 
-    lost = unidentified(found)
+    lost = unidentified(found.params)
     return min(lost, key=sure) if lost else None
 
 
@@ -262,7 +262,7 @@ def _sentence(
     if not np.isfinite(found.climb.at.loglik):
         return f"nothing was fitted: {found.status}; check units, signs and start values"
     parts = [found.status]
-    unknown = [name for name, estimate in params.items() if not estimate.identified]
+    unknown = unidentified(params)
     if unknown:
         parts.append("the data do not identify " + ", ".join(unknown))
     for group in wide.together:

@@ -16,7 +16,7 @@ from grounded.rollout import Rollout, Run, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
-from grounded.search.feedback.sample_age import planned_age
+from grounded.search.feedback.sample_age import planned_age, run_ages
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread, too_strong
 from grounded.search.scatter import beyond_noise
@@ -87,7 +87,7 @@ class About:
         self.grounding = ground(plan, own, match_inputs=matched)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         # without a bias: independent of noise and start
-        age = planned_age(planner.task, incumbent, make.now.history)
+        age = planned_age(planner.task, incumbent, make.ages)
         self.plain = replace(planner.plan.problem(exact=True), age=age)
         self.real = exact.on(replace(plan.problem(exact=True), age=age))
         self.theta = planner.widened(incumbent.candidate.policy)
@@ -496,6 +496,11 @@ class Maker:
         gently, loose = partial(self._gently, own, problem), self.planner.loosened(problem)
         new = steadied(problem, own, gently, loose)
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
+
+    @cached_property
+    def ages(self) -> list[float]:
+        """The ages of the samples in the runs so far [s]."""
+        return run_ages(self.planner.task, self.now.history)
 
     @cached_property
     def quiet(self) -> Quiet | None:

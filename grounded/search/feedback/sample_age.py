@@ -78,15 +78,14 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
     return age if clear else 0.0
 
 
-def planned_age(task: Task, incumbent: Tried, history: Sequence[Tried]) -> float:
+def planned_age(task: Task, incumbent: Tried, ages: Sequence[float]) -> float:
     """Return the age of samples to plan for [s]: that of the incumbent's runs, or of all runs.
 
     Args:
         task: the manoeuvre.
         incumbent: the best candidate, with its trials.
-        history: all candidates with their trials.
+        ages: those of all runs [s], see `run_ages`.
     """
-    ages = run_ages(task, history)
     if ages and different(task, min(ages), max(ages)):
         return float(np.mean(ages))
     return sample_age(task, incumbent.candidate, incumbent.trials)

@@ -111,8 +111,8 @@ def test_a_plan_is_for_the_mean_age_if_it_differs_from_run_to_run():
 
     steady, other = tried(0.014, 0.016), tried(0.002)
     alone = sample_age(task, made, steady.trials)
-    assert planned_age(task, steady, [steady]) == alone
+    assert planned_age(task, steady, run_ages(task, [steady])) == alone
     ages = run_ages(task, [steady, other])
     assert ages == pytest.approx([0.014, 0.016, 0.002], abs=0.003)
-    assert planned_age(task, steady, [steady, other]) == pytest.approx(np.mean(ages))
+    assert planned_age(task, steady, ages) == pytest.approx(np.mean(ages))
     assert not different(task, 0.010, 0.0145) and different(task, 0.010, 0.016)  # dt is 50 ms

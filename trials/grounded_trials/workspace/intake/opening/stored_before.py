@@ -43,11 +43,7 @@ def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | N
     if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
         return
     identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
-    if not as_run:  # the wrong file, most likely; a diagnosis may rest on it
-        raise GroundedError(
-            f"{path} is stored already, as {identity}, data: pass the log of the run of {wanted}. "
-            f"Only if this is one, discard {identity} and ingest it again"
-        )
+    refuse_known_data(path, stored)  # the wrong file, most likely; a diagnosis may rest on it
     raise GroundedError(
         f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
         f"use it as {_what(wanted)} instead, discard {identity} first",
