@@ -20,7 +20,7 @@ from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adoptable import joined
-from grounded_trials.workspace.adopting import as_adopted, left_behind
+from grounded_trials.workspace.adopting import as_adopted, left_behind, tied_when_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
@@ -65,26 +65,30 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
         since: changes since then.
     """
     table, task = workspace.config.model, workspace.origin
-    known = _Known(diagnosis, as_adopted(workspace))
+    known, ties = _Known(diagnosis, as_adopted(workspace)), tied_when_adopted(workspace)
     clauses = [_clause(effect, task.model, known) for effect in table.effects]
     clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
     if not clauses:
         return None
-    rows = tuple(_rows(task.model, table, known))
+    rows = tuple(_rows(task.model, table, known, ties))
     found = Settled(tuple(clauses), rows=rows)
+    names = [str(effect["name"]) for effect in table.effects]
+    unsure = [f"{c}{_or_else(ties.get(n, ()))}" for n, c in zip(names, clauses, strict=False)]
+    with_ties = replace(found, adopted=(*unsure, *clauses[len(names) :]))
     if diagnosis is None or diagnosis.no_cause:
-        return found
+        return with_ties
     if not since.changed:
         text = gained(diagnosis, task, now="crude", before="outset", who=NOW)
         causes = diagnosis.verdict.causes or diagnosis.effects
         left, briefly = (_still(diagnosis, some) for some in (causes, diagnosis.effects))
-        return replace(found, gained=text, left=left, briefly=briefly)
+        return replace(with_ties, gained=text, left=left, briefly=briefly)
     if not _as_claimed(diagnosis, table):
-        return found
+        return with_ties
     before = "outset" if gained(diagnosis, task, before="outset") else "crude"
     text = gained(diagnosis, task, before=before, who=NOW)
     left, briefly = still_open(diagnosis), still_open(diagnosis, ties=False)
-    return replace(found, gained=text, left=left, closed=True, briefly=briefly)
+    told = found if set(ties) <= set(diagnosis.effects) else with_ties  # `left` has its ties
+    return replace(told, gained=text, left=left, closed=True, briefly=briefly)
 
 
 def measured_now(workspace: Folder) -> str:
@@ -217,7 +221,16 @@ def _clause(entry: Mapping[str, Any], model: Model, known: _Known) -> str:
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
 
-def _rows(model: Model, table: ModelTable, known: _Known) -> Iterator[tuple[str, str]]:
+def _or_else(others: Sequence[str]) -> str:
+    """Return a clause on the effects that an adopted one may stand for; "" for none."""
+    if not others:
+        return ""
+    return f" or, as the trials could not tell them apart, {' or '.join(others)} instead"
+
+
+def _rows(
+    model: Model, table: ModelTable, known: _Known, ties: Mapping[str, Sequence[str]]
+) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter."""
     from grounded.diagnosis.cause_words import give_or_take
     from grounded.effects import param_name
@@ -237,7 +250,7 @@ def _rows(model: Model, table: ModelTable, known: _Known) -> Iterator[tuple[str,
         units = {q.name: q.unit for q in quantities if q.name in entry}
         units = units or {key: "" for key in entry if key != "name"}
         each = (f"{q} = {told(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
-        yield name, ", ".join(each)
+        yield name, ", ".join(each) + "".join(f", or {one}" for one in ties.get(name, ()))
     for name, value in table.params.items():
         if name in model.params and model.params[name].value != value:
             first, unit = model.params[name].value, model.params[name].unit

@@ -138,7 +138,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     known = _as_estimated(found, names, nominal, calibrated)
-    step = {"names": names, "before": _written(model), "after": after, "known": known}
+    ties = {name: others for name in names if (others := _rivals(found, name))}
+    step = {"names": names, "before": _written(model), "after": after, "known": known, "ties": ties}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
@@ -204,6 +205,28 @@ def as_adopted(workspace: Folder) -> dict[str, Estimate]:
     except (GroundedError, AttributeError, TypeError, ValueError):
         return {}
     return found
+
+
+def _rivals(found: Diagnosis, name: str) -> list[str]:
+    """Return the effects that a diagnosis could not tell from this one."""
+    groups = [group for group in found.indistinguishable if name in group]
+    return list(dict.fromkeys(other for group in groups for other in group if other != name))
+
+
+def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
+    """Return the effects that the trials could not tell from an adopted one, by its name.
+
+    Nothing compares them again, so a tie lasts as long as the one is part of the model and the
+    other is not. Empty if reports/adoptions.json is missing or can't be read.
+    """
+    now, found = [str(one["name"]) for one in workspace.config.model.effects], dict[str, Any]()
+    try:
+        for step in adoptions(workspace)[0]:
+            found |= dict.fromkeys(step["names"], ()) | dict(step.get("ties", {}))
+        rest = {name: [str(one) for one in found.get(name, ()) if one not in now] for name in now}
+    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
+    return {name: tuple(others) for name, others in rest.items() if others}
 
 
 def _rewritten(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
 from grounded_trials.wording import count, rendered
+from grounded_trials.workspace.adopting import tied_when_adopted
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
@@ -109,7 +110,8 @@ def diagnose_in(
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    found = replace(found, made=made, preflight=seen, ranking=known)
+    limits = (*found.unknowable, *_not_compared(workspace))
+    found = replace(found, made=made, preflight=seen, ranking=known, unknowable=limits)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
     try:
@@ -150,6 +152,15 @@ def diagnose_in(
         which = "The next candidate will do: it is planned with the model as it is."
         found = replace(found, next_trial=f"{found.next_trial} {which}")
     return replace(found, then=then)
+
+
+def _not_compared(workspace: Folder) -> Iterator[str]:
+    """Yield a sentence for each adopted effect that tied with others when it was adopted."""
+    for name, others in tied_when_adopted(workspace).items():
+        yield (
+            f"{name} is part of the model, but when it was adopted the trials could not tell it "
+            f"from {' or '.join(others)}; this diagnosis does not compare them again"
+        )
 
 
 def _deeper(found: Diagnosis, took: float) -> str:
