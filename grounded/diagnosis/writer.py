@@ -44,7 +44,7 @@ from grounded.places import position
 from grounded.task import Task
 from grounded.trial import Trial
 
-HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more there
+HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more there; of a gap
 MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
 
 
@@ -130,11 +130,14 @@ class Writer:
         there = region is not None and region.occupancy < HALF and not region.of_time
         when = region.phrase if region and there else ""
         noise = not remainder  # no gap is named then
-        look = another_look(self.task, self.trials, off, when, noise=noise) if off else ""
         named = [row.effect for row in ranking if row.claimed]
+        located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
+        channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
+        if remainder and not named and channels[0].share > HALF:
+            off = channels[0].name  # where it begins: a position only sums up what its speed misses
+        look = another_look(self.task, self.trials, off, when, noise=noise) if off else ""
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
-        located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse = objection(rows, agreement, named)
@@ -177,7 +180,7 @@ class Writer:
         return Diagnosis(
             verdict=said,
             where=Where(
-                channels=self.channels(gain if located else np.full_like(gain, np.nan), rows),
+                channels=channels,
                 times=tuple(by_time(gain.sum(axis=-1), data)) if located else (),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best))
                 if located
