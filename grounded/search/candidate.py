@@ -230,6 +230,11 @@ class Tried(Result):
         return self.accepted is False and not (self.gone and self.candidate.slopes)
 
     @property
+    def crashed(self) -> bool:
+        """Whether one of its trials did not run to the end, so that it has no utility."""
+        return self.utility == -np.inf
+
+    @property
     def failed(self) -> tuple[str, ...]:
         """Ids of its trials that did not run to the end."""
         each = zip(self.trials, self.utilities, strict=True)
@@ -250,7 +255,7 @@ class Tried(Result):
         if self.accepted is None:
             return "waiting" if last or self.trials else "no trial"
         if not self.accepted:
-            return "crashed" if self.utility == -np.inf else "no better"
+            return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
         return "maybe better" if self.probability < SURE else "better"

@@ -255,11 +255,12 @@ def _below_noise(
     """Return the ended search if a step lost and the next promises less than its trial can show.
 
     Else a search under noise goes on for as long as the model promises anything. None: it goes on,
-    as it does before a loss, since many small gains add up, and if the best one's runs scatter by
-    as much as they cost: a ball's search ended so at -1.1 +- 0.6, and the next one was steady at
-    -0.55.
+    as it does before a measured loss (a failed run is none), since many small gains add up, and if
+    the best one's runs scatter by as much as they cost: a ball's search ended so at -1.1 +- 0.6,
+    and the next one was steady at -0.55.
     """
-    lost = losers_of(make.now.history, best.candidate.id, make.fingerprint)
+    measured = [tried for tried in make.now.history if not tried.crashed]
+    lost = losers_of(measured, best.candidate.id, make.fingerprint)
     error = one_trial_error(best, options.repeats)
     gain = made.promised_over(best)
     if not (options.damps and lost and made.grounded and gain < error):

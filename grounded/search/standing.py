@@ -283,9 +283,12 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
 
     Too little is less than the tolerance each on average, or in total less than the standard error
     of that gain, if repeats show it. Else a search under noise would follow lucky runs. A changed
-    model is given LOST candidates of its own.
+    model is given LOST candidates of its own. A candidate that failed, perhaps because somebody
+    stopped its run, measured no gain and does not count, unless all of the last ones failed.
     """
     history = tuple(t for t in history if t.accepted is not False or t.lost)
+    if not all(t.crashed for t in history[-PATIENCE:]):
+        history = tuple(t for t in history if not t.crashed)
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
     if not before or any(t.candidate.model != model for t in last[-LOST:]):

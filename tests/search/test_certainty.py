@@ -19,7 +19,7 @@ from grounded.search.certainty import (
     student,
     with_chances,
 )
-from grounded.search.standing import _hardly
+from grounded.search.standing import PATIENCE, _hardly
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -85,6 +85,16 @@ def test_a_gain_within_its_own_standard_error_ends_a_search():
     assert ending(-1.02, repeated=(-1.1,)) is None  # the noise is unknown
     assert ending(-1.02, repeated=(-1.1,), tolerance=0.05) == "too little gained"
     assert ending(-0.9, repeated=(-9.0, -0.2, -4.0), base="") is None  # the wild first policy
+
+
+def test_a_stopped_run_is_no_candidate_that_gained_nothing():
+    """A car stopped at 8 s ended its search, beside a command to discard that run."""
+    lost = [tried(-1.2 - k / 10, accepted=False) for k in range(3)]
+    before = (tried(-9.0, base=""), tried(-1.1), *lost)
+    crash = tried(-np.inf, accepted=False)
+    assert _hardly((*before, crash), 1e-3, "m") is None
+    assert _hardly((*before, crash, tried(-1.5, accepted=False)), 1e-3, "m") is not None
+    assert _hardly((*before, *[crash] * PATIENCE), 1e-3, "m") is not None
 
 
 def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
