@@ -188,6 +188,7 @@ class Tried(Result):
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
+    asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
 
     @cached_property
     def utility(self) -> float:
@@ -243,6 +244,8 @@ class Tried(Result):
     def verdict(self, last: bool = True) -> str:
         """Return the verdict: first, better, no better, crashed; or why it is undecided.
 
+        That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
+
         It is "maybe better" if its runs were better, but by so little that the scatter of repeats
         may explain it.
 
@@ -250,6 +253,8 @@ class Tried(Result):
             last: whether it is the latest candidate; an earlier one without a trial gets "no
                 trial" instead of "waiting".
         """
+        if self.asked:
+            return "ended early" if self.crashed else "in doubt"
         if self.in_doubt:
             return "in doubt"
         if self.accepted is None:

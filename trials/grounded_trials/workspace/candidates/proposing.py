@@ -310,13 +310,28 @@ def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
 
 
 def status_in(workspace: Folder) -> Status:
-    """Return where the search stands; if its last trial should be discarded, say that first."""
+    """Return where the search stands; it waits if its last trial should be discarded first."""
     from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 
     asked, then = unanswered(workspace)
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
-    return replace(status_of(workspace, standing_in(workspace), asked), then=then)
+    now = _undecided(standing_in(workspace), then.arguments[0])
+    return replace(status_of(workspace, now, asked), then=then)
+
+
+def _undecided(now: Standing, trial: str) -> Standing:
+    """Return the standing as it waits for the user to discard a trial, or to go on with it.
+
+    The verdict of a search that counts that trial would contradict the advice to discard it.
+    """
+    ran = next((t for t in now.history if trial in [one.id for one in t.trials]), None)
+    if ran is None:
+        return now
+    sentence = f"discard {trial}, a run of {ran.candidate.id}, or go on with it: `propose`"
+    history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
+    waits = replace(now, phase="await-trial", outstanding=ran.candidate, missing=1, history=history)
+    return replace(waits, sentence=sentence, ending="", then=None, doubt="", missed="")
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:

@@ -152,7 +152,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    warnings = (*read.warnings, *odd, *([elsewhere.told] if elsewhere else []), *checked)
+    begun = [elsewhere.told] if elsewhere and not (read.aside and not elsewhere.again) else []
+    warnings = (*read.warnings, *odd, *begun, *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.id in workspace.discarded():
@@ -163,7 +164,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow) or read.aside or (elsewhere is not None and elsewhere.again)
+    wrong = bool(slow or read.aside) or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:
@@ -182,6 +183,11 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
     rest = [one for one in history if one is not tried and one.accepted]
     outdone = max(rest, key=lambda one: one.utility, default=None)
+    if read.aside and not aside:  # `status` can't tell it from the stored trial
+        note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": read.aside}
+        with suppress(GroundedError):  # a folder that can't be written
+            workspace.notes.add(note, again=False)
+        vars(workspace).pop("noted", None)
     best = tried is not None and now is not None and now.incumbent is tried
     told = traded(workspace.task, tried, outdone) if best and tried and outdone else ""
     return Ingested(
@@ -197,10 +203,14 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         verdict=verdict,
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
-            *read.notes,
-            *filter(None, [told]),
+            *([read.before.told(used=not aside)] if read.before else []),
+            *filter(None, [*read.notes, told]),
             *(no_longer(workspace, added.id, now) if now and not added.known else ()),
-            *(odd_run(workspace, now, added.id) if now and read.doubted else ()),
+            *(
+                odd_run(workspace, now, added.id, aside=bool(read.aside))
+                if now and read.doubted and not aside
+                else ()
+            ),
         ),
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
