@@ -97,13 +97,16 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 def _predicted(proposed: Proposed) -> str:
     """Return the predicted utility, and errors in units.
 
-    If sensor noise costs much, the utility to be expected in the log is added.
+    If its log will have much sensor noise that it lacks, the utility to be expected there is added,
+    with all of the noise in it, as that of the best one is told.
     """
     assert proposed.candidate is not None
     promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
     text = f"utility {number(promised)}"
     if cost > NOISY * abs(promised):
-        text += f", about {number(promised - cost)} in its log, including sensor noise"
+        in_log = promised - cost
+        share = _of_it(proposed.noise_in_log, in_log) or ", including sensor noise"
+        text += f", about {number(in_log)} in its log{share}"
     errors = "; ".join(one.summary() for one in proposed.off_target)
     return f"{text}; off target: {errors}" if errors else text
 
@@ -182,9 +185,14 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
 
 def noise_share(best: Tried) -> str:
     """Return how much of the best one's cost is sensor noise, if it is much; else ""."""
-    if not best.noise_cost > MUCH * -best.utility:
+    return _of_it(best.noise_cost, best.utility)
+
+
+def _of_it(noise: float, utility: float) -> str:
+    """Return how much of a logged run's cost is sensor noise, if it is much; else ""."""
+    if not noise > MUCH * -utility:
         return ""
-    return f", about {number(min(best.noise_cost, -best.utility))} of it sensor noise"
+    return f", about {number(min(noise, -utility))} of it sensor noise"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
@@ -321,7 +329,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
-        noise = f", or {promised} with the sensor noise seen since" * (said != promised)
+        noise = f", or {promised} with sensor noise" * (said != promised)
         text = f"the last prediction was {said}{noise}, the real run gave {real}"
         if failed:
             text = f"the last run failed, where {said} was predicted"

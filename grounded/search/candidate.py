@@ -184,7 +184,7 @@ class Tried(Result):
     in_doubt: bool = False  # undecided because the incumbent is to be run again
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
-    noise_missed: float = 0.0  # the part of it that its prediction lacks, see `scatter`
+    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since

@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.result import with_error
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.scatter import (
+    NoiseSoFar,
     Repeats,
     beyond_noise,
     by_pieces,
     by_states,
     noise_cost,
     noise_missed,
-    sensor_noise,
     with_errors,
 )
 from grounded.task import Task
@@ -87,18 +86,28 @@ def judged(
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     best_one = incumbent and incumbent.candidate
-    noise = sensor_noise(trials, task.model.n)
-    told = with_chances(with_errors([_with_noise(task, tried, noise) for tried in history]))
+    noises = NoiseSoFar(trials, task.model.n)
+    own = [[one.id for one in candidates[k:]] for k in range(len(candidates))]
+    each = [_with_noise(task, one, noises, ids) for one, ids in zip(history, own, strict=True)]
+    told = with_chances(with_errors(each))
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
 
-def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
-    """Return the candidate with the mean cost of the noise in its logs; unchanged without logs."""
-    if not tried.trials:
-        return tried
+def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[str]) -> Tried:
+    """Return the candidate with the mean cost of the noise in its logs, and what was promised.
+
+    The promise is made with the noise known before its first run, and stays as it is.
+
+    Args:
+        task: its reward judges the logs.
+        tried: the candidate.
+        noises: the noise of the sensors over time.
+        since: ids of the candidate and of all later ones.
+    """
     made = tried.candidate
-    cost, missed = noise_cost(task, made.policy, noise), noise_missed(task, made, noise)
+    missed = noise_missed(task, made, noises.before(since))
+    cost = noise_cost(task, made.policy, noises.now) if tried.trials else 0.0
     return replace(tried, noise_cost=cost, noise_missed=missed)
 
 

@@ -23,7 +23,7 @@ predicts a run with the noise of that mean, which is less than that of a log (`n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,6 +124,33 @@ def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
     """
     each = [white_noise(trial.states[:ROWS]) for trial in trials[-LATEST:]]
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
+
+
+class NoiseSoFar:
+    """The noise of the sensors as it was known at some time, see `sensor_noise`.
+
+    Args:
+        trials: all trials, in order of storage.
+        n: number of states.
+    """
+
+    def __init__(self, trials: Sequence[Trial], n: int) -> None:
+        self.trials, self.n, self._found = trials, n, dict[int, Array]()
+
+    @property
+    def now(self) -> Array:
+        """The noise by the latest trials, (n,)."""
+        return self._at(len(self.trials))
+
+    def before(self, candidates: Collection[str]) -> Array:
+        """Return the noise by the trials before the first of candidates; if none, by that one."""
+        ran = (k for k, trial in enumerate(self.trials) if trial.candidate in candidates)
+        return self._at(max(1, next(ran, len(self.trials))))
+
+    def _at(self, count: int) -> Array:
+        if count not in self._found:
+            self._found[count] = sensor_noise(self.trials[:count], self.n)
+        return self._found[count]
 
 
 def noise_cost(task: Task, policy: Policy, noise: Array) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.scatter import noise_missed, sensor_noise
+from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import (
@@ -52,6 +52,7 @@ class Proposed(Result):
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
     lacks: str = ""  # what the last diagnosis found and the model lacks
+    noise_in_log: float = 0.0  # expected cost of all of the sensor noise in its log
 
     @property
     def candidate(self) -> Candidate | None:
@@ -167,12 +168,15 @@ def propose_in(workspace: Folder) -> Proposed:
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
-    noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
-    cost = noise_missed(workspace.task, candidate, noise)
+    noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
+    same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
+    noise = noises.before([candidate.id])
+    cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
+    whole = noise_cost(workspace.task, candidate.policy, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
     if not candidate.grounded:  # a run that no sensor measured
         off_target = tuple(replace(one, noise=0.0) for one in off_target)
-    return Proposed(proposal, path, then, cost, off_target, lacks)
+    return Proposed(proposal, path, then, cost, off_target, lacks, whole)
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:

@@ -25,7 +25,11 @@ from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
-from grounded_trials.workspace.candidates.standing_without import no_longer, odd_run
+from grounded_trials.workspace.candidates.standing_without import (
+    no_longer,
+    odd_run,
+    standing_without,
+)
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
@@ -161,7 +165,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
+    verdict = ASIDE if aside else _verdict(workspace, trial, tried)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
     wrong = bool(slow or read.aside) or (elsewhere is not None and elsewhere.again)
@@ -248,8 +252,14 @@ def _undo(identity: str) -> str:
     return f"`restore {identity}` undoes that"
 
 
-def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
+def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:
+    """Return the verdict on a run; "run again" for another one of what was the best before it."""
     if tried is None:
         return "probe" if trial.candidate else ""
-    again = tried.accepted and trial.id not in [one.id for one in tried.trials[:repeats]]
-    return "run again" if again else tried.verdict()
+    repeats = workspace.config.search.repeats
+    again = trial.id not in [one.id for one in tried.trials[:repeats]]
+    if again and tried.accepted is False and not tried.crashed:
+        before = standing_without(workspace, {trial.id}).incumbent
+        again = before is not None and before.candidate.id == tried.candidate.id
+        return "run again" if again else tried.verdict()
+    return "run again" if again and tried.accepted else tried.verdict()

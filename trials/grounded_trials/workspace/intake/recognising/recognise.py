@@ -184,8 +184,8 @@ def recognised(
                 "SECONDS"
             )
         opens = found and found.opens_alike
-        told = not (opens or other or units or pace or passed or seen.silent)
-        foreign = log and told and seen.ran and seen.ran.foreign and not seen.ran.opens
+        unread = not (opens or other or units or pace or passed or seen.silent)
+        foreign = log and unread and seen.ran and seen.ran.foreign and not seen.ran.opens
         aside = doubts[0] if turned or foreign else ""
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True, aside=aside)
     if units:
