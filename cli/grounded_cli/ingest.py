@@ -102,9 +102,9 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
         return
     _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
     show("")
-    tell_proposed(workspace, done.proposed, last=done.exported is None)
     for path in done.removed:
         remark("note", f"{path} is deleted: {path.stem} was not run and is void")
+    tell_proposed(workspace, done.proposed, last=done.exported is None)
     if done.exported is not None:
         show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
         then = next_line(NextCommand("next", ("LOG",)))

@@ -55,9 +55,8 @@ def command(json_: bool) -> None:
         show(f"\n{table(settled.rows, ('adopted', 'value'))}")
         for text in filter(None, (settled.gained, settled.briefly)):
             show("\n".join(wrapped(text, "  ", "  ")))
-        show()
     if status.outdated:
-        show(field("diagnosis", status.outdated))
+        show("\n" * bool(settled) + field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")
 
 

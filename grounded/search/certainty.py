@@ -87,9 +87,9 @@ def judged(
         history.append(tried)
     best_one = incumbent and incumbent.candidate
     noises = NoiseSoFar(trials, task.model.n)
-    own = [[one.id for one in candidates[k:]] for k in range(len(candidates))]
-    each = [_with_noise(task, one, noises, ids) for one, ids in zip(history, own, strict=True)]
-    told = with_chances(with_errors(each))
+    later = [[one.id for one in candidates[k:]] for k in range(len(candidates))]
+    pairs = zip(history, later, strict=True)
+    told = with_chances(with_errors([_with_noise(task, t, noises, ids) for t, ids in pairs]))
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 

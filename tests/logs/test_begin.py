@@ -648,6 +648,13 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert found.kind == "pendulum" and len(found.unsure) == 3
     paths = [g.path for g in (*found.states, *found.inputs)]
     assert paths == ["/csv.q", "/csv.w", "/csv.u"]
+    status = Workspace(tmp_path / "w").status()
+    assert status.then.verb == found.then.verb == "ingest" and not status.notes
+    assert Path(status.then.arguments[-1]).samefile(found.then.arguments[-1])
+    config = tmp_path / "w/grounded.toml"
+    config.write_text(re.sub("(?m)^seen_in.*", "", config.read_text()))
+    (note,) = Workspace(tmp_path / "w").status().notes
+    assert holds(note, "no log is stored", "`ingest --data LOG`", "`propose`")
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
     assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()

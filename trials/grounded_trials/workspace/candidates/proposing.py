@@ -27,7 +27,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import doubted, next_command, not_adopted
+from grounded_trials.workspace.next_step import doubted, next_command, not_adopted, not_ingested
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
@@ -292,6 +292,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.sentence if since else "",
         (
             *notes,
+            *_nothing_stored(workspace),
             *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
             *(_disowned(standing) if standing.phase != "propose" else ()),
             *_namesakes(workspace),
@@ -302,6 +303,19 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         found,
         since,
     )
+
+
+def _nothing_stored(workspace: Folder) -> list[str]:
+    """Return a note that a log may be stored first, if it is not known which; [] if it is."""
+    if workspace.store.list() or workspace.candidate_ids() or not_ingested(workspace):
+        return []
+    config = workspace.config
+    if not config.log.has("state") or config.system.reachable:
+        return []
+    return [
+        "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
+        "model lacks; without, `propose` plans with the model as it is"
+    ]
 
 
 def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
