@@ -92,8 +92,8 @@ def summary(status: Status) -> str:
         lines.append("\n" + field("utility", bars) if bars else "")
     if standing.incumbent is not None:
         best = standing.incumbent
-        text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
-        lines.append(field("best", text + noise_share(best)))
+        text = f"{best.candidate.id}, utility {number(best.utility)}{noise_share(best)}"
+        lines.append(field("best", text + _gained(standing)))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     exported = "then " * (status.again.verb == "next")

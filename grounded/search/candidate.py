@@ -186,6 +186,7 @@ class Tried(Result):
     noise_cost: float = 0.0  # cost of sensor noise in its logs
     noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
+    repeats: int = 0  # runs beyond the first of each candidate on which that rests
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on

@@ -32,7 +32,7 @@ from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import BY_STEP, Candidate, Tried
-from grounded.search.certainty import one_trial_error, runs_needed
+from grounded.search.certainty import few, one_trial_error, runs_needed
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
@@ -272,8 +272,8 @@ def _below_noise(
     if gain > 0:
         sentence += (
             f"promises {figure(gain)}, less than the standard error of a trial's gain, "
-            f"{error:.2g} (it takes {runs_needed(gain, best)} of each candidate to show such a "
-            "gain)"
+            f"{error:.2g}{few(best.repeats)} (it takes {runs_needed(gain, best)} of each candidate "
+            "to show such a gain)"
         )
     else:
         sentence += "promises no gain over its runs"

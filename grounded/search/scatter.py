@@ -46,6 +46,7 @@ class Scatter:
 
     variance: float = math.nan
     freedom: float = 0.0  # degrees of freedom of that estimate
+    repeats: int = 0  # runs beyond the first of each candidate that it rests on
 
     @property
     def known(self) -> bool:
@@ -213,13 +214,18 @@ class Repeats:
             return Scatter()
         share = parts / (parts.sum() or 1.0)
         added = min(nu / float((share**2).sum() or 1.0) - nu, PIECES - 1.0)
-        return Scatter((total + added * float(parts.sum()) / nu) / (nu + added), nu + added)
+        variance = (total + added * float(parts.sum()) / nu) / (nu + added)
+        return Scatter(variance, nu + added, round(nu))
 
 
 def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
     """Return the candidates, each with the standard deviation of a run of similar utility."""
     near = Repeats(history).near
-    return tuple(replace(t, deviation=math.sqrt(near(t.utility).variance)) for t in history)
+    each = [(tried, near(tried.utility)) for tried in history]
+    return tuple(
+        replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats)
+        for tried, found in each
+    )
 
 
 def _repeated(tried: Tried) -> bool:

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
-from grounded.search.certainty import LUCK, error_between, judged, last_improvement
+from grounded.search.certainty import LUCK, error_between, few, judged, last_improvement
 from grounded.search.scatter import Repeats
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
@@ -307,7 +307,8 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
         )
     error, known = error_between(old, best, history)
     if known and gained < error:
-        return "too little gained", f"{told} its standard error of {error:.2g} from repeats"
+        repeats = few(Repeats(history).near(best.utility).repeats) or " from repeats"
+        return "too little gained", f"{told} its standard error of {error:.2g}{repeats}"
     return None
 
 
