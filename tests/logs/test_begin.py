@@ -1082,6 +1082,19 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
 
 
+def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
+    """A car's roll rate was one, and a weight of 100 was put on it."""
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
+    columns = [t, np.sin(t), rng.normal(0, 0.005, len(t)), np.sign(np.sin(2 * t))]
+    header = "t,pose,roll_rate,servo"
+    table = np.column_stack(columns)
+    np.savetxt(tmp_path / "a.csv", table, "%.5f", ",", header=header, comments="")
+    command = ("init", tmp_path / "w", "--from", tmp_path / "a.csv", "--inputs", "servo")
+    made = grounded(*command)
+    assert made.code == 0 and "left out of model.py: roll_rate" in made.err
+    assert Workspace(tmp_path / "w").base_model.state_names == ("pose",)
+
+
 @pytest.mark.parametrize("name", ["force", "grip [N]"])
 def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     """A cart's force became a state, beside an input `u` that the log did not have."""

@@ -388,6 +388,17 @@ def test_a_missing_column_is_not_said_to_be_one_that_another_signal_is(tmp_path)
         read_signals(path, {"r": specs["r"]})
 
 
+def test_a_column_that_is_missing_names_the_columns_that_there_are(tmp_path):
+    """It listed `header`, which is no column, and hid those that are read."""
+    path = tmp_path / "a.csv"
+    path.write_text("t,pos,v\n0,0,0\n0.1,1,1\n0.2,2,2\n")
+    specs = {"x": SignalSpec("/csv.x"), "v": SignalSpec("/csv.v")}
+    with pytest.raises(GroundedError) as refused:
+        read_signals(path, specs)
+    assert holds(str(refused.value), "has no field 'x'", "pos", "v is read already")
+    assert "header" not in str(refused.value)
+
+
 def test_an_exported_candidate_is_no_log(cart_candidate):
     """It was "no column of times", and was named among the newest logs."""
     folder, file = cart_candidate
