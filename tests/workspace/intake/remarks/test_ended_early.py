@@ -34,6 +34,8 @@ def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
     assert now.then.arguments == ("t0001",) and holds(now.notes[0], "t0001", "recording")
     told = grounded("-C", w.folder, "status").out
     assert holds(told, "ended early", "waiting", "discard t0001") and "crashed" not in told
+    report = grounded("-C", w.folder, "report").out
+    assert holds(report, "ended early", "waiting") and report.split()[-2:] == told.split()[-2:]
     assert w.propose().candidate.id == "c0002"  # it counts as failed, if the user goes on
     assert w.status().then.verb != "discard"
 

@@ -334,11 +334,11 @@ def status_in(workspace: Folder) -> Status:
     asked, then = unanswered(workspace)
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
-    now = _undecided(standing_in(workspace), then.arguments[0])
+    now = undecided(standing_in(workspace), then.arguments[0])
     return replace(status_of(workspace, now, asked), then=then)
 
 
-def _undecided(now: Standing, trial: str) -> Standing:
+def undecided(now: Standing, trial: str) -> Standing:
     """Return the standing as it waits for the user to discard a trial, or to go on with it.
 
     The verdict of a search that counts that trial would contradict the advice to discard it.
