@@ -31,7 +31,6 @@ ENDS = 8  # final values are shown for models with at most this many states
 LAST = 3  # number of recent predictions whose errors are shown
 MINOR = 0.1  # of the largest reason: a smaller one is not mentioned
 LUCKY = 2.0  # standard errors within which a difference counts as scatter
-NOISY = 0.1  # share of the predicted cost above which the cost of sensor noise is shown
 MUCH = 0.2  # share of the best cost above which its part due to sensor noise is shown
 MISSED = 0.5  # share of a run's cost: a model off by more cannot say what is left to gain
 ASTRAY = 3.0  # a model that predicts more than this times a run's cost does not replay it
@@ -97,14 +96,14 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 def _predicted(proposed: Proposed) -> str:
     """Return the predicted utility, and errors in units.
 
-    If its log will have much sensor noise that it lacks, the utility to be expected there is added,
-    with all of the noise in it, as that of the best one is told.
+    If its log will have sensor noise that it lacks, the utility to be expected there is added, with
+    all of the noise in it if that is much, as that of the best one is told.
     """
     assert proposed.candidate is not None
     promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
     text = f"utility {number(promised)}"
-    if cost > NOISY * abs(promised):
-        in_log = promised - cost
+    in_log = promised - cost
+    if cost > 0 and number(in_log) != number(promised):  # which `status` shows
         share = _of_it(proposed.noise_in_log, in_log) or ", including sensor noise"
         text += f", about {number(in_log)} in its log{share}"
     errors = "; ".join(one.summary() for one in proposed.off_target)
