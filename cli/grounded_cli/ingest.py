@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.ingest import Ingested
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
-AGAIN = "run again"  # a verdict
+AGAIN, ASIDE = "run again", "set aside"  # verdicts
 BEST = ("better", "maybe better")  # verdicts on what was the best when its run arrived
 # verdict -> what it means for the search
 VERDICTS = {
@@ -42,7 +42,7 @@ VERDICTS = {
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
     "probe": ", for the diagnosis: the search ignores it",
-    "set aside": ": it does not count",
+    ASIDE: ": it does not count",
     AGAIN: ": the candidate counts with the mean of its runs",
 }
 
@@ -102,9 +102,9 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
         return
     _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
     show("")
-    tell_proposed(workspace, done.proposed, last=done.exported is None)
     for path in done.removed:
         remark("note", f"{path} is deleted: {path.stem} was not run and is void")
+    tell_proposed(workspace, done.proposed, last=done.exported is None)
     if done.exported is not None:
         show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
         then = next_line(NextCommand("next", ("LOG",)))
@@ -137,12 +137,15 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         passed = passed and (one.verdict == AGAIN or (one.known and one.verdict in BEST))
         meaning = VERDICTS.get(one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
-            meaning = "; discard it, as the warning says"
+            says = any("discard" in warning for warning in one.warnings)
+            meaning = f"; discard it, as the {'warning' if says else 'note'} says"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         text = f"utility {number(one.utility)}, {one.verdict}{_earlier(one) or meaning}"
         if one.verdict == "crashed" and one.then.verb == "discard":
             text = f"no utility: it ended early{meaning}"
+        if one.verdict == ASIDE and one.utility == float("-inf"):
+            text = f"{ASIDE}{meaning}"
         if passed and best is not None:
             text += f"; the best is now {best.candidate.id}, {number(best.utility)}"
         show(field(one.candidate, text, "  "))

@@ -31,7 +31,6 @@ ENDS = 8  # final values are shown for models with at most this many states
 LAST = 3  # number of recent predictions whose errors are shown
 MINOR = 0.1  # of the largest reason: a smaller one is not mentioned
 LUCKY = 2.0  # standard errors within which a difference counts as scatter
-NOISY = 0.1  # share of the predicted cost above which the cost of sensor noise is shown
 MUCH = 0.2  # share of the best cost above which its part due to sensor noise is shown
 MISSED = 0.5  # share of a run's cost: a model off by more cannot say what is left to gain
 ASTRAY = 3.0  # a model that predicts more than this times a run's cost does not replay it
@@ -97,13 +96,16 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
 def _predicted(proposed: Proposed) -> str:
     """Return the predicted utility, and errors in units.
 
-    If sensor noise costs much, the utility to be expected in the log is added.
+    If its log will have sensor noise that it lacks, the utility to be expected there is added, with
+    all of the noise in it if that is much, as that of the best one is told.
     """
     assert proposed.candidate is not None
     promised, cost = proposed.candidate.predicted_utility, proposed.noise_cost
     text = f"utility {number(promised)}"
-    if cost > NOISY * abs(promised):
-        text += f", about {number(promised - cost)} in its log, including sensor noise"
+    in_log = promised - cost
+    if cost > 0 and number(in_log) != number(promised):  # which `status` shows
+        share = _of_it(proposed.noise_in_log, in_log) or ", including sensor noise"
+        text += f", about {number(in_log)} in its log{share}"
     errors = "; ".join(one.summary() for one in proposed.off_target)
     return f"{text}; off target: {errors}" if errors else text
 
@@ -182,9 +184,14 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
 
 def noise_share(best: Tried) -> str:
     """Return how much of the best one's cost is sensor noise, if it is much; else ""."""
-    if not best.noise_cost > MUCH * -best.utility:
+    return _of_it(best.noise_cost, best.utility)
+
+
+def _of_it(noise: float, utility: float) -> str:
+    """Return how much of a logged run's cost is sensor noise, if it is much; else ""."""
+    if not noise > MUCH * -utility:
         return ""
-    return f", about {number(min(best.noise_cost, -best.utility))} of it sensor noise"
+    return f", about {number(min(noise, -utility))} of it sensor noise"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
@@ -321,7 +328,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if len(missed) == 1:
         promised, real = number(promises[-1]), number(last[-1].utility)
         said = number(last[-1].candidate.predicted_utility)
-        noise = f", or {promised} with the sensor noise seen since" * (said != promised)
+        noise = f", or {promised} with sensor noise" * (said != promised)
         text = f"the last prediction was {said}{noise}, the real run gave {real}"
         if failed:
             text = f"the last run failed, where {said} was predicted"

@@ -55,9 +55,8 @@ def command(json_: bool) -> None:
         show(f"\n{table(settled.rows, ('adopted', 'value'))}")
         for text in filter(None, (settled.gained, settled.briefly)):
             show("\n".join(wrapped(text, "  ", "  ")))
-        show()
     if status.outdated:
-        show(field("diagnosis", status.outdated))
+        show("\n" * bool(settled) + field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")
 
 
@@ -93,8 +92,8 @@ def summary(status: Status) -> str:
         lines.append("\n" + field("utility", bars) if bars else "")
     if standing.incumbent is not None:
         best = standing.incumbent
-        text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
-        lines.append(field("best", text + noise_share(best)))
+        text = f"{best.candidate.id}, utility {number(best.utility)}{noise_share(best)}"
+        lines.append(field("best", text + _gained(standing)))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     exported = "then " * (status.again.verb == "next")

@@ -184,10 +184,12 @@ class Tried(Result):
     in_doubt: bool = False  # undecided because the incumbent is to be run again
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
-    noise_missed: float = 0.0  # the part of it that its prediction lacks, see `scatter`
+    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
+    repeats: int = 0  # runs beyond the first of each candidate on which that rests
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
+    asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
 
     @cached_property
     def utility(self) -> float:
@@ -230,6 +232,11 @@ class Tried(Result):
         return self.accepted is False and not (self.gone and self.candidate.slopes)
 
     @property
+    def crashed(self) -> bool:
+        """Whether one of its trials did not run to the end, so that it has no utility."""
+        return self.utility == -np.inf
+
+    @property
     def failed(self) -> tuple[str, ...]:
         """Ids of its trials that did not run to the end."""
         each = zip(self.trials, self.utilities, strict=True)
@@ -238,6 +245,8 @@ class Tried(Result):
     def verdict(self, last: bool = True) -> str:
         """Return the verdict: first, better, no better, crashed; or why it is undecided.
 
+        That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
+
         It is "maybe better" if its runs were better, but by so little that the scatter of repeats
         may explain it.
 
@@ -245,12 +254,14 @@ class Tried(Result):
             last: whether it is the latest candidate; an earlier one without a trial gets "no
                 trial" instead of "waiting".
         """
+        if self.asked:
+            return "ended early" if self.crashed else "in doubt"
         if self.in_doubt:
             return "in doubt"
         if self.accepted is None:
             return "waiting" if last or self.trials else "no trial"
         if not self.accepted:
-            return "crashed" if self.utility == -np.inf else "no better"
+            return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
         return "maybe better" if self.probability < SURE else "better"

@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.result import with_error
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.scatter import (
+    NoiseSoFar,
     Repeats,
     beyond_noise,
     by_pieces,
     by_states,
     noise_cost,
     noise_missed,
-    sensor_noise,
     with_errors,
 )
 from grounded.task import Task
@@ -34,7 +33,7 @@ ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
 MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
-FEW = 4.0  # degrees of freedom below which the sentence mentions the few repeats
+FEW = 8  # repeats below which a scatter may be off by half, so that their number is told
 
 
 def judged(
@@ -87,18 +86,28 @@ def judged(
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     best_one = incumbent and incumbent.candidate
-    noise = sensor_noise(trials, task.model.n)
-    told = with_chances(with_errors([_with_noise(task, tried, noise) for tried in history]))
+    noises = NoiseSoFar(trials, task.model.n)
+    later = [[one.id for one in candidates[k:]] for k in range(len(candidates))]
+    pairs = zip(history, later, strict=True)
+    told = with_chances(with_errors([_with_noise(task, t, noises, ids) for t, ids in pairs]))
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
 
-def _with_noise(task: Task, tried: Tried, noise: Array) -> Tried:
-    """Return the candidate with the mean cost of the noise in its logs; unchanged without logs."""
-    if not tried.trials:
-        return tried
+def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[str]) -> Tried:
+    """Return the candidate with the mean cost of the noise in its logs, and what was promised.
+
+    The promise is made with the noise known before its first run, and stays as it is.
+
+    Args:
+        task: its reward judges the logs.
+        tried: the candidate.
+        noises: the noise of the sensors over time.
+        since: ids of the candidate and of all later ones.
+    """
     made = tried.candidate
-    cost, missed = noise_cost(task, made.policy, noise), noise_missed(task, made, noise)
+    missed = noise_missed(task, made, noises.before(since))
+    cost = noise_cost(task, made.policy, noises.now) if tried.trials else 0.0
     return replace(tried, noise_cost=cost, noise_missed=missed)
 
 
@@ -189,14 +198,18 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         return ""
     before, after = accepted[-2], accepted[-1]
     gain, start = after.utility - before.utility, owed_to_start(before, after, history)
-    if start:
-        return (
-            f"the last gain is {gain:.3g}: according to the model, {start:.3g} of it is due to "
-            f"the different start states of {before.candidate.id} and {after.candidate.id}, and "
-            f"{gain - start:.3g} to the policy; another run of {before.candidate.id}, from [task] "
-            "start, would show it"
-        )
     error, freedom = error_between(before, after, history)
+    if start:
+        other, rest = before.candidate.id, gain - start
+        measured = f"{gain:.3g}" + (f" +- {error:.2g}" if freedom and error else "")
+        policy = f"and {rest:.3g} to the policy"
+        if rest < 0:
+            policy = f"without which {other} would be ahead by {-rest:.3g}"
+        return (
+            f"the last gain, of {after.candidate.id} over {other}, is {measured} as measured, and "
+            f"that counts; by the model, {start:.3g} of it is due to where their runs began, "
+            f"{policy}. Another run of {other}, from [task] start, would show which is better"
+        )
     if freedom and error and _start_unknown(before, after, history):
         return (
             f"the last gain is {with_error(gain, error)} by the scatter of repeats, but "
@@ -212,8 +225,15 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
     return (
         f"the last gain is {with_error(gain, error)}: an improvement with probability "
-        f"{chance(before, after, history):.2f}" + ", from few repeats" * (freedom < FEW)
+        f"{chance(before, after, history):.2f}{few(Repeats(history).near(after.utility).repeats)}"
     )
+
+
+def few(repeats: int) -> str:
+    """Return on how many repeats a scatter rests, as a clause, if it may be far off; else ""."""
+    if not 0 < repeats < FEW:
+        return ""
+    return f", from {'a single repeat' if repeats == 1 else f'{repeats} repeats'} only"
 
 
 def one_trial_error(best: Tried, repeats: int = 1) -> float:
@@ -247,8 +267,9 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
         )
     return (
         f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "
-        f"single runs scatter by {best.deviation:.2g}, so a gain below {least:.2g} may be luck. To "
-        f"show it takes {runs_needed(gain, best)} of each of the two{stop}"
+        f"single runs scatter by {best.deviation:.2g}{few(best.repeats)}, so a gain below "
+        f"{least:.2g} may be luck. To show it takes {runs_needed(gain, best)} of each of the "
+        f"two{stop}"
     )
 
 

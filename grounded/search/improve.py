@@ -32,7 +32,7 @@ from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
 from grounded.result import figure
 from grounded.search.candidate import BY_STEP, Candidate, Tried
-from grounded.search.certainty import one_trial_error, runs_needed
+from grounded.search.certainty import few, one_trial_error, runs_needed
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
@@ -255,11 +255,12 @@ def _below_noise(
     """Return the ended search if a step lost and the next promises less than its trial can show.
 
     Else a search under noise goes on for as long as the model promises anything. None: it goes on,
-    as it does before a loss, since many small gains add up, and if the best one's runs scatter by
-    as much as they cost: a ball's search ended so at -1.1 +- 0.6, and the next one was steady at
-    -0.55.
+    as it does before a measured loss (a failed run is none), since many small gains add up, and if
+    the best one's runs scatter by as much as they cost: a ball's search ended so at -1.1 +- 0.6,
+    and the next one was steady at -0.55.
     """
-    lost = losers_of(make.now.history, best.candidate.id, make.fingerprint)
+    measured = [tried for tried in make.now.history if not tried.crashed]
+    lost = losers_of(measured, best.candidate.id, make.fingerprint)
     error = one_trial_error(best, options.repeats)
     gain = made.promised_over(best)
     if not (options.damps and lost and made.grounded and gain < error):
@@ -271,8 +272,8 @@ def _below_noise(
     if gain > 0:
         sentence += (
             f"promises {figure(gain)}, less than the standard error of a trial's gain, "
-            f"{error:.2g} (it takes {runs_needed(gain, best)} of each candidate to show such a "
-            "gain)"
+            f"{error:.2g}{few(best.repeats)} (it takes {runs_needed(gain, best)} of each candidate "
+            "to show such a gain)"
         )
     else:
         sentence += "promises no gain over its runs"

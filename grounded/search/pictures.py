@@ -36,7 +36,8 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     if not tried:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
-    whole = _utility(now, tried, number, optimum)
+    waits = [t for t in shown if not t.utilities and now.verdict(t) == "waiting"]
+    whole = _utility(now, tried + waits, number, optimum)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
     panels = (whole, *near, _steps(now, shown, number))
     unsure = any(now.verdict(t) == "maybe better" for t in shown)
@@ -127,6 +128,9 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
         f"utility {real}, predicted {figure(tried.promised)}\n{became}"
     )
+    expected = Dot(at, tried.promised, "predicted", note, "dash")
+    if not tried.utilities:
+        return [expected] if math.isfinite(tried.promised) else []
     error = tried.standard_error
     if math.isfinite(error):
         note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
@@ -135,7 +139,7 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     shape, role = _look(tried, became)
     dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
     if math.isfinite(tried.promised):
-        dots.insert(0, Dot(at, tried.promised, "predicted", note, "dash"))
+        dots.insert(0, replace(expected, note=note))
     return dots
 
 

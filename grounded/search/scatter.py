@@ -23,7 +23,7 @@ predicts a run with the noise of that mean, which is less than that of a log (`n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +46,7 @@ class Scatter:
 
     variance: float = math.nan
     freedom: float = 0.0  # degrees of freedom of that estimate
+    repeats: int = 0  # runs beyond the first of each candidate that it rests on
 
     @property
     def known(self) -> bool:
@@ -126,6 +127,33 @@ def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 
+class NoiseSoFar:
+    """The noise of the sensors as it was known at some time, see `sensor_noise`.
+
+    Args:
+        trials: all trials, in order of storage.
+        n: number of states.
+    """
+
+    def __init__(self, trials: Sequence[Trial], n: int) -> None:
+        self.trials, self.n, self._found = trials, n, dict[int, Array]()
+
+    @property
+    def now(self) -> Array:
+        """The noise by the latest trials, (n,)."""
+        return self._at(len(self.trials))
+
+    def before(self, candidates: Collection[str]) -> Array:
+        """Return the noise by the trials before the first of candidates; if none, by that one."""
+        ran = (k for k, trial in enumerate(self.trials) if trial.candidate in candidates)
+        return self._at(max(1, next(ran, len(self.trials))))
+
+    def _at(self, count: int) -> Array:
+        if count not in self._found:
+            self._found[count] = sensor_noise(self.trials[:count], self.n)
+        return self._found[count]
+
+
 def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
     """Return the mean loss of utility of a logged run due to sensor noise; >= 0.
 
@@ -186,13 +214,18 @@ class Repeats:
             return Scatter()
         share = parts / (parts.sum() or 1.0)
         added = min(nu / float((share**2).sum() or 1.0) - nu, PIECES - 1.0)
-        return Scatter((total + added * float(parts.sum()) / nu) / (nu + added), nu + added)
+        variance = (total + added * float(parts.sum()) / nu) / (nu + added)
+        return Scatter(variance, nu + added, round(nu))
 
 
 def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
     """Return the candidates, each with the standard deviation of a run of similar utility."""
     near = Repeats(history).near
-    return tuple(replace(t, deviation=math.sqrt(near(t.utility).variance)) for t in history)
+    each = [(tried, near(tried.utility)) for tried in history]
+    return tuple(
+        replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats)
+        for tried, found in each
+    )
 
 
 def _repeated(tried: Tried) -> bool:

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
-from grounded.search.certainty import LUCK, error_between, judged, last_improvement
+from grounded.search.certainty import LUCK, error_between, few, judged, last_improvement
 from grounded.search.scatter import Repeats
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
@@ -283,9 +283,12 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
 
     Too little is less than the tolerance each on average, or in total less than the standard error
     of that gain, if repeats show it. Else a search under noise would follow lucky runs. A changed
-    model is given LOST candidates of its own.
+    model is given LOST candidates of its own. A candidate that failed, perhaps because somebody
+    stopped its run, measured no gain and does not count, unless all of the last ones failed.
     """
     history = tuple(t for t in history if t.accepted is not False or t.lost)
+    if not all(t.crashed for t in history[-PATIENCE:]):
+        history = tuple(t for t in history if not t.crashed)
     before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
     if not before or any(t.candidate.model != model for t in last[-LOST:]):
@@ -304,7 +307,8 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
         )
     error, known = error_between(old, best, history)
     if known and gained < error:
-        return "too little gained", f"{told} its standard error of {error:.2g} from repeats"
+        repeats = few(Repeats(history).near(best.utility).repeats) or " from repeats"
+        return "too little gained", f"{told} its standard error of {error:.2g}{repeats}"
     return None
 
 

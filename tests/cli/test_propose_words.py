@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from grounded.search.candidate import Tried
-from grounded_cli.propose import _came_true, _samples, _what
+from grounded_cli.propose import _came_true, _predicted, _samples, _what
 
 
 def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
@@ -12,7 +12,7 @@ def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
     run = SimpleNamespace(id="t0001")
     tried = Tried(made, (run,), (-0.02,), True, noise_missed=1e-4)
     said = _came_true(made, [tried], SimpleNamespace(incumbent=None, history=(tried,)))
-    assert said.index("-0.01330") < said.index("or -0.01340 with the sensor noise seen since")
+    assert said.index("-0.01330") < said.index("or -0.01340 with sensor noise")
     twice = _came_true(made, [tried, tried], SimpleNamespace(incumbent=None, history=(tried,)))
     assert "with sensor noise, missed the utility by 0.0066" in twice
 
@@ -50,3 +50,14 @@ def test_how_old_samples_are_is_one_short_sentence(monkeypatch):
     )
     made.sample_age, ages[:] = -0.004, []
     assert "4 ms newer than in its log" in _samples(made, now, task)
+
+
+def test_the_noise_in_a_log_is_told_as_that_of_the_best_one():
+    """0.0020 of it, what a prediction lacks, stood beside the 0.0060 of the best one."""
+    made = SimpleNamespace(predicted_utility=-0.0056)
+    proposed = SimpleNamespace(candidate=made, noise_cost=0.002, noise_in_log=0.006, off_target=())
+    assert _predicted(proposed).endswith(
+        "about -0.007600 in its log, about 0.006000 of it sensor noise"
+    )
+    rest = SimpleNamespace(candidate=made, noise_cost=0.002, noise_in_log=0.001, off_target=())
+    assert _predicted(rest).endswith("in its log, including sensor noise")

@@ -648,6 +648,13 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert found.kind == "pendulum" and len(found.unsure) == 3
     paths = [g.path for g in (*found.states, *found.inputs)]
     assert paths == ["/csv.q", "/csv.w", "/csv.u"]
+    status = Workspace(tmp_path / "w").status()
+    assert status.then.verb == found.then.verb == "ingest" and not status.notes
+    assert Path(status.then.arguments[-1]).samefile(found.then.arguments[-1])
+    config = tmp_path / "w/grounded.toml"
+    config.write_text(re.sub("(?m)^seen_in.*", "", config.read_text()))
+    (note,) = Workspace(tmp_path / "w").status().notes
+    assert holds(note, "no log is stored", "`ingest --data LOG`", "`propose`")
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
     assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
@@ -1073,6 +1080,19 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert model.input_names == ("servo_deg",) and model.states["ball_vel_mm_s"] == "mm/s"
     (relation,) = integrals(model)
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
+
+
+def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
+    """A car's roll rate was one, and a weight of 100 was put on it."""
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
+    columns = [t, np.sin(t), rng.normal(0, 0.005, len(t)), np.sign(np.sin(2 * t))]
+    header = "t,pose,roll_rate,servo"
+    table = np.column_stack(columns)
+    np.savetxt(tmp_path / "a.csv", table, "%.5f", ",", header=header, comments="")
+    command = ("init", tmp_path / "w", "--from", tmp_path / "a.csv", "--inputs", "servo")
+    made = grounded(*command)
+    assert made.code == 0 and "left out of model.py: roll_rate" in made.err
+    assert Workspace(tmp_path / "w").base_model.state_names == ("pose",)
 
 
 @pytest.mark.parametrize("name", ["force", "grip [N]"])

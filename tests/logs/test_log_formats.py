@@ -14,9 +14,13 @@ from rosbags.typesys import Stores, get_typestore
 from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.formats.tables import npz_records
 from grounded_trials.formats.text_tables import column_units, table_remarks
 from grounded_trials.logs.inspection.inspect_log import inspect_log
+from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from workspaces import make
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000
 TIME = np.arange(N) * DT
@@ -382,3 +386,32 @@ def test_a_missing_column_is_not_said_to_be_one_that_another_signal_is(tmp_path)
     )
     with pytest.raises(GroundedError, match=r"did you mean 'Nickrate_dps'"):
         read_signals(path, {"r": specs["r"]})
+
+
+def test_a_column_that_is_missing_names_the_columns_that_there_are(tmp_path):
+    """It listed `header`, which is no column, and hid those that are read."""
+    path = tmp_path / "a.csv"
+    path.write_text("t,pos,v\n0,0,0\n0.1,1,1\n0.2,2,2\n")
+    specs = {"x": SignalSpec("/csv.x"), "v": SignalSpec("/csv.v")}
+    with pytest.raises(GroundedError) as refused:
+        read_signals(path, specs)
+    assert holds(str(refused.value), "has no field 'x'", "pos", "v is read already")
+    assert "header" not in str(refused.value)
+
+
+def test_an_exported_candidate_is_no_log(cart_candidate):
+    """It was "no column of times", and was named among the newest logs."""
+    folder, file = cart_candidate
+    with pytest.raises(GroundedError, match=r"best\.npz is an exported candidate, c0001"):
+        list(npz_records(file))
+    for k in range(4):
+        (folder / f"drive{'abcd'[k]}.csv").write_text("t,x\n0,0\n")
+    with pytest.raises(GroundedError, match="newest of the 4 logs"):
+        log_files(folder / "another.csv")
+
+
+@pytest.fixture
+def cart_candidate(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    w.export(w.propose().candidate.id, tmp_path / "best.npz", form="npz")
+    return tmp_path, tmp_path / "best.npz"

@@ -489,6 +489,8 @@ def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
     assert plotted(steps)["layout"]["xaxis"]["ticktext"] == list(names)
     assert steps.dots[-1].role == "predicted" and steps.dots[-1].shape == "ring"
     assert any("waiting" in key.name for key in figure.key)
+    expected = figure.panels[0].dots[-1]  # as the table has it
+    assert (expected.shape, expected.y) == ("dash", last.promised)
     assert not any("waiting" in key.name for key in search_figure(now).key)
 
 

@@ -61,7 +61,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
         "/state/x/desired",
         "/state/x/best",
         "/input/force/low",
-        "/bias/v/iteration_0",
+        "/bias/v/c0001",
         "/bias/v/left_as_diagnosed",
         "/ahead/real/body",
         "/ahead/off/body",

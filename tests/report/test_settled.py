@@ -342,3 +342,8 @@ def test_a_sensor_s_bias_is_said_to_move_start_and_target(cart, tmp_path, value)
     keep, mend = f"add {value} to them", f"offset {-value:+}"
     assert done.code == 0 and holds(done.err, "start", "target", reads, keep, mend)
     assert holds(done.err, "remove sensor_bias:v")  # or it is corrected twice
+
+
+def test_status_has_no_two_empty_lines_in_a_row(adopted):
+    out = grounded("-C", adopted, "status").out
+    assert "adopted" in out and "\n\n\n" not in out

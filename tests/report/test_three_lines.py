@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.result import measured, measured_alike
+from grounded.utility import Reward
 from grounded_trials.report.diagnosis_words import verdict_lines
-from grounded_trials.report.three_lines import gained_most, three_lines
+from grounded_trials.report.three_lines import gained, gained_most, three_lines
 from reported import DIAGNOSIS
 from small_tasks import cart_task
 
@@ -53,6 +55,19 @@ def test_causes_gain_and_what_is_left(diagnosis):
     assert CAUSES[2] in wrong  # in words, however small its share
     assert "x by 12 mm instead of 250 mm" in gained
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
+
+
+def test_what_is_equal_as_printed_is_left_out(diagnosis):
+    """`x by 7.8 mm instead of 9.7 mm and v by 0.020 m/s instead of 0.020 m/s`."""
+    (row,) = diagnosis.prediction_error
+    row = replace(row, crude={"x": 0.25, "v": 0.02001}, with_effects={"x": 0.012, "v": 0.02})
+    reward = Reward(np.array([10.0, 1.0]), np.zeros(2), np.zeros(1), np.ones(1))
+    both = cart_task(reward=reward, target=np.zeros((41, 2)))
+    text = three_lines(replace(diagnosis, prediction_error=(row,)), both)[1]
+    assert "x by 12 mm instead of 250 mm" in text and "v by" not in text
+    alone = replace(row, crude={"x": 0.01201, "v": 0.02}, with_effects={"x": 0.012, "v": 0.02})
+    found = gained(replace(diagnosis, prediction_error=(alone,)), cart_task())
+    assert "x by 12 mm instead of 12 mm" in found
 
 
 def test_what_became_worse_is_not_kept_back(diagnosis):

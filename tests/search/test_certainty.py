@@ -13,13 +13,15 @@ from grounded.search.certainty import (
     beyond_one_trial,
     chance,
     error_between,
+    few,
     last_improvement,
     owed_to_start,
     runs_to_show,
     student,
     with_chances,
 )
-from grounded.search.standing import _hardly
+from grounded.search.scatter import with_errors
+from grounded.search.standing import PATIENCE, _hardly
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -87,10 +89,30 @@ def test_a_gain_within_its_own_standard_error_ends_a_search():
     assert ending(-0.9, repeated=(-9.0, -0.2, -4.0), base="") is None  # the wild first policy
 
 
+def test_a_stopped_run_is_no_candidate_that_gained_nothing():
+    """A car stopped at 8 s ended its search, beside a command to discard that run."""
+    lost = [tried(-1.2 - k / 10, accepted=False) for k in range(3)]
+    before = (tried(-9.0, base=""), tried(-1.1), *lost)
+    crash = tried(-np.inf, accepted=False)
+    assert _hardly((*before, crash), 1e-3, "m") is None
+    assert _hardly((*before, crash, tried(-1.5, accepted=False)), 1e-3, "m") is not None
+    assert _hardly((*before, *[crash] * PATIENCE), 1e-3, "m") is not None
+
+
 def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
     best = replace(tried(*utilities), deviation=deviation)
     made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: gain, doubtful=doubtful)
     return made, best
+
+
+def test_a_scatter_says_on_how_many_repeats_it_rests():
+    """One pair of runs scattered by 0.016 where twenty scatter by 0.04."""
+    few_runs, many = tried(-5.0, -5.2), tried(-5.0, *[-5.2] * 9)
+    found = [with_errors([one])[0] for one in (few_runs, many)]
+    assert [one.repeats for one in found] == [1, 9]
+    assert [few(one.repeats) for one in found] == [", from a single repeat only", ""]
+    made, _ = promising(0.05)
+    assert holds(beyond_one_trial(made, replace(found[0], deviation=0.1)), "single repeat")
 
 
 def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
@@ -198,6 +220,9 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert owed_to_start(first, second, [first, second]) == pytest.approx(1.9)
     found = last_improvement([first, second])
     assert holds(found, "2.1", "1.9", "0.2", "c0001") and "probability" not in found
+    worse = replace(second, utilities=(-4.4, -4.3))  # the policy lost, the start made up for it
+    told = last_improvement([first, worse])
+    assert holds(told, "c0002 over c0001", "that counts", "without which c0001", "0.255")
     here = ran("c0001", "", -6.0, off=0.0)
     assert owed_to_start(here, second, [here, second]) == 0.0
     assert "probability" in last_improvement([here, second])

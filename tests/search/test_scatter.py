@@ -135,8 +135,11 @@ def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
         own = [replace(run, candidate="c0002", id=f"r{k}") for k, run in enumerate(more)]
         now = standing(task, [first, made], [*runs, *own], SearchOptions(), made.model)
         told = now.history[-1]
-        assert shares[0] <= told.noise_missed / told.noise_cost < shares[1]
+        whole = noise_cost(task, made.policy, sensor_noise(runs, 2))
+        assert shares[0] <= told.noise_missed / whole < shares[1]
         assert told.promised == made.predicted_utility - told.noise_missed
+        waits = standing(task, [first, made], runs, SearchOptions(), made.model).history[-1]
+        assert waits.promised == told.promised  # as it was told before the runs
     missed = made.predicted_utility - told.utility
     assert missed > 0.2 * -told.utility  # four logs of 41 rows tell the noise to a third or so
     assert abs(told.promised - told.utility) < 0.6 * missed

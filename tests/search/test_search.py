@@ -193,7 +193,7 @@ def test_a_small_promise_that_is_not_kept_asks_for_nothing():
 
 
 @pytest.mark.parametrize(("scatter", "goes_on"), [(1e-6, True), (0.4, False), (1e3, True)])
-@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("lost", ["lost", "stopped", ""])
 def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
     monkeypatch, scatter, goes_on, lost
 ):
@@ -202,11 +202,11 @@ def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
     It goes on if the best one's runs scatter by as much as they cost: another may be steadier.
     """
     story = Story().add().add()
-    story = story.add(bad) if lost else story
+    story = story.add(bad if lost == "lost" else cut) if lost else story
     noisy = lambda h: tuple(replace(one, deviation=scatter) for one in h)  # noqa: E731
     monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
     proposal = story.propose()
-    assert (proposal.candidate is not None) == (goes_on or not lost)
+    assert (proposal.candidate is not None) == (goes_on or lost != "lost")
     if proposal.candidate is None:
         ended = proposal.standing
         assert (ended.phase, ended.ending) == ("converged", "below the noise")

@@ -30,6 +30,7 @@ SAME, CLEAR = 0.5, 0.01
 OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
+FOREIGN = 0.5  # of the squared difference of unrelated commands: from here on nothing is alike
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 OTHERS = 20  # number of latest candidates to compare with
@@ -52,6 +53,7 @@ class Following:
     opens: bool  # they are alike until then, at least `LEAST` steps, not only at their limits
     late: int  # steps by which the log is late
     moved: float  # squared difference at `late`, relative to that without shift
+    foreign: bool  # that input differs by about as much as unrelated commands do
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
     fine: Array  # (m,) resolution of the commands
 
@@ -119,6 +121,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
         late=late,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
+        foreign=bool(off[:, j].mean() > FOREIGN * unrelated[j]),
         off=apart,
         fine=FINE * size,
     )

@@ -52,6 +52,16 @@ def test_a_doubt_that_is_settled_without_the_run_asked_for_says_so(doubtful):
     assert holds(told, "c0001 need not", "c0002", "still counts")
 
 
+def test_a_run_that_costs_the_best_its_place_is_told_as_one_more_run_of_it(doubtful):
+    """It was "no better than the best so far", without a word that the best was another now."""
+    states = doubtful.best.states.copy()
+    states[1:, 0] += 5.0
+    write_trial(doubtful.unnamed, replace(doubtful.best, states=states), {"kind": "trial"})
+    found = ingest_log(doubtful, doubtful.unnamed, "c0001")
+    assert (found.candidate, found.verdict) == ("c0001", "run again")
+    assert standing_in(doubtful).incumbent.candidate.id == "c0002"
+
+
 def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
     """An arm's search asked for it, a run of the loser came first: `none is waiting`."""
     ingest_log(doubtful, doubtful.worse(0.81), "c0002")

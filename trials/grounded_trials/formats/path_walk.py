@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import nearest
+from grounded.result import listed
 from grounded_trials.formats.message_path import (
     ANGLES,
     AXES,
@@ -132,11 +133,13 @@ class NoField(BadPath):
 
 
 def _without(type: Struct, name: str, taken: Collection[str]) -> str:
-    left = [one for one in type.by_name if one not in taken]
+    left = [one for one in type.by_name if one not in taken and one != "header"]
+    read = [one for one in type.by_name if one in taken]
     alike = in_another_unit(name, left)
     hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left)
-    if taken and {*left} <= {"header"}:
-        hint = "other signals are read from its other fields"
+    if read:
+        are = f"{listed(read)} {'is' if len(read) == 1 else 'are'} read already"
+        hint = f"{hint}; {are}" if left else are
     return f"{type} has no field '{name}': {hint}"
 
 

@@ -26,6 +26,7 @@ ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
 VALUES = 200_000_000  # largest number of values in one file
 ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
+CANDIDATE = {"candidate", "feedforward", "law"}  # names of arrays in an exported one
 TICKS = {  # an Arduino's functions, and their units in full
     "millis": "ms",
     "milliseconds": "ms",
@@ -59,7 +60,21 @@ def npz_records(path: Path) -> Iterator[Record]:
             arrays = {name: archive[name] for name in archive.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError) as error:
         raise GroundedError(f"{path} can't be read as a NumPy archive: {error}") from None
+    if arrays.keys() >= CANDIDATE:
+        raise GroundedError(
+            f"{path} is an exported candidate, {arrays['candidate']}: the policy to run, not a log "
+            "of its run. Pass the log that the robot's program wrote"
+        )
     yield from table_records(_npz_tables(arrays), "npz", path)
+
+
+def is_candidate(path: Path) -> bool:
+    """Return whether a file is a candidate that was exported as .npz, by the names in it."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.removesuffix(".npy") for name in archive.namelist()} >= CANDIDATE
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _check_size(path: Path) -> None:

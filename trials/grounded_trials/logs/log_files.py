@@ -85,10 +85,13 @@ def _nearby(path: Path) -> str:
     """Return advice on a file that does not exist, to append to the message."""
     from difflib import get_close_matches
 
+    from grounded_trials.formats.tables import is_candidate
+
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: give a path relative to the current folder"
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
-    logs = sorted((p for p in there if not _NO_LOG.fullmatch(p.name)), key=lambda p: -_written(p))
+    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not is_candidate(p)]
+    logs = sorted(there, key=lambda p: -_written(p))
     if logs:
         plain = _DIGITS.sub("0", path.stem.lower())
         named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike

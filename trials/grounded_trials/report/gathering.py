@@ -7,13 +7,14 @@ A damaged or missing trial is left out and listed in `lost`; the rest is still s
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from grounded.diagnosis.report import Diagnosis
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
@@ -25,9 +26,10 @@ from grounded_trials.report.forecast import anchored
 from grounded_trials.report.settled import settled_in
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adoptable import Better, better_model
-from grounded_trials.workspace.candidates.proposing import uncounted
+from grounded_trials.workspace.candidates.proposing import uncounted, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder, Lost
+from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 from grounded_trials.workspace.last_diagnosis import (
     LEAST_STEPS,
     Since,
@@ -53,7 +55,7 @@ def gather(workspace: Folder) -> Findings:
     fitting = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     own = [t for t in fitting if t.candidate in known]
     data = [t for t in fitting if not t.candidate]
-    now = _standing(workspace, contents)
+    now, asked = _standing(workspace, contents)
     shown, logs = _shown(now, own), [_drawable(t) for t in data[-LOGS:]]
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
@@ -72,7 +74,7 @@ def gather(workspace: Folder) -> Findings:
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=known_optimum(workspace.reports),
-        then=next_command(workspace, now, diagnosis, usable),
+        then=asked or next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since,
         settled=settled_in(workspace, diagnosis, since),
@@ -95,8 +97,20 @@ def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
     return [t for t in trials if t.id in latest or t.candidate in names]
 
 
-def _standing(workspace: Folder, contents: Contents) -> Standing:
-    """Return the standing, by planning ahead if possible, to know whether the search has ended."""
+def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextCommand | None]:
+    """Return the standing, and the command by which the last trial should be discarded, or None.
+
+    It plans ahead if possible, to know whether the search has ended.
+    """
+    with suppress(GroundedError):  # of damaged files
+        if (asked := unanswered(workspace)[1]) is not None:
+            now = standing_in(workspace, contents=contents)
+            return undecided(now, asked.arguments[0]), asked
+    return _ahead(workspace, contents), None
+
+
+def _ahead(workspace: Folder, contents: Contents) -> Standing:
+    """Return the standing, one proposal ahead if that can be planned."""
     try:
         ahead = not workspace.config.search.refit
         return standing_in(workspace, ahead=ahead, contents=contents)

@@ -148,7 +148,7 @@ def _biases(findings: Findings, table: Table) -> str:
     if not runs:
         return "bias\n  no whole trial yet"
     rows = by_state(task.model, [rms(run.residual) / task.dt for run in runs], per_second)
-    header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
+    header = ("state", "unit", *(run.candidate.id for run in runs))
     return f"bias: what the {findings.plain} lacks, rms over the run\n" + table(rows, header)
 
 

@@ -74,7 +74,7 @@ def gained(
         before: the column of those before; that of today says nothing of before.
         who: misses so much.
     """
-    row, parts = telling(diagnosis.prediction_error), []
+    row, parts, same = telling(diagnosis.prediction_error), list[str](), list[str]()
     if row is None:
         return ""
     after, first = getattr(row, now), getattr(row, before)
@@ -85,7 +85,9 @@ def gained(
         noise = [row.noise_floor.get(names[0], 0.0)] if len(names) == 1 else []  # as the verdict
         ends = measured_alike([*(_together(errors, names) for errors in told), *noise], unit)
         ends = ends[: len(told)]
-        parts.append(f"{what} by {' instead of '.join(ends)}")
+        equal = len(ends) > len({*ends})  # as printed: that says nothing beside others
+        (same if equal else parts).append(f"{what} by {' instead of '.join(ends)}")
+    parts = parts or same
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
     return f"{ahead} {who} misses {listed(parts)}." if parts else ""

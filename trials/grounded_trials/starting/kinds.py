@@ -40,6 +40,7 @@ from grounded_trials.starting.skeletons import (
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
 Units = Mapping[str, str]  # unit of a number by its path
 HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
+QUIET = 10.0  # range of a number of noise alone, in standard deviations of that, at most
 MOST, INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
@@ -85,6 +86,13 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     return dict(reversed(found.items()))
 
 
+def _noise_only(field: FieldReport) -> bool:
+    """Return whether a number never moves beyond its noise, as the roll rate of a car does."""
+    if field.low is None or field.high is None:
+        return False
+    return field.high - field.low < QUIET * field.noise
+
+
 def called_input(name: str, path: str) -> bool:
     """Return whether a number of a log is named like a command."""
     return bool(COMMANDED.search(path.lower()) or SIDES.search(name))
@@ -94,9 +102,10 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     """Return a skeleton for any robot, with the numbers of the log as states and inputs.
 
     A state whose rate is another state gets that as its derivative; every other state follows the
-    inputs with a first-order lag. Without `inputs`, the inputs are the numbers that are named like
-    commands, else those held constant over several samples while others move, else those named
-    after an actuator, else forces, torques and voltages.
+    inputs with a first-order lag. Numbers of noise alone are no states. Without `inputs`, the
+    inputs are the numbers that are named like commands, else those held constant over several
+    samples while others move, else those named after an actuator, else forces, torques and
+    voltages.
 
     Args:
         log: the log.
@@ -125,7 +134,9 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         held = held if 2 * len(held) < len(names) else []
         efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
         inputs = (called or held or driven or efforts)[:INPUTS] or ["u"]
-    states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]
+    named = [name for name in reversed(found) if name not in inputs]
+    moved = [name for name in named if not _noise_only(found[name])]
+    states = (moved or named)[:MOST] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
     for position, rate in rates.items():  # v is logged without a unit, x in m: v is in m/s
         known_as = rate.removeprefix("s.")

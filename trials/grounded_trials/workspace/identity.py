@@ -120,6 +120,7 @@ class Noted:
     hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
     since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
     told: dict[str, str] = field(default_factory=dict)  # what was told once -> of which trial
+    asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> why
 
     @property
     def last(self) -> set[str]:
@@ -160,6 +161,8 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.since.append(note["candidate"])
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
+        elif kind == "asked":
+            found.asked[note["trial"]] = note["said"]
         elif kind == "told":
             found.told.setdefault(note["what"], note["trial"])
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.off_target import logged_target
 from grounded_trials.workspace.read_before import changed_since, last_again
+from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -103,6 +105,8 @@ def _follows(
     if now.ending == "not allowed" and not now.trials:
         return TARGET  # the plan for this target leaves [safety]: proposing again would not help
     if diagnosis is None:
+        if log := not_ingested(workspace):
+            return NextCommand("ingest", ("--data", log))
         logs = usable and not now.history  # diagnose logs before the first candidate
         teach = usable and (logs or now.phase != "propose")
         then = None if now.doubt and not doubted(now, None, usable) else now.then
@@ -116,6 +120,16 @@ def _follows(
     if now.asks_again and now.incumbent:
         return to_run(workspace, now.incumbent.candidate.id, "best")
     return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
+
+
+def not_ingested(workspace: Folder) -> str:
+    """Return the log that the workspace was made from if nothing was stored or planned yet; or "".
+
+    Its name is known until the user deletes it from [limits]. It is "LOG" if it lies elsewhere.
+    """
+    log = "" if workspace.store.list() or workspace.candidate_ids() else seen_in(workspace.config)
+    places = (Path(log), workspace.folder.parent / log, workspace.folder / log)
+    return next((str(path) for path in places if path.exists()), "LOG") if log else ""
 
 
 def _of_another_model(workspace: Folder, diagnosis: Diagnosis, since: Since) -> bool:

@@ -149,6 +149,23 @@ def test_a_named_candidate_overrides_with_a_warning(waiting):
     assert found.candidate == "c0002" and "force" in found.warnings[0]
 
 
+def test_a_log_of_other_driving_that_names_a_candidate_is_to_be_discarded(tmp_path):
+    """It was judged as a run: "the run counts", and the next candidate was planned from it."""
+    w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
+    policy = w.propose().candidate.policy
+    sent = 2 * np.sin(1 + 0.7 * np.arange(policy.horizon))[:, None]
+    other = replace(policy, feedforward=sent, gain=None, reference=None)
+    log = record(w, tmp_path / "hand.csv", other, 0.0)
+    done = grounded("-C", w.folder, "next", log, "--candidate", "c0001")
+    said = " ".join(f"{done.out} {done.err}".split())
+    assert holds(said, "not what c0001 sends", "nothing is proposed", "only because --candidate")
+    assert "The run counts" not in said and done.out.split()[-1] == "t0001"
+    status = w.forget().status()
+    assert status.then == NextCommand("discard", ("t0001",)) and holds(status.notes[0], "force")
+    assert w.propose().candidate.id == "c0002"  # the user has decided
+    assert w.status().then.verb != "discard"
+
+
 def said_to_have_run(candidate, run, to, steps=sys.maxsize, nudge=0.0):
     """The file `to`, with a run's trial, or its first steps, as one that names this candidate."""
     trial, _, _ = read_trial(run)

@@ -32,8 +32,23 @@ def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
     assert f"`grounded -C {w.folder} discard t0001`" in told
     now = w.forget().status()
     assert now.then.arguments == ("t0001",) and holds(now.notes[0], "t0001", "recording")
+    told = grounded("-C", w.folder, "status").out
+    assert holds(told, "ended early", "waiting", "discard t0001") and "crashed" not in told
+    report = grounded("-C", w.folder, "report").out
+    assert holds(report, "ended early", "waiting") and report.split()[-2:] == told.split()[-2:]
     assert w.propose().candidate.id == "c0002"  # it counts as failed, if the user goes on
     assert w.status().then.verb != "discard"
+
+
+def test_a_log_that_stays_set_aside_is_not_said_to_be_used(tmp_path):
+    """It was "used as a run of c0001 again", and "does not count"."""
+    w, policy = waiting(tmp_path)
+    log = record(w, tmp_path / "a.csv", policy, 0.7, until=1.3)
+    w.ingest(log)
+    w.discard("t0001")
+    out = grounded("-C", w.folder, "next", log)
+    assert holds(f"{out.out} {out.err}", "t0001 stays set aside", "set aside: it does not count")
+    assert "is used as" not in f"{out.out} {out.err}" and "utility failed" not in out.out
 
 
 def driven(w, policy, off=0.0):

@@ -245,13 +245,14 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
             gain = f": cost reduced by {percent(share)}"
+            if _probability(findings) < SURE:
+                gain += ", which the scatter of repeats may explain"
             tried = {one.candidate.id: one for one in findings.history}
             two = tried[first.candidate.id], tried[best.candidate.id]
             if start := owed_to_start(*two, findings.history):
-                part = percent(-start / first.utility)
-                gain += f", {part} due to different start states, as the model predicts"
-            if _probability(findings) < SURE:
-                gain += ", which the scatter of repeats may explain"
+                did = "reduced" if start > 0 else "raised"
+                by = f"{did} it by {percent(abs(start / first.utility))}"
+                gain += f"; by the model, different start states alone {by}"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:

@@ -2,7 +2,7 @@
 
     /paths/...                desired, the model's own policy, the best so far and its prediction
     /state/x/...              the same over time, one plot per state;  /input/u/...  with limits
-    /bias/x/...               bias of the crude model along the run [unit/s], by iteration
+    /bias/x/...               bias of the crude model along the run [unit/s], by candidate
     /ahead/...                the best run, and forecasts restarted every second: effects off, on
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
@@ -153,13 +153,13 @@ class _Recorder:
                 self.line(f"{at}/{role}", values, self.dt, role, name, width)
 
     def biases(self) -> None:
-        """Record the crude model's bias by iteration, and that of the model with effects."""
+        """Record the crude model's bias by candidate, and that of the model with effects."""
         best, better = self.findings.best, self.findings.better
         shown, found = selection(self.findings.improvements, ITERATIONS), []
         for number, run in enumerate(shown):
             last = number == len(shown) - 1 and number > 0
             colour = "best" if last else ("model_policy", "accepted", "other")[number % 3]
-            found.append((f"iteration {run.candidate.iteration}", run.residual, colour))
+            found.append((run.candidate.id, run.residual, colour))
         if best is not None and best.explained is not None and better is not None:
             found.append((f"left, {better.name}", best.explained, "limit"))
         for i, name in enumerate(self.task.model.state_names):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.scatter import noise_missed, sensor_noise
+from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import (
@@ -27,7 +27,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import doubted, next_command, not_adopted
+from grounded_trials.workspace.next_step import doubted, next_command, not_adopted, not_ingested
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ class Proposed(Result):
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
     lacks: str = ""  # what the last diagnosis found and the model lacks
+    noise_in_log: float = 0.0  # expected cost of all of the sensor noise in its log
 
     @property
     def candidate(self) -> Candidate | None:
@@ -167,12 +168,15 @@ def propose_in(workspace: Folder) -> Proposed:
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
-    noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
-    cost = noise_missed(workspace.task, candidate, noise)
+    noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
+    same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
+    noise = noises.before([candidate.id])
+    cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
+    whole = noise_cost(workspace.task, candidate.policy, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
     if not candidate.grounded:  # a run that no sensor measured
         off_target = tuple(replace(one, noise=0.0) for one in off_target)
-    return Proposed(proposal, path, then, cost, off_target, lacks)
+    return Proposed(proposal, path, then, cost, off_target, lacks, whole)
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -288,6 +292,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.sentence if since else "",
         (
             *notes,
+            *_nothing_stored(workspace),
             *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
             *(_disowned(standing) if standing.phase != "propose" else ()),
             *_namesakes(workspace),
@@ -300,6 +305,19 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     )
 
 
+def _nothing_stored(workspace: Folder) -> list[str]:
+    """Return a note that a log may be stored first, if it is not known which; [] if it is."""
+    if workspace.store.list() or workspace.candidate_ids() or not_ingested(workspace):
+        return []
+    config = workspace.config
+    if not config.log.has("state") or config.system.reachable:
+        return []
+    return [
+        "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
+        "model lacks; without, `propose` plans with the model as it is"
+    ]
+
+
 def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
     """Return the standing, which asks for another run of the best one if `then` is that run."""
     if not now.asks_again or now.missed or now.incumbent is None:
@@ -310,13 +328,28 @@ def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
 
 
 def status_in(workspace: Folder) -> Status:
-    """Return where the search stands; if its last trial should be discarded, say that first."""
+    """Return where the search stands; it waits if its last trial should be discarded first."""
     from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 
     asked, then = unanswered(workspace)
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
-    return replace(status_of(workspace, standing_in(workspace), asked), then=then)
+    now = undecided(standing_in(workspace), then.arguments[0])
+    return replace(status_of(workspace, now, asked), then=then)
+
+
+def undecided(now: Standing, trial: str) -> Standing:
+    """Return the standing as it waits for the user to discard a trial, or to go on with it.
+
+    The verdict of a search that counts that trial would contradict the advice to discard it.
+    """
+    ran = next((t for t in now.history if trial in [one.id for one in t.trials]), None)
+    if ran is None:
+        return now
+    sentence = f"discard {trial}, a run of {ran.candidate.id}, or go on with it: `propose`"
+    history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
+    waits = replace(now, phase="await-trial", outstanding=ran.candidate, missing=1, history=history)
+    return replace(waits, sentence=sentence, ending="", then=None, doubt="", missed="")
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:

@@ -31,13 +31,16 @@ def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
     return standing(workspace.task, workspace.read().candidates, trials, options, model)
 
 
-def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
+def odd_run(
+    workspace: Folder, now: Standing, identity: str, *, aside: bool = False
+) -> tuple[str, ...]:
     """Return a note on a doubted run: that it counts, or how it changed its candidate's utility.
 
     Args:
         workspace: the workspace with the trials.
         now: the standing of the search including the run.
         identity: the run's id, such as t0011.
+        aside: whether it is to be set aside unless the user goes on with it.
     """
     after = _of(now, identity)
     if after is None:
@@ -47,6 +50,11 @@ def odd_run(workspace: Folder, now: Standing, identity: str) -> tuple[str, ...]:
         f"it counts as a run of {after.candidate.id} all the same, because --candidate says so. To "
         f"undo this: `{undo}`",
     )
+    if aside:
+        return (
+            f"it counts as a run of {after.candidate.id} only because --candidate says so: "
+            f"`{undo}`, unless it ran that; then `propose` goes on",
+        )
     if len(after.utilities) < 3 or now.incumbent is None:
         return counts
     was = standing_without(workspace, {identity})

@@ -25,7 +25,11 @@ from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
-from grounded_trials.workspace.candidates.standing_without import no_longer, odd_run
+from grounded_trials.workspace.candidates.standing_without import (
+    no_longer,
+    odd_run,
+    standing_without,
+)
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
@@ -152,7 +156,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    warnings = (*read.warnings, *odd, *([elsewhere.told] if elsewhere else []), *checked)
+    begun = [elsewhere.told] if elsewhere and not (read.aside and not elsewhere.again) else []
+    warnings = (*read.warnings, *odd, *begun, *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if aside := added.id in workspace.discarded():
@@ -160,10 +165,10 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    verdict = ASIDE if aside else _verdict(trial, tried, workspace.config.search.repeats)
+    verdict = ASIDE if aside else _verdict(workspace, trial, tried)
     slow = "" if read.doubted else steps_skipped(workspace, trial)
     warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow) or read.aside or (elsewhere is not None and elsewhere.again)
+    wrong = bool(slow or read.aside) or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:
@@ -182,6 +187,11 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
     rest = [one for one in history if one is not tried and one.accepted]
     outdone = max(rest, key=lambda one: one.utility, default=None)
+    if read.aside and not aside:  # `status` can't tell it from the stored trial
+        note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": read.aside}
+        with suppress(GroundedError):  # a folder that can't be written
+            workspace.notes.add(note, again=False)
+        vars(workspace).pop("noted", None)
     best = tried is not None and now is not None and now.incumbent is tried
     told = traded(workspace.task, tried, outdone) if best and tried and outdone else ""
     return Ingested(
@@ -197,10 +207,14 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         verdict=verdict,
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
-            *read.notes,
-            *filter(None, [told]),
+            *([read.before.told(used=not aside)] if read.before else []),
+            *filter(None, [*read.notes, told]),
             *(no_longer(workspace, added.id, now) if now and not added.known else ()),
-            *(odd_run(workspace, now, added.id) if now and read.doubted else ()),
+            *(
+                odd_run(workspace, now, added.id, aside=bool(read.aside))
+                if now and read.doubted and not aside
+                else ()
+            ),
         ),
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
@@ -238,8 +252,14 @@ def _undo(identity: str) -> str:
     return f"`restore {identity}` undoes that"
 
 
-def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
+def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:
+    """Return the verdict on a run; "run again" for another one of what was the best before it."""
     if tried is None:
         return "probe" if trial.candidate else ""
-    again = tried.accepted and trial.id not in [one.id for one in tried.trials[:repeats]]
-    return "run again" if again else tried.verdict()
+    repeats = workspace.config.search.repeats
+    again = trial.id not in [one.id for one in tried.trials[:repeats]]
+    if again and tried.accepted is False and not tried.crashed:
+        before = standing_without(workspace, {trial.id}).incumbent
+        again = before is not None and before.candidate.id == tried.candidate.id
+        return "run again" if again else tried.verdict()
+    return "run again" if again and tried.accepted else tried.verdict()

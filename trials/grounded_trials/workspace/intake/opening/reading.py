@@ -30,6 +30,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
 from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.stored_before import (
+    Aside,
     refuse_as_another,
     refuse_known_data,
     same_recording,
@@ -54,7 +55,8 @@ class Read:
     copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
-    aside: bool = False  # to be set aside unless the user goes on: an input was reversed
+    aside: str = ""  # why it is to be set aside unless the user goes on
+    before: Aside | None = None  # the trial that was made from the log before and is set aside
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
     fell: bool = False  # it failed before the log ends, as a warning says
@@ -190,7 +192,7 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
         refuse_as_another(path, log.stored, chosen)
         _check_candidate(workspace, path, chosen)
     read = cut_log(log, chosen)
-    return replace(read, notes=(before.told(),)) if before and chosen == ran else read
+    return replace(read, before=before) if before and chosen == ran else read
 
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:

@@ -76,12 +76,13 @@ class Aside:
     id: str
     candidate: str  # "" for data
 
-    def told(self) -> str:
-        """Return the note that the log is used as before, and how to change that."""
-        return (
-            f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside: it "
-            f"is used as {_what(self.candidate)} again. To change that, use --candidate ID"
-        )
+    def told(self, *, used: bool) -> str:
+        """Return the note that the log is used as before, or not, and how to change that."""
+        before = f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside"
+        if not used:
+            return f"{before}. If it ran another candidate, name that with --candidate ID"
+        used_as = f"it is used as {_what(self.candidate)} again"
+        return f"{before}: {used_as}. To change that, use --candidate ID"
 
 
 def set_aside_of(workspace: Folder, digest: str) -> Aside | None:

@@ -114,7 +114,9 @@ class Look:
                 f"its first command was logged {1e3 * -begins:.3g} ms after {ran} began, by the "
                 "times of the others"
             )
-        self.read = replace(there, warnings=tuple(warnings), notes=tuple(notes))
+        self.read = replace(
+            there, warnings=tuple(warnings), notes=tuple(notes), before=self.read.before
+        )
         cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
 

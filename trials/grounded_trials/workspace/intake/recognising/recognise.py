@@ -183,7 +183,11 @@ def recognised(
                 f"{longer * (WHOLE * _lasting_s(log) > run)}; set another with [log.span] start = "
                 "SECONDS"
             )
-        return replace(read, warnings=(*read.warnings, *doubts), doubted=True, aside=bool(turned))
+        opens = found and found.opens_alike
+        unread = not (opens or other or units or pace or passed or seen.silent)
+        foreign = log and unread and seen.ran and seen.ran.foreign and not seen.ran.opens
+        aside = doubts[0] if turned or foreign else ""
+        return replace(read, warnings=(*read.warnings, *doubts), doubted=True, aside=aside)
     if units:
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):

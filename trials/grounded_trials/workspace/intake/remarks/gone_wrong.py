@@ -197,7 +197,11 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
     last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
     if last is None or "~" in last.trial.candidate or _decided(workspace, last):
         return (), None
-    trial, own = last.trial, "source" not in last.meta
+    trial, own, name = last.trial, "source" not in last.meta, last.stored.id
+    if said := workspace.noted.asked.get(last.stored.digest, ""):
+        unless = f"`discard {name}`, unless it ran {trial.candidate}; then `propose` goes on"
+        why = f"{name}: {said}{'' if said.endswith('?') else '.'} {unless}"
+        return (why,), NextCommand("discard", (name,))
     told = [one.told(trial, own=own) for one in log_faults(workspace, trial)]
     told += filter(None, [steps_skipped(workspace, last.measured)])
     begun = begun_elsewhere(workspace, last.measured)
@@ -210,7 +214,6 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
         wrong = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         early = ended_early(workspace, last.measured)
         told = [one.said for one in (wrong, early) if one and one.aside][:1]
-    name = last.stored.id
     then = NextCommand("discard", (name,)) if told else None
     return tuple(f"{name}: {one}" for one in told), then
 
