@@ -44,7 +44,7 @@ from grounded.places import position
 from grounded.task import Task
 from grounded.trial import Trial
 
-HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more there; of a gap
+HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more; of a gap
 MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
 
 

@@ -68,7 +68,9 @@ def test_the_status_has_one_line_for_each_adopted_effect_and_parameter(adopted):
     lines = plain(grounded("-C", adopted, "status").out).splitlines()
     head = next(k for k, line in enumerate(lines) if line.startswith("adopted "))
     effect, mass, gain = lines[head + 1 : head + 4]
-    assert re.fullmatch(r"viscous_friction:v +k = 0\.300 \+- 0\.010 1/s, or quadratic_drag:v", effect)
+    assert re.fullmatch(
+        r"viscous_friction:v +k = 0\.300 \+- 0\.010 1/s, or quadratic_drag:v", effect
+    )
     assert re.fullmatch(r"mass +1\.4\d* \+- 0\.\d+ kg, was 1", mass)
     assert "12 mm instead of 250 mm" in gain
 
@@ -106,9 +108,7 @@ def test_a_tie_is_remembered_until_the_other_is_adopted_or_the_one_undone(adopte
     for shown in (words(adopted, "status"), words(adopted, "report")):
         assert "quadratic_drag:v" in shown
     clause, _ = grounded("-C", adopted, "report", "--html", "--json").json["adopted"]["clauses"]
-    assert clause.endswith(
-        "or, as the trials could not tell them apart, quadratic_drag:v instead"
-    )
+    assert clause.endswith("or, as the trials could not tell them apart, quadratic_drag:v instead")
     page = (adopted / "reports" / "report.html").read_text()
     assert "could not tell them apart, quadratic_drag:v instead" in page
     path = adopted / "reports" / "adoptions.json"
