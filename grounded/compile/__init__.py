@@ -100,13 +100,14 @@ def system_from(signature: Signature, integrator: Integrator, derivatives: bool 
     if not derivatives and len(found.graph.live(found.outputs)) <= MAX_STEPS:
         return CompiledSteps(signature, found, integrator, "")
     system, place = CompiledSystem(signature, found, integrator), where(signature.function)
-    try:
-        operations, wide = system.operations, system.n * (system.n + system.m) > MAX_PLACES
-        if operations <= MAX_COMPILED and not wide:
-            return system
-        size = f"{operations:,} operations of {system.n} states"
-    except TooLong as error:
-        size = str(error)
+    size = f"the derivatives of {system.n} states by {system.n + system.m} states and inputs"
+    if system.n * (system.n + system.m) <= MAX_PLACES:
+        try:
+            if (operations := system.operations) <= MAX_COMPILED:
+                return system
+            size = f"{operations:,} operations of {system.n} states"
+        except TooLong as error:
+            size = str(error)
     slow = f"({place}): to compile {size} would take too long; it is planned with all the same"
     if len(found.graph.live(found.outputs)) > MAX_STEPS:
         return TracedSystem(signature, found, integrator, f"not compiled {slow}, more slowly")

@@ -18,7 +18,7 @@ slopes there.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from heapq import heapify, heappop, heappush
 
@@ -61,6 +61,9 @@ class _Elimination:
         self.graph, self.ends = graph, [-1 - place for place in range(len(outputs))]
         self.below = defaultdict[int, dict[int, int]](dict)  # node -> argument -> partial
         self.above = defaultdict[int, set[int]](set)
+        # by node: how many edges to below and from above it have a weight of 0, 1 and 2
+        self.lower = defaultdict[int, list[int]](lambda: [0, 0, 0])
+        self.upper = defaultdict[int, list[int]](lambda: [0, 0, 0])
         moving = set(variables)
         for i in graph.live(outputs):
             node = graph.nodes[i]
@@ -98,18 +101,25 @@ class _Elimination:
         if self.graph.constant(partial) == 0.0:
             return
         known = self.below[i].get(argument)
-        both = partial if known is None else self.graph.node("add", known, partial)
-        self.below[i][argument] = both
+        if known is not None:
+            self._count(i, argument, known, -1)
+            partial = self.graph.node("add", known, partial)
+        self._count(i, argument, partial, 1)
+        self.below[i][argument] = partial
         self.above[argument].add(i)
+
+    def _count(self, i: int, argument: int, partial: int, by: int) -> None:
+        weight = self._weight(partial)
+        self.lower[i][weight] += by
+        self.upper[argument][weight] += by
 
     def _cost(self, i: int) -> int:
         """Products that take the place of a node: 2 each, 1 where a factor is the same everywhere.
 
         Those with plus or minus 1, and of two factors that are the same everywhere, are free.
         """
-        lower = Counter(self._weight(d) for d in self.below[i].values())
-        upper = Counter(self._weight(self.below[j][i]) for j in self.above[i])
-        return 2 * lower[2] * upper[2] + lower[2] * upper[1] + lower[1] * upper[2]
+        (_, low, lows), (_, up, ups) = self.lower[i], self.upper[i]
+        return 2 * lows * ups + lows * up + low * ups
 
     def _weight(self, partial: int) -> int:
         """0 for plus or minus 1, 1 for a number that is the same in every sample, else 2."""
@@ -122,9 +132,11 @@ class _Elimination:
         lower, upper = self.below.pop(i, {}), self.above.pop(i, set())
         for j in sorted(upper):
             partial = self.below[j].pop(i)
+            self._count(j, i, partial, -1)
             for argument, d in lower.items():
                 self._add(j, argument, self.graph.node("mul", partial, d))
-        for argument in lower:
+        for argument, d in lower.items():
+            self._count(i, argument, d, -1)
             self.above[argument].discard(i)
         return upper.union(lower)
 
