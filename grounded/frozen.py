@@ -13,6 +13,8 @@ from grounded.errors import GroundedError
 Array = NDArray[np.float64]
 MEDIAN = 0.6745  # median of |x| of a standard normal x
 ORDERS = (2, 3, 4, 5)  # orders of differences
+FLAT = 0.85  # least ratio of the last two orders of differences of noise
+COLOURED = 1.2  # ratio of differences of every second sample and of neighbours: more is no chance
 
 
 def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
@@ -74,13 +76,38 @@ def white_noise(states: Array) -> Array:
     motion that is smooth over k samples vanish. So the smallest estimate of several orders contains
     the least motion. It is 0 for a state without samples.
     """
-    found = np.full(states.shape[1], np.inf)
-    for order in ORDERS:
-        for j, column in enumerate(np.abs(np.diff(states, n=order, axis=0)).T):
+    return _seen(_by_orders(states, 1))
+
+
+def resampled_noise(states: Array) -> Array:
+    """Estimate the same for noise that neighbours share, as they do where a log was interpolated.
+
+    A sample halfway between two of the sensor has half the noise of each of its neighbours, whose
+    differences so show as little as 0.4 of it. Those of every second sample show all of it; they
+    count where they are noise and no motion: where a higher order hardly makes them less.
+    """
+    near, apart = _by_orders(states, 1), _by_orders(states, 2)
+    white, found = _seen(near), _seen(apart)
+    level = apart[-1] > FLAT * apart[-2]
+    return np.where(level & (found > COLOURED * white), found, white)
+
+
+def _by_orders(states: Array, stride: int) -> Array:
+    """Return the noise by differences of each order of every `stride`-th sample, (orders, n)."""
+    found = np.full((len(ORDERS), states.shape[1]), np.inf)
+    parts = [np.asarray(states[k::stride]) for k in range(stride)]
+    for row, order in zip(found, ORDERS, strict=True):
+        each = np.abs(np.concatenate([np.diff(part, n=order, axis=0) for part in parts]))
+        white = MEDIAN * math.sqrt(math.comb(2 * order, order))
+        for j, column in enumerate(each.T):
             known = column[np.isfinite(column)]
-            white = MEDIAN * math.sqrt(math.comb(2 * order, order))
-            found[j] = min(found[j], median(known) / white if len(known) else np.inf)
-    return np.where(np.isfinite(found), found, 0.0)
+            row[j] = median(known) / white if len(known) else np.inf
+    return found
+
+
+def _seen(by_orders: Array) -> Array:
+    least = by_orders.min(axis=0)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:

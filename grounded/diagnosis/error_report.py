@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.result import Document, measured_alike, number, with_unit
+from grounded.result import Document, measured_alike, number, percent, with_unit
 
 ABOVE = 1.3  # times the noise floor, above which a leftover is stated
 SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
@@ -312,12 +312,33 @@ class Credit(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class Part(Document):
+    """A short part of a trial, from `start` to `end` [s], that holds a share of an error."""
+
+    trial: str
+    start: float = field(metadata={"key": "from"})
+    end: float = field(metadata={"key": "to"})
+    share: float
+
+    @property
+    def when(self) -> str:
+        """`t0001, from 0 to 1 s`."""
+        return f"{self.trial or 'the log'}, from {number(self.start)} to {number(self.end)} s"
+
+    @property
+    def phrase(self) -> str:
+        """`87 % of it in t0001, from 0 to 1 s`."""
+        return f"{percent(self.share)} of it in {self.when}"
+
+
+@dataclass(frozen=True, eq=False)
 class Remainder(Document):
     """A leftover that no known effect explains.
 
     size: rms of the rate that the model of a state lacks, if a flexible regression finds one [unit
     of the state per second]; error: rms error of predictions `horizon_s` ahead; floor: the same
-    from noise alone, or an upper bound of it (`floor_at_most`).
+    from noise alone, or an upper bound of it (`floor_at_most`). If most of the squared error above
+    the noise is in one short part of a trial, `part` is that: something was different there.
     """
 
     channel: str
@@ -330,6 +351,7 @@ class Remainder(Document):
     horizon_s: float = math.nan
     error_unit: str = ""
     floor_at_most: bool = False
+    part: Part | None = field(metadata=BRIEF, default=None)
 
     @property
     def above(self) -> bool:
@@ -339,6 +361,7 @@ class Remainder(Document):
     def sentence(self) -> str:
         """Return it as one clause."""
         where = "" if self.region is None else f", mostly {self.region.phrase}"
+        where = f", {self.part.phrase}" if self.part else where
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
         ahead, name = f"{number(self.horizon_s)} s ahead", self.channel

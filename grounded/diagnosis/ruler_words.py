@@ -235,7 +235,7 @@ def in_doubt(rows: Sequence[RulerRow]) -> str:
     values = [row.with_effects[name], row.noise_floor[name]]
     error, noise = measured_alike(values, row.unit_by_channel[name])
     times_off = f"{doubt_of(row.floor_unsure):.2g}"
-    few = f"but so few repeats may tell that noise too small by a factor of up to {times_off}"
+    few = f"which so few repeats tell only to a factor of {times_off}"
     noise = f"{'at most ' * row.floor_bound}{noise}"
     return f"{_when(row)} {name} is off by {error}, {times:.2g} times its noise of {noise}, {few}"
 

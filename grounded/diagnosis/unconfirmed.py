@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.cause_words import meaning
-from grounded.diagnosis.error_report import RulerRow
+from grounded.diagnosis.error_report import Part, RulerRow
 from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.report import Ranked, Unconfirmed
@@ -138,7 +138,14 @@ def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
 
 
 def another_look(
-    task: Task | None, trials: Sequence[Trial], left: str, when: str = "", *, noise: bool = False
+    task: Task | None,
+    trials: Sequence[Trial],
+    left: str,
+    when: str = "",
+    *,
+    noise: bool = False,
+    begins: str = "",
+    part: Part | None = None,
 ) -> str:
     """Return what to run to investigate a leftover: first a repeat, then a new motion.
 
@@ -148,11 +155,22 @@ def another_look(
         left: the channel whose error has no known cause.
         when: where most of it is, as `Region.phrase`; "" if that is no place.
         noise: whether all of that error may be noise, so that it is not called a gap.
+        begins: the channel in which most of the one-step errors are; "" for `left` itself.
+        part: the short part of a trial in which most of it is.
     """
+    if part is not None:
+        then = another_look(task, trials, left, when, noise=noise, begins=begins)
+        return (
+            f"Look at {part.when} in its recording: was the robot held, pushed or in contact with "
+            f"something then? If so, discard {part.trial or 'it'} and ingest its log without that "
+            f"part; if not, {then[:1].lower()}{then[1:]}"
+        )
     what = f"how much of what is left in {left} is noise" if noise else f"the gap in {left}"
     runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
     if max(runs.values(), default=0) > 1:
-        where = f"spends more time {when}" if when else f"moves {left} in another way"
+        where = f"spends more time {when}" if when else f"moves {begins or left} in another way"
+        if begins not in ("", left):
+            what += f" (most of the one-step errors are in {begins})"
         how = "" if when else f": {_another_way(task, trials)}"
         return f"Run a trial that {where}, to investigate {what}{how}."
     why = f"to see {what}" if noise else f"to see whether {what} repeats"

@@ -132,10 +132,16 @@ class Writer:
         noise = not remainder  # no gap is named then
         named = [row.effect for row in ranking if row.claimed]
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
+        if remainder and not named:  # what is left elsewhere is no gap
+            gone = {data.model.state_names.index(one.channel) for one in remainder}
+            gain = np.where(np.isin(np.arange(gain.shape[-1]), [*gone]), gain, 0.0)
         channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
-        if remainder and not named and channels[0].share > HALF:
-            off = channels[0].name  # where it begins: a position only sums up what its speed misses
-        look = another_look(self.task, self.trials, off, when, noise=noise) if off else ""
+        first = channels[0] if remainder and not named and channels[0].share > HALF else None
+        begins = first.name if first else off  # a position only sums up what its speed misses
+        part = remainder[0].part if remainder else None
+        look = off and another_look(
+            self.task, self.trials, off, when, noise=noise, begins=begins, part=part
+        )
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)

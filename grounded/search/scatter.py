@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.frozen import MEDIAN, Array, median, white_noise
+from grounded.frozen import MEDIAN, Array, median, resampled_noise, white_noise
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
@@ -108,7 +108,7 @@ def sample_noise(trial: Trial, predicted: Array) -> Array:
         trial: a run of a candidate.
         predicted: its predicted states (H+1, n).
     """
-    white, lag = white_noise(trial.states), max(1, round(SLOW_S / trial.dt))
+    white, lag = resampled_noise(trial.states), max(1, round(SLOW_S / trial.dt))
     T = min(len(predicted), trial.finite_steps + 1)
     if 2 * lag + FEWEST > T:
         return white
@@ -118,12 +118,12 @@ def sample_noise(trial: Trial, predicted: Array) -> Array:
 
 
 def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
-    """Return the white noise (std) of each state's sensor, (n,); 0 without a trial.
+    """Return the noise (std) of a sample of each state's sensor, (n,); 0 without a trial.
 
     It is the median over the latest trials. The estimate of a single short run is off by a third
     either way. Of a long log its first rows are enough.
     """
-    each = [white_noise(trial.states[:ROWS]) for trial in trials[-LATEST:]]
+    each = [resampled_noise(trial.states[:ROWS]) for trial in trials[-LATEST:]]
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 

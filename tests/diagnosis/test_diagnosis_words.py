@@ -9,7 +9,15 @@ import numpy as np
 from facts import holds
 from grounded import Trial
 from grounded.diagnosis.cause_words import as_large, with_worth
-from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, furthest, runaway
+from grounded.diagnosis.error_report import (
+    Credit,
+    Part,
+    Region,
+    Remainder,
+    RulerRow,
+    furthest,
+    runaway,
+)
 from grounded.diagnosis.next_trial import LOG, LOST, next_trial
 from grounded.diagnosis.report import Agreement, Diagnosis, Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.ruler_words import (
@@ -372,6 +380,13 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
     twice = another_look(task, three, "x", "where |v| > 1")
     assert "twice" not in twice and holds(twice, "x", "|v| > 1")
     # it asked to move x in another way, and a student asked how: by hand? which way? how far?
+    part = Part("t0001", 0.0, 0.5, 0.87)  # where a finger held the ball
+    held = another_look(task, three, "x", part=part)
+    assert holds(held, "Look at t0001, from 0 to 0.5 s", "discard t0001", "if not, run a trial")
+    left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", part=part)
+    assert left.sentence().endswith("(noise: 100 mm), 87 % of it in t0001, from 0 to 0.5 s")
+    begun = another_look(task, three, "x", begins="v")  # it was to move y where v was 100 % off
+    assert holds(begun, "moves v in another way", "gap in x (most of the one-step errors are in v)")
     anyhow = another_look(task, three, "x")
     assert holds(anyhow, "in another way", "by hand", "steps", "sweeps", "inside", "manoeuvre")
     driven = another_look(task, [*three, ran(4, "")], "x")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
+from grounded.frozen import resampled_noise, white_noise
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
@@ -200,3 +201,19 @@ def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
     ):
         loser = off("c0002", **errors)
         assert in_doubt(task, best, loser, (best, loser), 9) is doubt
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
+    """A boat's position had 16 mm on the grid, its promises counted 11 mm."""
+    rng = np.random.default_rng(3)
+    t = 0.05 * np.arange(401)
+    seen = 0.02 * rng.standard_normal((401, 8))
+    log = (1 - share) * seen[:-1] + share * seen[1:] + np.sin(t[:-1])[:, None]
+    true = 0.02 * np.hypot(1 - share, share)
+    np.testing.assert_allclose(np.median(resampled_noise(log)), true, rtol=0.08)
+    smooth = np.sin(3 * t)[:, None]  # nothing but motion
+    assert resampled_noise(smooth)[0] == white_noise(smooth)[0] < 1e-3
+    gaps = np.where(np.arange(400)[:, None] % 9, log, np.nan)
+    np.testing.assert_allclose(np.median(resampled_noise(gaps)), true, rtol=0.2)
+    assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0

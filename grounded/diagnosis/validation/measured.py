@@ -19,6 +19,7 @@ from grounded.diagnosis.error_report import (
     ABOVE,
     SURE,
     Credit,
+    Part,
     Remainder,
     RulerRow,
     RunChange,
@@ -36,6 +37,7 @@ from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 
+MOSTLY, FEW = 0.5, 0.2  # of the error above the noise, in a part with at most this share of all
 FAR = 3.0  # times the noise floor, above which a leftover is stated despite any uncertainty
 WHITE = 0.01  # p-value below which the innovations are not white
 MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
@@ -250,10 +252,33 @@ class Measured:
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
                 floor_at_most=self.at_most or self.source == "alike",
+                part=self.part(at, ruler.shown[i], floor),
             )
             found.append((-error / max(floor, float(fine[i])), i, left, row))
         found.sort(key=lambda each: each[:2])
         return tuple(self.with_region(row, left) for *_, left, row in found)
+
+    def part(self, k: int, i: int, floor: float) -> Part | None:
+        """Return the part of a trial, of a second or less, with most of a state's error; or None.
+
+        Args:
+            k: place of the horizon.
+            i: the state.
+            floor: rms error of noise alone, which does not count.
+        """
+        errors, ruler, data = self.ruler.errors(self.best), self.ruler, self.data
+        total, count = errors.total[k, :, i], errors.count[k, :, i]
+        above = np.maximum(total - count * floor**2, 0.0)
+        most = int(np.argmax(above))
+        share = above[most] / max(float(above.sum()), 1e-300)
+        if share < MOSTLY or count[most] > FEW * count.sum():
+            return None
+        run = int(ruler.run_of[most])
+        trial = int(data.trial_of[run])
+        first = int(data.step_at[run, 0] - ruler.step0[trial])
+        first += int(most - ruler.piece0[run]) * ruler.steps[-1]
+        end = min(first + ruler.steps[-1], int(data.lengths[trial]))
+        return Part(self.trials[trial].id, first * data.dt, end * data.dt, float(share))
 
     def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:
         """Add the missing rate and its region, as a flexible regression finds them."""

@@ -42,6 +42,7 @@ LEAST_WHOLE = 3
 FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
 SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
 ODD = 10.0  # a trial that misses more than this times the best repeat is not a repeat
+UNKNOWN = 10  # samples of a run until an unmeasured state is known
 MOMENTS = 20  # most moments at which repeats are compared
 AS_LONG = 1.25  # whole trials up to this times as long as the repeats have their floor
 ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
@@ -89,13 +90,21 @@ class Ruler:
 
     @cached_property
     def starts(self) -> tuple[Any, Any]:
-        """Step within the run, and run, of each moment that predictions start from, (M,) each."""
+        """Step within the run, and run, of each moment that predictions start from, (M,) each.
+
+        Where a state is not measured, a speed for instance, the first samples of a run do not tell
+        it yet: predictions from there would miss by that and not by the model.
+        """
         data, least = self.data, self.steps[0]
         lengths = data.valid.sum(axis=1).astype(int)
         first = data.step_at[:, 0] - self.step0[data.trial_of]
         room = data.lengths[data.trial_of] - least - first
+        blind = len(self._watched) < len(self.shown)
+        begin = np.clip(lengths // 4, 1, UNKNOWN) if blind else np.ones_like(lengths)
         pairs = [
-            (t, b) for b in range(len(lengths)) for t in range(1, min(lengths[b], room[b] + 1))
+            (t, b)
+            for b in range(len(lengths))
+            for t in range(begin[b], min(lengths[b], room[b] + 1))
         ] or [(0, 0)]
         most = MOST_STARTS if not simulated(data.model) else FEWER_STARTS
         at, run = np.array(pairs[:: max(1, len(pairs) // most)]).T
@@ -271,7 +280,9 @@ class Ruler:
         """Return the noise floor from repeats: the scatter of their errors about their mean.
 
         The number of independent samples is the number of repeats times the number of horizons that
-        fit into one: two repeats of 4 s sample the noise over a second about eight times.
+        fit into one: two repeats of 4 s sample the noise over a second about eight times. If it is
+        larger in some motions than in others (on an unstable ball), they tell less: then what
+        counts is how much it differs from moment to moment. Noise is never less further ahead.
 
         Returns:
             The rms floor (K, n), NaN for whole trials if these are longer than the repeats, and the
@@ -282,6 +293,7 @@ class Ruler:
         of_trial = dict(zip(data.trial_of[first].tolist(), first.tolist(), strict=True))
         total = np.zeros((len(self.steps) + 1, data.model.n))
         count, often = np.zeros_like(total), np.zeros(len(total))
+        cells: list[list[tuple[float, Array, Array]]] = [[] for _ in total]
         longest = int(data.lengths[data.trial_of[self.wholes]].max())
         for group in repeats:
             runs = np.array([of_trial[i] for i in group if i in of_trial])
@@ -295,20 +307,27 @@ class Ruler:
                     continue
                 often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
                 last = min(own - 1, length - steps)
-                moments = np.unique(np.linspace(min(1, last), last, MOMENTS).astype(int))
+                begin = min(int(self.starts[0].min()), last)
+                moments = np.unique(np.linspace(begin, last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
                 error = missed(self.predictor, [h], 0 * at, fit.states, at, run, steps)
                 error = error[1:] if k == len(self.steps) else error[-1:]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
-                there = np.isfinite(error).all(axis=1)
+                there = np.asarray(np.isfinite(error).all(axis=1))
                 spread = np.where(there, np.nan_to_num(error).var(axis=1, ddof=1), 0.0)
                 total[k] += spread.sum(axis=(0, 1))
                 count[k] += there.sum(axis=(0, 1))
+                apart = min(max(length // steps, 1) / max(len(moments), 1), 1.0)
+                cells[k].append((apart, spread.reshape(-1, data.model.n), there[0]))
         if not (count[:-1][:, self._watched] > 0).all():
             return None
         found = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
-        return found, 1 / np.sqrt(2 * np.maximum(often, 0.5))
+        found[:-1] = np.fmax.accumulate(found[:-1], axis=0)
+        unsure = 1 / np.sqrt(2 * np.maximum(often, 0.5))
+        for k in range(len(self.steps)):
+            unsure[k] = max(unsure[k], _uneven(cells[k])[self._watched].max())
+        return found, unsure
 
     def _alike(self, h: Hypothesis, track: Array, runs: Any) -> Any:
         """Return the runs that are repeats, without those whose one-step errors are far larger.
@@ -333,6 +352,24 @@ class Ruler:
     def _watched(self) -> list[int]:
         """The shown states that have a measurement."""
         return [i for i in self.shown if self.data.seen[..., i].any()]
+
+
+def _uneven(cells: Sequence[tuple[float, Array, Array]]) -> Array:
+    """Return the standard deviation of the logarithm of a noise's rms, by state (n,).
+
+    It follows from how much the variance differs from moment to moment, whatever that is due to.
+
+    Args:
+        cells: of each group of repeats the share of its M moments that are independent, the
+            variance at each (M, n), and whether it is known (M, n) or in one array (1, n).
+    """
+    each = np.concatenate([one for _, one, _ in cells])
+    weight = np.concatenate([w * np.broadcast_to(there, one.shape) for w, one, there in cells])
+    often = weight.sum(axis=0)
+    mean = (weight * each).sum(axis=0) / np.maximum(often, 1e-12)
+    spread = (weight * (each - mean) ** 2).sum(axis=0) / np.maximum(often - 1, 1)
+    few = np.sqrt(spread / np.maximum(often, 1)) / np.maximum(2 * mean, 1e-300)
+    return np.where((often > 1) & (mean > 0), few, 0.0)
 
 
 def _jackknife(each: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array, white_noise
+from grounded.frozen import Array, resampled_noise
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
 from grounded.search.certainty import began_apart
@@ -121,7 +121,9 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
 
 def single_sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> float:
     """Return the noise (std) of one sample of the distance that some states have, by its runs."""
-    each = [white_noise(trial.states[: trial.finite_steps + 1])[list(states)] for trial in trials]
+    each = [
+        resampled_noise(trial.states[: trial.finite_steps + 1])[list(states)] for trial in trials
+    ]
     return float(np.sqrt(np.mean([noise @ noise for noise in each])))
 
 
