@@ -259,7 +259,7 @@ def test_what_noise_of_few_repeats_does_not_tell_is_no_explanation_down_to_the_n
     assert "1.8 times" in rest(rows) and not in_doubt(rows) and not rest(few)
     said = explained(few)
     assert "down to the noise" not in said
-    assert holds(said, "1.6 mm", "0.91 mm", "1.8 times", "factor of up to 3.4")
+    assert holds(said, "1.6 mm", "0.91 mm", "1.8 times", "to a factor of 3.4")
     assert "down to the noise" not in explained((row({"x": 0.1}, {"x": 0.1}, {"x": math.nan}),))
 
 

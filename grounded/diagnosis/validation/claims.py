@@ -272,7 +272,7 @@ class Claims:
                 found.append((first, *others))
                 continue
             name = first.removeprefix("parameter:")
-            if first in self.names and all(self._one_thing(first, other) for other in others):
+            if first in self.names and all(self._twins(first, other) for other in others):
                 found.append((first, *others))
             if name == first or name not in model.param_names:
                 continue
@@ -326,13 +326,21 @@ class Claims:
 
     def _one_thing(self, name: str, other: str) -> bool:
         """Check whether two effects are equivalent with other values of the free parameters."""
+        return (name, other) in {(o.effect, o.like) for o in self.alike} and self._twins(
+            name, other
+        )
+
+    def _twins(self, name: str, other: str) -> bool:
+        """Check the same of two that explain the data, though their own signals may be opposite.
+
+        A weaker right thruster is a stronger left one with less thrust of both.
+        """
         key = name, other
         if key not in self._same:
             effects = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
-            like = (name, other) in {(one.effect, one.like) for one in self.alike}
             free = moving(self.data, self.best.hypothesis)
-            pair = effects[name], effects[other]
-            self._same[key] = bool(free) and like and twins(self.predictor, *pair, free)
+            known = bool(free) and {name, other} <= effects.keys()
+            self._same[key] = known and twins(self.predictor, effects[name], effects[other], free)
         return self._same[key]
 
     def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:

@@ -1,7 +1,8 @@
 """Forecasts: rollouts of a model along a trial, restarted from the measured state periodically.
 
 They show the gap between model and reality: from a measured state, with the inputs that were sent,
-where does the model predict the robot a second later? All rollouts are simulated at once.
+where does the model predict the robot a second later? Of a sensor that is late they start from the
+true value, as a filter tells it. All rollouts are simulated at once.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
     if whole < 1:
         return None
     part = trial.until(whole)
-    lifted, plan = anchored(planner, part), planner.plan
+    lifted, plan = _known(planner, part), planner.plan
     problem = plan.problem(exact=True)
     past = plan.past if part.start_inputs is None else part.start_inputs
     z = augmented(problem, lifted.states, lifted.inputs, past)
@@ -77,6 +78,39 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
             states.append(x[:, :n])
             steps.append(np.where(starts + k + 1 <= whole, starts + k + 1, -1))
     return Forecast(np.stack(states, axis=1), np.stack(steps, axis=1))
+
+
+def _known(planner: Planner, trial: Trial) -> Trial:
+    """Extend a finite trial by the planning model's memory states, as past samples tell them.
+
+    Of a sensor that is late, a filter estimates the true value. Its motion is as uncertain as a
+    tenth of its change in a step, see `first_noise`.
+    """
+    from grounded.places import true_values
+
+    lifted, model, n = anchored(planner, trial), planner.plan.model, planner.task.model.n
+    behind = true_values(model.state_names, model.state_names[n:])
+    if not behind:
+        return lifted
+    from grounded.estimate import NoiseStd, of_states
+    from grounded.estimate.likelihood import first_noise
+    from grounded.estimate.record import batch_of, records_of
+    from grounded.estimate.trials import smooth_trials
+
+    seen = np.where(np.arange(model.n) < n, lifted.states, np.nan)
+    seen[0] = lifted.states[0]  # before the start they were settled
+    logged, measures = replace(lifted, states=seen), of_states(model)
+    latency = planner.plan.latency
+    assert latency is not None
+    noise = first_noise(batch_of(records_of(model, [logged]), measures, model.n, latency), measures)
+    known = noise.measurement.copy()
+    for memory, log in behind.items():
+        known[memory] = known[log]
+    noise = NoiseStd(noise.process, known, noise.dt)
+    [found] = smooth_trials(model, [logged], noise, latency=latency, forward=True)
+    states = np.array(lifted.states)
+    states[:, list(behind)] = found.states[:, list(behind)]
+    return replace(lifted, states=states) if np.isfinite(states).all() else lifted
 
 
 def anchored(planner: Planner, trial: Trial) -> Trial:

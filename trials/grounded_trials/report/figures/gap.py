@@ -14,7 +14,7 @@ import numpy as np
 from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import SHORT, probe, samples
+from grounded.places import SHORT, probe, samples, true_values
 from grounded.trial import Trial
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.findings import Findings, Run
@@ -86,6 +86,12 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
         "inputs that were sent: where the lines differ, the model is wrong."
     )
+    names = better.planner.plan.model.state_names if better is not None else ()
+    if true_values(names, names[findings.task.model.n :]):
+        caption += (
+            " A sensor that the model knows to be late shows where the robot was: then it starts "
+            "from where it is, as far as the samples until then tell."
+        )
     diagnosis = findings.diagnosis
     if diagnosis is not None and diagnosis.made is not None and better is not None:
         saw = "used this trial" if trial.id in diagnosis.made.trials else "did not use this trial"
