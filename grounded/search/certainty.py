@@ -135,11 +135,12 @@ def in_doubt(
 ) -> bool:
     """Return whether a loss may be due to a lucky trial of the incumbent, or to other start states.
 
-    What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would block every further step. So after a loss within two standard errors the
-    incumbent is run again, until it has `most` trials: one for each loss. Without repeats at a
-    similar utility, the standard deviation is taken as half of the utility, as for chi-squared with
-    eight degrees of freedom; a loss of more than 1.4 times the best cost is then accepted at once,
-    and one of more than 0.7 times if it is of another kind (`another_kind`).
+    What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would
+    block every further step. So after a loss within two standard errors the incumbent is run again,
+    until it has `most` trials: one for each loss. Without repeats at a similar utility, the
+    standard deviation is taken as half of the utility, as for chi-squared with eight degrees of
+    freedom; a loss of more than 1.4 times the best cost is then accepted at once, and one of more
+    than 0.7 times if it is of another kind (`another_kind`).
     On a deterministic system this costs one trial per incumbent.
     """
     if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most) is None:

@@ -18,6 +18,7 @@ a state with what to run next.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -340,7 +341,7 @@ def let_down(ended: Standing, model: str) -> Standing:
     """
     best = ended.incumbent
     assert best is not None
-    own, missed = best.candidate.id, list[float]()
+    own, missed = best.candidate.id, list[Tried]()
     lost = losers_of(ended.history, own, model)
     for tried in ended.history:
         made = tried.candidate
@@ -351,12 +352,14 @@ def let_down(ended: Standing, model: str) -> Standing:
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:
-            missed.append(made.predicted_gain)
-    if not missed or not max(missed) > LITTLE * -best.utility:
+            missed.append(tried)
+    most = max(missed, key=lambda one: one.candidate.predicted_gain, default=None)
+    if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
         return ended
+    gave = f"gave {figure(most.utility)}" if math.isfinite(most.utility) else "failed"
     why = (
-        f". But a step that lost had promised {figure(max(missed))} more: the model is wrong near "
-        f"{own}, and a diagnosis may show what it lacks"
+        f". But {most.candidate.id}, for which {figure(most.promised)} was predicted, {gave}: the "
+        f"model is wrong near {own}, and a diagnosis may show what it lacks"
     )
     then = NextCommand("diagnose")
     return replace(ended, sentence=ended.sentence + why, then=then, missed=why)
