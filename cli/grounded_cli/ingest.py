@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
 AGAIN, ASIDE = "run again", "set aside"  # verdicts
+BEGUN = "in doubt for its start"  # a verdict "in doubt" that another run of the same one settles
 BEST = ("better", "maybe better")  # verdicts on what was the best when its run arrived
 # verdict -> what it means for the search
 VERDICTS = {
@@ -41,6 +42,7 @@ VERDICTS = {
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
+    BEGUN: ": by the model where it began explains that, and it is run once more",
     "probe": ", for the diagnosis: the search ignores it",
     ASIDE: ": it does not count",
     AGAIN: ": the candidate counts with the mean of its runs",
@@ -135,7 +137,8 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
     else:
         passed = best is not None and best.candidate.id != one.candidate
         passed = passed and (one.verdict == AGAIN or (one.known and one.verdict in BEST))
-        meaning = VERDICTS.get(one.verdict, "")
+        doubted = one.verdict == "in doubt" and one.to_settle == one.candidate
+        meaning = VERDICTS.get(BEGUN if doubted else one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
             says = any("discard" in warning for warning in one.warnings)
             meaning = f"; discard it, as the {'warning' if says else 'note'} says"

@@ -84,8 +84,10 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         from grounded_trials.workspace.identity import estimated_in
 
         guessed = estimated_in(workspace.trials())
-        text = _so_far(candidate, standing.incumbent, workspace.task, guessed)
+        text, *parts = _so_far(candidate, standing.incumbent, workspace.task, guessed).split("\n")
         show(field("so far", text, "  "))
+        for part in parts:
+            show(field("", part, "    "))
     lacks = "; this model lacks what the last diagnosis found" * bool(proposed.lacks)
     show(field("trust", _trust(candidate, standing, workspace) + lacks, "  "))
     show_extent(candidate, workspace.task)
@@ -134,7 +136,8 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
 def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection[str] = ()) -> str:
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
-    Its gain is counted from what the model gives the best one, which therefore ends the text. The
+    The gain of the candidate is counted from what the model gives the best one. Parts of the
+    difference between the two follow, each on a line. The
     difference is split into three parts: the start (the model's own run starts at s_0, the real
     ones elsewhere, if by more than their sensors show), the noise in the runs' mean (which the
     model replays: it costs less than they do, because their scatter is averaged out), and the rest,
@@ -162,24 +165,27 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     start = same - candidate.base_as_run if elsewhere else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
+    off = listed(elsewhere.values())
     reasons = (
-        (start, f"runs that began off [task] start, by {listed(elsewhere.values())}"),
-        (mean, "noise in the runs that it leaves out"),
+        (start, f"it begins at [task] start, the runs began off that, by {off}"),
+        (mean, "it replays the mean of the runs, in which what differs between them cancels"),
     )
     parts = [(part, why) for part, why in reasons if abs(part) > told]
     rest = same - best.utility - sum(part for part, _ in parts)
     if math.isfinite(best.standard_error):
         within = abs(rest) <= LUCKY * best.standard_error
-        parts.append((rest, "the scatter of the runs" if within else "its own error"))
+        parts.append(
+            (rest, "within the scatter of the runs" if within else "the model's own error")
+        )
     elif parts:
-        parts.append((rest, "noise or its own error (one run can't tell which)"))
+        parts.append((rest, "noise, or the model's own error (one run can't tell which)"))
     most = max((abs(part) for part, _ in parts), default=0.0)
     large = [(part, why) for part, why in parts if abs(part) > max(told, MINOR * most)]
     if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):
-        return f"{apart}, which is {large[0][1]}{then}"
-    said = "; ".join(f"{'+' * (part > 0)}{number(part)} for {why}" for part, why in large)
-    added = f"{own}: the {number(best.utility)} measured; {said}"
-    return f"{added if said else apart}{then}"
+        return f"{apart}: {large[0][1]}{then}"
+    each_part = [f"\n{'+' * (part > 0)}{number(part)}: {why}" for part, why in large]
+    sum_of = f". The {number(same - best.utility)} between the two are" * bool(each_part)
+    return f"{apart}{then}{sum_of}{''.join(each_part)}"
 
 
 def noise_share(best: Tried) -> str:

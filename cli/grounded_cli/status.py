@@ -99,7 +99,9 @@ def summary(status: Status) -> str:
     exported = "then " * (status.again.verb == "next")
     again = f" ({exported}`{rendered(status.again)}`)"
     if certainty := last_improvement(standing.history, again):
-        if (waiting := standing.outstanding) is not None and standing.incumbent is not None:
+        ran = {t.candidate.id for t in standing.history if t.trials}
+        waiting = standing.outstanding
+        if waiting and waiting.id not in ran and standing.incumbent is not None:
             small = beyond_one_trial(waiting, standing.incumbent, standing.missing)
             certainty = "; ".join(filter(None, (certainty, small)))
         lines.append(field("certainty", certainty))
@@ -120,6 +122,8 @@ def _gained(standing: Standing) -> str:
         return "; the model's own policy failed"
     if best.candidate.base == "" or not own.utility:
         return ""
+    if best.excused(own):
+        return ""  # `certainty` says by what it counts as better
     if chance(own, best, standing.history) < SURE:
         return "; the scatter of repeats may explain its lead on the model's own policy"
     share = (best.utility - own.utility) / abs(own.utility)

@@ -34,10 +34,12 @@ Slopes = Literal[
 LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
 SURE = 0.95  # probability of an improvement from which it counts as one
 UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
+PART = 0.3  # share of a gain or loss due to different start states from which on it is reported
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
+    from grounded.search.starts import Starts
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -181,7 +183,8 @@ class Tried(Result):
     trials: tuple[Trial, ...]
     utilities: tuple[float, ...]
     accepted: bool | None  # None: undecided, trials are missing
-    in_doubt: bool = False  # undecided because the incumbent is to be run again
+    in_doubt: bool = False  # undecided because one of the two is to be run again
+    to_settle: str = ""  # id of the candidate whose next run is to settle the doubt
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
     noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
@@ -190,11 +193,28 @@ class Tried(Result):
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
+    starts: Starts | None = None  # what the start states of its runs cost, by the model
 
     @cached_property
     def utility(self) -> float:
         """Mean utility of the trials; nan without a trial, -inf if one of them failed."""
         return float(np.mean(self.utilities)) if self.utilities else float("nan")
+
+    def gain_over(self, other: Tried) -> float:
+        """Return by how much its mean utility exceeds another's; every judgement uses this number.
+
+        A loss is counted without the part that different start states explain by the model. A gain
+        counts as measured, as in the paper, and so does a loss of which they explain little.
+        """
+        return self.utility - other.utility + self.excused(other)
+
+    def excused(self, other: Tried) -> float:
+        """Return the part of a loss to another candidate that the start states explain, or 0."""
+        loss = other.utility - self.utility
+        if self.starts is None or not (loss >= 0 and np.isfinite(loss)):
+            return 0.0
+        due = -self.starts.owed(self, other)
+        return due if due > PART * loss else 0.0
 
     @property
     def promised(self) -> float:

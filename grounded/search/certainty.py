@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.result import with_error
-from grounded.search.candidate import Candidate, Tried
+from grounded.search.candidate import PART, Candidate, Tried
 from grounded.search.scatter import (
     NoiseSoFar,
     Repeats,
@@ -26,9 +26,9 @@ from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
+    from grounded.search.starts import Starts
     from grounded.search.step.step_size import SearchOptions
 
-PART = 0.3  # share of a gain due to different start states from which on it is reported
 ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
@@ -42,8 +42,13 @@ def judged(
     trials: Sequence[Trial],
     options: SearchOptions,
     model: str,
+    starts: Starts | None = None,
 ) -> tuple[tuple[Tried, ...], Tried | None, int]:
-    """Return every candidate with its trials and verdict, the incumbent, and the iterations."""
+    """Return every candidate with its trials and verdict, the incumbent, and the iterations.
+
+    A candidate that was run repeatedly and whose loss different start states explain is accepted if
+    it is ahead without them; one that was run once is in doubt.
+    """
     history: list[Tried] = []
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
@@ -65,11 +70,13 @@ def judged(
         if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None, gone=gone))
             continue
-        better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
-        accepted = better and not failed
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        tried = Tried(candidate, own, utilities, accepted, pieces=pieces, gone=gone)
-        if accepted:
+        tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone, starts=starts)
+        better = incumbent is None or tried.utility > incumbent.utility
+        if incumbent is not None and not better and len(own) > 1:
+            better = tried.gain_over(incumbent) > 0
+        if better and not failed:
+            tried = replace(tried, accepted=True)
             iteration += incumbent is not None
             incumbent, losses = tried, 0
             history = [_settled(one) for one in history]
@@ -83,7 +90,9 @@ def judged(
                 and not (spent or exact)
                 and in_doubt(task, incumbent, tried, history, losses + options.repeats)
             ):
-                tried = replace(tried, accepted=None, in_doubt=True)
+                again = to_settle(incumbent, tried, losses + options.repeats)
+                name = again.candidate.id if again else ""
+                tried = replace(tried, accepted=None, in_doubt=True, to_settle=name)
         history.append(tried)
     best_one = incumbent and incumbent.candidate
     noises = NoiseSoFar(trials, task.model.n)
@@ -113,7 +122,7 @@ def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[st
 
 def _settled(tried: Tried) -> Tried:
     """Return a candidate whose loss was in doubt as one that lost: a later one beat both runs."""
-    return replace(tried, accepted=False, in_doubt=False) if tried.in_doubt else tried
+    return replace(tried, accepted=False, in_doubt=False, to_settle="") if tried.in_doubt else tried
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
@@ -124,24 +133,38 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
 def in_doubt(
     task: Task, incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
 ) -> bool:
-    """Return whether a loss may be due to a lucky trial of the incumbent.
+    """Return whether a loss may be due to a lucky trial of the incumbent, or to other start states.
 
-    A lucky incumbent would block every further step. So after a loss within two standard errors the
-    incumbent is run again, until it has `most` trials: one for each loss. Without repeats at a
-    similar utility, the standard deviation is taken as half of the utility, as for chi-squared with
-    eight degrees of freedom; a loss of more than 1.4 times the best cost is then accepted at once,
-    and one of more than 0.7 times if it is of another kind (`another_kind`).
+    What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would
+    block every further step. So after a loss within two standard errors the incumbent is run again,
+    until it has `most` trials: one for each loss. Without repeats at a similar utility, the
+    standard deviation is taken as half of the utility, as for chi-squared with eight degrees of
+    freedom; a loss of more than 1.4 times the best cost is then accepted at once, and one of more
+    than 0.7 times if it is of another kind (`another_kind`).
     On a deterministic system this costs one trial per incumbent.
     """
-    if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
+    if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most) is None:
         return False
     scatter = Repeats((*history, loser)).near(incumbent.utility)
     each = math.sqrt(scatter.variance) if scatter.known else 0.5 * abs(incumbent.utility)
     error = each * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
-    loss = incumbent.utility - loser.utility
+    loss = -loser.gain_over(incumbent)
     if not scatter.known and loss > error and another_kind(task, incumbent, loser):
         return False
     return not loss > 2 * error
+
+
+def to_settle(incumbent: Tried, loser: Tried, most: int) -> Tried | None:
+    """Return which of two candidates to run again after a loss; None if that was done enough.
+
+    It is the incumbent, which may have been lucky, but the one whose starts matter more if start
+    states explain the loss. Neither is run again that has `most` trials.
+    """
+    either = [incumbent]
+    if loser.starts is not None and loser.excused(incumbent):
+        either, cost = [loser, incumbent], loser.starts.cost
+        either.sort(key=lambda one: -abs(cost(one)))
+    return next((one for one in either if len(one.trials) < most), None)
 
 
 def another_kind(task: Task, incumbent: Tried, loser: Tried) -> bool:
@@ -199,6 +222,14 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
     before, after = accepted[-2], accepted[-1]
     gain, start = after.utility - before.utility, owed_to_start(before, after, history)
     error, freedom = error_between(before, after, history)
+    if after.excused(before):
+        other = before.candidate.id
+        return (
+            f"{after.candidate.id} counts as better than {other}, although its runs gave "
+            f"{-gain:.3g} less: by the model, where they began explains {-start:.3g}, so that the "
+            f"policy is ahead by {gain - start:.3g}. Another run of each, from [task] start, would "
+            "show which is better"
+        )
     if start:
         other, rest = before.candidate.id, gain - start
         measured = f"{gain:.3g}" + (f" +- {error:.2g}" if freedom and error else "")
@@ -291,6 +322,8 @@ def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> boo
 
 def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown."""
+    if excused := after.excused(before):
+        return -excused
     if not (before.trials and after.trials and began_apart(before, after)):
         return 0.0
 

@@ -104,7 +104,7 @@ def propose(
     trials = list_of(trials, Trial, "trials")
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
-    now = standing(task, candidates, trials, options, fingerprint)
+    now = standing(task, candidates, trials, options, fingerprint, planner)
     if now.phase == "await-trial":
         return Proposal(now, now.outstanding, is_new=False)
     if now.phase != "propose":
@@ -129,7 +129,7 @@ def propose(
     found = _improvement(make, now.incumbent, options)
     if found.candidate is None:
         return found
-    before = standing(task, candidates, trials[:-1], options, fingerprint)
+    before = standing(task, candidates, trials[:-1], options, fingerprint, planner)
     note = _run_again(before, now, trials[-1], found.candidate)
     return replace(found, notes=(*found.notes, note)) if note else found
 

@@ -131,7 +131,7 @@ class About:
         base = next((t for t in history if t.candidate.id == made.base), None)
         if base is None or made.slopes or made.model != self.make.fingerprint:
             return False
-        off = self.incumbent.utility - base.utility - made.predicted_gain
+        off = self.incumbent.gain_over(base) - made.predicted_gain
         lost = losers_of(history, made.id, made.model)
         return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
@@ -141,7 +141,7 @@ class About:
         lost = losers_of(self.make.now.history, best.candidate.id, model)
         corrected = {c.id for c in lost if c.of_corrected and c.of_original == self.original}
         return sum(
-            tried.utility - best.utility < tried.candidate.expected_gain
+            tried.gain_over(best) < tried.candidate.expected_gain
             for tried in self.make.now.history
             if tried.candidate.id in corrected
         )
@@ -303,7 +303,7 @@ class About:
                 continue
             again = predicted(self.real, made.policy)
             run = (again.states, again.inputs)
-            short = (again.utility - self.already) - (tried.utility - best.utility)
+            short = (again.utility - self.already) - tried.gain_over(best)
             if short > 0 and (far := apart(self.real, run, self.run)) > 0:
                 found.append((run, far, short))
         return found
@@ -328,7 +328,7 @@ class About:
             if own and tried.lost and np.isfinite(tried.utility):
                 change = predicted(self.plain, tried.candidate.policy).utility - self.plainly
                 told += abs(change)
-                missed += abs(change - (tried.utility - self.incumbent.utility))
+                missed += abs(change - tried.gain_over(self.incumbent))
         return missed > MISTAKEN * told
 
     def _plain_gain(self, made: Candidate) -> float | None:

@@ -153,7 +153,7 @@ def promises(
             continue
         base = judged[made.base]
         error, known = error_between(base, tried, history)
-        gained = promised, tried.utility - base.utility, error if known else 0.0
+        gained = promised, tried.gain_over(base), error if known else 0.0
         if _by_adopted(tried, model):
             adopted = adopted.and_of(*gained)
         else:

@@ -6,7 +6,8 @@ order of their proposal, and their trials determine:
     the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
     outstanding      the candidate that was proposed and has not been run often enough
     tried            the steps from the incumbent that did not improve (step 6)
-    in doubt         a loss that may be luck: the incumbent is run again before it is accepted
+    in doubt         a loss that may be luck: the incumbent is run again before it is accepted; or
+                     that other start states explain, by the model: that run is repeated
 
 Two trials of a candidate that agree to the last bit show that the system is deterministic, unless
 other repeats differ: from then on nothing is run twice.
@@ -17,6 +18,7 @@ a state with what to run next.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,12 +28,14 @@ from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import LUCK, error_between, few, judged, last_improvement
 from grounded.search.scatter import Repeats
+from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
+    from grounded.search.planner import Planner
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 Ending = Literal[
@@ -201,6 +205,7 @@ def standing(
     trials: Sequence[Trial],
     options: SearchOptions,
     model: str,
+    planner: Planner | None = None,
 ) -> Standing:
     """Derive the state of the search from stored trials (steps 6 and 7).
 
@@ -210,8 +215,10 @@ def standing(
         trials: in order of storage; those of unknown candidates are ignored.
         options: the [search] table.
         model: fingerprint of the current planning model; a direction belongs to one model.
+        planner: has that model, which tells what start states cost; None: that stays unknown.
     """
-    history, incumbent, iteration = judged(task, candidates, trials, options, model)
+    starts = Starts(planner) if planner else None
+    history, incumbent, iteration = judged(task, candidates, trials, options, model, starts)
     total = sum(len(t.trials) for t in history)
     now = Standing(
         phase="propose",
@@ -294,7 +301,7 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     if not before or any(t.candidate.model != model for t in last[-LOST:]):
         return None
     old, best = before[-1], [t for t in history if t.accepted][-1]
-    gained = best.utility - old.utility
+    gained = best.gain_over(old)
     if gained == 0.0:
         return "no step improved", f"the last {PATIENCE} candidates did not improve"
     if any(t.candidate.way == BY_STEP for t in last) and before[-1].candidate.way != BY_STEP:
@@ -334,23 +341,25 @@ def let_down(ended: Standing, model: str) -> Standing:
     """
     best = ended.incumbent
     assert best is not None
-    own, missed = best.candidate.id, list[float]()
+    own, missed = best.candidate.id, list[Tried]()
     lost = losers_of(ended.history, own, model)
     for tried in ended.history:
         made = tried.candidate
         if made not in lost or made.doubtful:
             continue
         error, known = error_between(best, tried, ended.history)
-        loss, noise = best.utility - tried.utility, LUCK * error if known else 0.0
+        loss, noise = -tried.gain_over(best), LUCK * error if known else 0.0
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:
-            missed.append(made.predicted_gain)
-    if not missed or not max(missed) > LITTLE * -best.utility:
+            missed.append(tried)
+    most = max(missed, key=lambda one: one.candidate.predicted_gain, default=None)
+    if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
         return ended
+    gave = f"gave {figure(most.utility)}" if math.isfinite(most.utility) else "failed"
     why = (
-        f". But a step that lost had promised {figure(max(missed))} more: the model is wrong near "
-        f"{own}, and a diagnosis may show what it lacks"
+        f". But {most.candidate.id}, for which {figure(most.promised)} was predicted, {gave}: the "
+        f"model is wrong near {own}, and a diagnosis may show what it lacks"
     )
     then = NextCommand("diagnose")
     return replace(ended, sentence=ended.sentence + why, then=then, missed=why)
@@ -388,13 +397,22 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     waiting = _waiting(now, model)
     doubt = next((t for t in now.history if t.in_doubt), None)
     if doubt is not None and now.incumbent is not None:
-        made, missing = now.incumbent.candidate, 1
-        lost = f"{doubt.candidate.id} lost to {made.id}"
-        if Repeats(now.history).near(now.incumbent.utility).known:
+        best, missing = now.incumbent.candidate, 1
+        made = doubt.candidate if doubt.to_settle == doubt.candidate.id else best
+        lost, from_start = f"{doubt.candidate.id} lost to {best.id}", ""
+        if excused := doubt.excused(now.incumbent):
+            from_start = ", from [task] start"
+            gain = doubt.gain_over(now.incumbent)
+            lost += (
+                f" by {figure(now.incumbent.utility - doubt.utility)}, but by the model it lost "
+                f"{figure(excused)} by where the runs began, and is itself "
+                f"{figure(abs(gain))} {'better' if gain > 0 else 'worse'}"
+            )
+        elif Repeats(now.history).near(now.incumbent.utility).known:
             lost += " by no more than noise may explain"
         else:
             lost += ", but none as good ran twice, so how much runs differ is not known"
-        sentence = f"{lost}: {made.id} is waiting for another trial"
+        sentence = f"{lost}: {made.id} is waiting for another trial{from_start}"
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"

@@ -89,6 +89,7 @@ def step(
     utilities = (utility,) if runs is None else runs
     pieces = None if runs is None else np.outer(runs, np.ones(PIECES) / PIECES)
     fields = {"utility": float(np.mean(utilities)), "utilities": utilities, "pieces": pieces}
+    fields["gain_over"] = lambda other: float(np.mean(utilities)) - other.utility
     return SimpleNamespace(
         candidate=made, accepted=accepted, lost=accepted is False and lost, **fields
     )

@@ -182,6 +182,11 @@ def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
     ended = story.propose().standing
     assert ended.ending == "no step improved" and ended.then == NextCommand("diagnose")
     assert holds(ended.sentence, ended.incumbent.candidate.id, "diagnosis")
+    rows = {row[0]: row for row in ended.table()[0]}  # its numbers are those of `status`
+    lost = ended.sentence.partition(". But ")[2]
+    assert holds(
+        lost, f"{lost[:5]}, for which {rows[lost[:5]][4]} was predicted", rows[lost[:5]][5]
+    )
 
 
 def test_a_small_promise_that_is_not_kept_asks_for_nothing():

@@ -204,7 +204,7 @@ class SearchOptions:
         if base is None or not goes_on or not self.damps:
             first = self.first_step()
             return self.next_step(first) if way == BY_STEP else first
-        real = incumbent.utility - base.utility
+        real = incumbent.gain_over(base)
         return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
 
     def steps_from(self, step: Step | None) -> Iterator[Step]:

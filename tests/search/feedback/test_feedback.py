@@ -235,7 +235,7 @@ def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
         (
             -9.0,
             0.1,
-            ("1.000 better than measured, which is runs that began off [task] start, by",),
+            ("1.000 better than measured: it begins at [task] start, the runs began off that, by",),
             ("scatter", "error"),
         ),
         # a car's line told 0.003 of the 0.129 that its two figures differ by
@@ -243,19 +243,19 @@ def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
             -7.5,
             np.nan,
             (
-                "predicts -8.000: the -9.000 measured; -0.5000 for runs that began off",
-                "; +1.500 for noise or its own error (one run",
-                "which). Compare c0002 with that: it is 1.000 better",
+                "predicts -8.000, 1.000 better than measured. Compare c0002 with that: it is 1.000",
+                "The 1.000 between the two are\n-0.5000: it begins at [task] start",
+                "\n+1.500: noise, or the model's own error (one run",
             ),
             (),
         ),
         (
             -8.0,
             0.6,
-            ("1.000 better than measured, which is the scatter of the runs",),
+            ("1.000 better than measured: within the scatter of the runs",),
             ("start",),
         ),
-        (-8.0, 0.1, ("1.000 better than measured, which is its own error",), ("start",)),
+        (-8.0, 0.1, ("1.000 better than measured: the model's own error",), ("start",)),
         (-8.0, np.nan, (), ("scatter", "start")),  # one run: the scatter is unknown
         (np.nan, 0.1, (), ("scatter", "start")),  # from an older version
     ],
@@ -300,7 +300,7 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
         trials=runs,
     )
     text = _so_far(promise("c0001", mean, 0.1 * abs(mean), mean), best, task)
-    assert "noise in the runs" in text and "error" not in text
+    assert "mean of the runs" in text and "error" not in text
 
 
 def test_a_difference_with_one_reason_has_one_number():
@@ -320,7 +320,7 @@ def test_a_difference_with_one_reason_has_one_number():
     off = 2 * best.utility  # and more but for the noise, which the model leaves out
     same = best.utility + off
     text = _so_far(promise("c0001", same, -4 * off, same), best, task)
-    assert f"{-off:.4g} worse than measured, which is the scatter of the runs" in text
+    assert f"{-off:.4g} worse than measured: within the scatter of the runs" in text
 
 
 def promise(base, of_base, gain, as_run):
@@ -375,7 +375,7 @@ def test_the_noise_of_a_first_row_is_no_start_elsewhere():
     )
     best.trials = [begun(task, noise=0.02)]
     text = _so_far(made, best, task)
-    assert "began" not in text and "2.000 better than measured, which is its own error" in text
+    assert "began" not in text and "2.000 better than measured: the model's own error" in text
 
 
 def test_after_a_swing_a_step_precedes_an_own_plan_that_promises_as_much(noisy, monkeypatch):

@@ -11,6 +11,7 @@ from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates import at_rest
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.remarks.after_run import _to_stay
 from grounded_trials.workspace.where_to_mend import where_to_mend
@@ -176,9 +177,12 @@ def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task(tmp_path):
     assert any("after the run" in one for one in same)  # of the log that it was told of
 
 
-@pytest.mark.parametrize("knows", [True, False])
-def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, knows):
-    """A helicopter fell under 0 V after every run: terminal weights and --hold were advised."""
+@pytest.mark.parametrize(("knows", "holds_it"), [(True, True), (False, True), (True, False)])
+def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, knows, holds_it):
+    """A helicopter fell under 0 V after every run: terminal weights and --hold were advised.
+
+    A boat in a current from the side was to have the input that holds it in [task] start.
+    """
     model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
     made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
     first = made.propose().candidate.policy
@@ -190,11 +194,15 @@ def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, knows):
         late = beyond > 0
         table[late, 1] = table[beyond <= 0, 1][-1] - 0.3 * beyond[late] ** 2
         np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
+    if not holds_it:
+        monkeypatch.setattr(at_rest, "resting", lambda *_: None)
     (told,) = (
         one for one in Workspace(made.folder).ingest(file).warnings if "after the run" in one
     )
-    assert holds(told, "force = 0 N", "runner.done(t)", "[task] start")
-    assert ("force = 1.5 N would" in told) is knows
+    assert holds(told, "force = 0 N", "runner.done(t)")
+    assert ("[task] start" in told) is holds_it
+    assert ("no constant input does" in told) is not holds_it
+    assert ("force = 1.5 N would" in told) is (knows and holds_it)
     assert "terminal" not in told and "--hold" not in told
 
 

@@ -244,7 +244,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
             share = 1 - best.utility / first.utility
-            gain = f": cost reduced by {percent(share)}"
+            gain = f": cost {'reduced' if share > 0 else 'raised'} by {percent(abs(share))}"
             if _probability(findings) < SURE:
                 gain += ", which the scatter of repeats may explain"
             tried = {one.candidate.id: one for one in findings.history}

@@ -144,6 +144,18 @@ def _drift(task: Task, stands: Array, own: int) -> Array:
     return np.abs(np.asarray(task.model.difference(x[0], stands[:n])))[:own]
 
 
+def moves_by(task: Task, free: NDArray[np.bool_]) -> float:
+    """Return how far a state moves at most in one step under the input held before; 0 at rest.
+
+    Args:
+        task: the task with the start.
+        free: (n,), states among which those of clocks are ignored.
+    """
+    clocks = free & [is_clock(name) for name in task.model.state_names]
+    away = float(np.abs(moved_at_start(task, task.past))[~clocks].max())
+    return away if away > 1e-9 else 0.0
+
+
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
     """Find states and inputs inside the limits under which the robot rests at its start.
 
@@ -162,9 +174,8 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
     from grounded.search.first_guess import trim
 
     clocks = free & [is_clock(name) for name in task.model.state_names]
-    free = free & ~clocks
-    away = np.abs(moved_at_start(task, task.past))[~clocks].max()
-    if not away > 1e-9 or _out_of_reach(task, free, clocks):
+    free, away = free & ~clocks, moves_by(task, free)
+    if not away or _out_of_reach(task, free, clocks):
         return None
     still = np.tile(task.start, (2, 1))
     still[1, clocks] += task.dt

@@ -226,8 +226,8 @@ class Check:
         except GroundedError:
             candidates = here.read(strict=False).candidates
         trials = [t.trial for t in self.trials if here.fits(t.trial)]
-        options, model = here.config.search, here.planner.fingerprint
-        return standing(here.task, candidates, trials, options, model)
+        options, planner = here.config.search, here.planner
+        return standing(here.task, candidates, trials, options, planner.fingerprint, planner)
 
     @property
     def same_task(self) -> bool:

@@ -56,7 +56,7 @@ def standing_in(
     contents = contents or workspace.read()
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
     workspace.save_index()
     if ahead and now.phase == "propose" and now.incumbent is not None:
         now = planned(workspace, contents).standing
@@ -80,7 +80,7 @@ def planned(workspace: Folder, contents: Contents) -> Proposal:
 
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
     planning = now.phase == "propose" and now.incumbent is not None
     if planning and (ended := known_end(workspace, contents, now)) is not None:
         return Proposal(ended, None, is_new=False)

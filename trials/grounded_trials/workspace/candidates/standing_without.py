@@ -27,8 +27,9 @@ LATEST = 4  # latest hand-outs that are looked at
 def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
     """Return the standing of the search without some trials."""
     trials = [t for t in workspace.task_trials() if t.id not in ids]
-    options, model = workspace.config.search, workspace.planner.fingerprint
-    return standing(workspace.task, workspace.read().candidates, trials, options, model)
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    candidates = workspace.read().candidates
+    return standing(task, candidates, trials, options, planner.fingerprint, planner)
 
 
 def odd_run(

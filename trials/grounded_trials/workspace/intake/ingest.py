@@ -76,6 +76,7 @@ class Ingested(Result):
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
+    to_settle: str = ""  # the candidate to be run again, if the verdict is "in doubt"
     off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
     faults: tuple[str, ...] = ()  # those warnings that say that columns of the log are wrong
     then: NextCommand = PROPOSE
@@ -205,6 +206,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         faults=odd,
         signals=read.signals,
         verdict=verdict,
+        to_settle=tried.to_settle if tried else "",
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
@@ -253,13 +255,17 @@ def _undo(identity: str) -> str:
 
 
 def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:
-    """Return the verdict on a run; "run again" for another one of what was the best before it."""
+    """Return the verdict on a run; "run again" for another one of what was a best before it."""
     if tried is None:
         return "probe" if trial.candidate else ""
     repeats = workspace.config.search.repeats
     again = trial.id not in [one.id for one in tried.trials[:repeats]]
-    if again and tried.accepted is False and not tried.crashed:
-        before = standing_without(workspace, {trial.id}).incumbent
-        again = before is not None and before.candidate.id == tried.candidate.id
-        return "run again" if again else tried.verdict()
-    return "run again" if again and tried.accepted else tried.verdict()
+    if not again or tried.accepted is None or tried.crashed:
+        return tried.verdict()
+    before = standing_without(workspace, {trial.id})
+    if tried.accepted:
+        again = any(t.accepted for t in before.history if t.candidate.id == tried.candidate.id)
+    else:
+        best = before.incumbent
+        again = best is not None and best.candidate.id == tried.candidate.id
+    return "run again" if again else tried.verdict()

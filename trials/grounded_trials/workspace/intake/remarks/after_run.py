@@ -164,13 +164,14 @@ def _at_rest(planner: Planner, whole: Trial) -> Trial:
 
 def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
     """Return that the input sent after a run does not hold the robot, and what would."""
-    from grounded_trials.workspace.candidates.at_rest import resting
+    from grounded_trials.workspace.candidates.at_rest import moves_by, resting
 
     model, memory = planner.task.model, np.arange(planner.plan.model.n) >= planner.task.model.n
     rest = _at_rest(planner, whole)
     there = replace(planner.plan, start=rest.states[-1], past=held)
     with np.errstate(all="ignore"):
         found = resting(there, memory, replace(planner.loose, start=there.start, past=held))
+        lost = found is None and moves_by(there, memory) > 0
 
     def told(values: Array, digits: int = 3) -> str:
         pairs = zip(model.inputs.items(), values + 0.0, strict=True)
@@ -179,11 +180,17 @@ def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
         )
 
     would = f" (by the model {told(found[len(memory) :], 2)} would)" if found is not None else ""
+    then = "Switch to a controller that holds it as soon as `runner.done(t)` is true"
+    if lost:  # such as a boat in a current from the side
+        would = " (and by the model no constant input does)"
+    else:
+        then += (
+            "; or, if the robot may have the input that holds it before the run too, set that in "
+            "[task] start"
+        )
     return (
-        f"after it the runner sends {told(held)}, which does not hold it there{would}. Switch to a "
-        "controller that holds it as soon as `runner.done(t)` is true; or, if the robot may have "
-        "the input that holds it before the run too, set that in [task] start. No weight in "
-        "[reward] changes this"
+        f"after it the runner sends {told(held)}, which does not hold it there{would}. {then}. No "
+        "weight in [reward] changes this"
     )
 
 

@@ -6,15 +6,15 @@ s_0. A run whose utility it changes much says nothing about its candidate, and m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from grounded.frozen import Array
 from grounded.result import listed
-from grounded.search.planner import predicted
 from grounded.search.returned.who_drove import LEAST
 from grounded.search.scatter import Repeats, sample_noise
+from grounded.search.starts import worth_of_start
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
@@ -98,7 +98,12 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         return None
     where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *tolerated))
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
-    if len(before) < FEWEST:
+    if _to_repeat(workspace, trial):
+        does = (
+            f"By the model that explains why it lost: {trial.candidate} is to be run again. Place "
+            "the robot nearer to the start"
+        )
+    elif len(before) < FEWEST:
         does += f" (after {FEWEST + 1} runs, offsets within their scatter are not told again)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
@@ -142,6 +147,12 @@ def _lost_by(workspace: Folder, trial: Trial) -> float:
     return float(best - task.utility(trial)) if np.isfinite(best) else 0.0
 
 
+def _to_repeat(workspace: Folder, trial: Trial) -> bool:
+    """Return whether a run's candidate is to be run again since its start explains its loss."""
+    history = standing_without(workspace, ()).history
+    return any(t.in_doubt and t.to_settle == t.candidate.id == trial.candidate for t in history)
+
+
 def _scatter(workspace: Folder, trial: Trial, cost: float) -> float:
     """Return the std of single runs of about this cost, by repeats among the others; 0 if unknown.
 
@@ -164,17 +175,8 @@ def _starts_before(workspace: Folder, identity: str) -> Array:
 
 def _changes(workspace: Folder, trial: Trial, off: Array) -> float:
     """Return by how much a start that is off by `off` (n,) changes the utility in the model."""
-    planner = workspace.planner
     policy = workspace.candidate(trial.candidate)[0].policy
-    problem = planner.plan.problem(exact=True)
-    moved = problem.start.copy()
-    moved[: len(off)] += off
-    with np.errstate(all="ignore"):
-        from_there, from_s_0 = (
-            predicted(replace(problem, start=start), policy).utility
-            for start in (moved, problem.start)
-        )
-    return float(np.nan_to_num(from_there - from_s_0, nan=-np.inf))
+    return float(np.nan_to_num(worth_of_start(workspace.planner, policy, off), nan=-np.inf))
 
 
 def _promised(workspace: Folder, trial: Trial) -> float:
