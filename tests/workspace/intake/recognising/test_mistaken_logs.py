@@ -115,6 +115,19 @@ def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
     assert w.discard("t0002").then.verb != "ingest"
 
 
+def test_states_that_earlier_logs_have_in_their_columns_are_exchanged_on_the_robot(w, tmp_path):
+    w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    path = log(w, tmp_path / "b.csv", seed=1)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0].replace("v,r,psi", "psi,r,v"), *lines[1:]]))
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "v", "psi", "t0001", "sensors", "`discard t0002`")
+    assert "paths in [log]" not in warning
+    w.discard("t0001")
+    lone = Workspace(w.folder).status().notes[0]
+    assert holds(lone, "[log]", "discard t0002") and "sensors" not in lone
+
+
 @pytest.mark.parametrize("before", [True, False])
 def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(
     w, tmp_path, before
