@@ -144,10 +144,12 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
             meaning = f"; discard it, as the {'warning' if says else 'note'} says"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
-        text = f"utility {number(one.utility)}, {one.verdict}{_earlier(one) or meaning}"
+        ended = one.utility == float("-inf")
+        gained = "no utility" if ended else f"utility {number(one.utility)}"
+        text = f"{gained}, {one.verdict}{_earlier(one) or meaning}"
         if one.verdict == "crashed" and one.then.verb == "discard":
             text = f"no utility: it ended early{meaning}"
-        if one.verdict == ASIDE and one.utility == float("-inf"):
+        if one.verdict == ASIDE and ended:
             text = f"{ASIDE}{meaning}"
         if passed and best is not None:
             text += f"; the best is now {best.candidate.id}, {number(best.utility)}"

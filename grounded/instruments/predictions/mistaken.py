@@ -127,7 +127,47 @@ def mistaken(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Tol
     whole = {c: fits for c, fits in found.items() if not sound.get(replace(c, signs=()))}
     if sum(trials[k].steps * trials[k].dt for k in some) < ODD_FROM:
         whole = {c: fits for c, fits in whole.items() if not any(sign < 0 for sign in c.signs)}
-    return _best(whole) if whole else None
+    if not whole:
+        return None
+    best = _best(whole)
+    return _most_telling(model, trials[min(whole[best.mistake])], shown, best)
+
+
+def _most_telling(model: Model, trial: Trial, shown: Sequence[int], told: Told) -> Told:
+    """Return an exchange with the state of the strongest evidence, with the model as it is.
+
+    Calibrated to a log with two exchanged wheels, a model turns the robot with neither: its heading
+    rate, which shows the exchange best, is then hardly worse than its speed.
+    """
+    if not told.mistake.inputs or not told.mistake.swap:
+        return told
+    known = [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+    signs = np.ones(model.m)
+    signs[list(told.mistake.inputs)] = told.mistake.signs or 1.0
+    with np.errstate(all="ignore"):
+        before = Ahead(model, trial, known, STARTS).plain(np.ones(model.m))
+        after = Ahead(model, told.mistake.mended(trial), known, STARTS).plain(signs)
+    i = int(np.argmin(after.rms / before.rms))
+    if not after.rms[i] / before.rms[i] < told.mended / told.logged:
+        return told
+    return replace(told, state=i, logged=float(before.rms[i]), mended=float(after.rms[i]))
+
+
+def contradicted(model: Model, trial: Trial, shown: Sequence[int], change: Mistake) -> bool:
+    """Check whether the model predicts a trial clearly better as logged than without a fault.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: indices of the states with a sensor.
+        change: the fault, of another trial.
+    """
+    known = [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+    logged, mended = (Ahead(model, one, known, STARTS) for one in (trial, change.mended(trial)))
+    if not (logged.enough and mended.enough) or not np.isfinite(trial.inputs).all():
+        return False
+    with np.errstate(all="ignore"):
+        return _gained(model, logged.plain(np.ones(model.m)).score, mended, change) < -HINT
 
 
 def as_logged(model: Model, told: Told, findings: Sequence[Finding]) -> Told:
@@ -184,8 +224,14 @@ def mended_by(model: Model, told: Told) -> str:
     )
 
 
-def described(model: Model, told: Told) -> str:
-    """Return one clause: what is wrong, and the evidence."""
+def described(model: Model, told: Told, *, robot: bool = False) -> str:
+    """Return one clause: what is wrong, and the evidence.
+
+    Args:
+        model: with the names and units.
+        told: the fault.
+        robot: an exchange is the robot's, and the log is right.
+    """
     unit = model.states[model.state_names[told.state]]
     error = with_unit(f"{told.mended:.2g} instead of {told.logged:.2g}", unit)
     proof = f"misses {model.state_names[told.state]} by {error} 0.25 s ahead"
@@ -199,7 +245,8 @@ def described(model: Model, told: Told) -> str:
             f"(in {told.mistake.unit}?): {'divided by that' if large else f'times {times}'} "
             f"the model {proof}"
         )
-    said, *others = (_named(model, one) for one in (told.mistake, *told.others))
+    named = _swapped if robot else _named
+    said, *others = (named(model, one) for one in (told.mistake, *told.others))
     text = said + "".join(f" (or {other})" for other in others)
     text = f"{text}: only with that undone does the model predict the robot's motion ({proof})"
     mirror = _mirrored(model, told.mistake)
@@ -221,6 +268,15 @@ def _named(model: Model, mistake: Mistake) -> str:
     else:
         said = ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
     return f"the columns of {said} look exchanged"
+
+
+def _swapped(model: Model, mistake: Mistake) -> str:
+    """Return what the robot did, rather than what looks wrong in its log."""
+    if mistake.inputs:
+        a, b = (model.input_names[j] for j in mistake.inputs)
+        return f"the robot did with {a} what was sent as {b}, and the reverse"
+    said = ", ".join(listed(model.state_names[i] for i in pair) for pair in mistake.states)
+    return f"the robot's sensors or program seem to exchange {said}"
 
 
 def _exchanges(model: Model, shown: Sequence[int]) -> Iterator[Mistake]:
@@ -292,7 +348,7 @@ def _each(
         mended = Ahead(model, change.mended(trial), known, starts)
         if not mended.enough:
             continue
-        gain = plain - min(mended.plain(gains).score for gains in _signed(model, change))
+        gain = _gained(model, plain, mended, change)
         if gain < -HINT:
             yield change, None
         elif gain > HINT:
@@ -302,6 +358,11 @@ def _each(
                 after = mended.best([np.ones(model.m)])
                 fits = (before, after) if after.score < before.score else None
             yield change, fits
+
+
+def _gained(model: Model, plain: float, mended: Ahead, change: Mistake) -> float:
+    """Return by how much the model, not calibrated, predicts better without a fault [nats]."""
+    return plain - min(mended.plain(gains).score for gains in _signed(model, change))
 
 
 def _act_exchanged(model: Model, trial: Trial, change: Mistake, known: Sequence[int]) -> bool:

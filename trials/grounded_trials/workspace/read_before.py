@@ -37,6 +37,15 @@ def read_by(mapping: LogMapping) -> dict[str, str]:
     return {READ_BY: json.dumps(found)}
 
 
+def paths_of(meta: Mapping[str, str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns from which [log] read some signals of a trial; () if it does not say."""
+    try:
+        before = json.loads(meta[READ_BY])
+        return tuple(str(before[name]["path"]) for name in names)
+    except (KeyError, ValueError, TypeError, RecursionError):
+        return ()
+
+
 def read_otherwise(
     meta: Mapping[str, str], mapping: LogMapping | None, corrected: Collection[tuple[str, str]] = ()
 ) -> tuple[str, ...]:

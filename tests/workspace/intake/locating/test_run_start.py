@@ -537,7 +537,11 @@ def test_one_log_is_one_trial(w, tmp_path):
     assert kept.candidate == ""
     with pytest.raises(GroundedError, match=f"stored already, as {kept.trial}, data") as refused:
         w.ingest(path)  # "ran c0001, which was made for an earlier task"
-    assert refused.value.then is None  # `next` with the log of a drive: it advised to discard it
+    # `next` with the log of a drive: it advised to discard it, and there was no `next:`
+    assert "c0002" in str(refused.value) and "discard" not in str(refused.value)
+    assert refused.value.then is not None and refused.value.then == w.status().then
+    with pytest.raises(GroundedError, match=f"really is a run of c0002, discard {kept.trial}"):
+        w.ingest(path, candidate="c0002")
 
 
 def recorded_in_motion(path, change=0.3, begun=0.13):

@@ -1,15 +1,19 @@
 """Logs with two commands exchanged, or in percent: told at ingest, and before a diagnosis."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.recognising.read_otherwise import exchanged_in
+from grounded_trials.workspace.intake.recognising.read_otherwise import misled
 from workspaces import make
 
 MODEL = """import numpy as np
@@ -45,6 +49,16 @@ model = "model.py"
 state = { v = { path = "/csv.v" }, r = { path = "/csv.r" }, psi = { path = "/csv.psi" } }
 input = { port = { path = "/csv.port" }, starboard = { path = "/csv.starboard" } }
 """
+RNG = np.random.default_rng(0)
+
+
+class Crossed(NamedTuple):
+    """Commands that arrive at each other's motor."""
+
+    port: float
+    starboard: float
+
+
 T = np.arange(101) * 0.05
 TARGET = "t,v,psi\n" + "\n".join(f"{t:.2f},{0.3 * t:.4f},{0.2 * t:.4f}" for t in T) + "\n"
 
@@ -87,6 +101,65 @@ def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
     assert done.code == 1 and holds(said, "port and starboard", "discard t0001 t0002")
     with pytest.raises(GroundedError, match="exchanged"):
         Workspace(w.folder).preflight()
+
+
+def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
+    """`Correct the paths in [log]`: every later run would have been misread."""
+    w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    other = log(w, tmp_path / "b.csv", columns=("starboard", "port"), seed=1)
+    (warning,) = w.ingest(other, data=True).warnings
+    assert holds(
+        warning, "with port what was sent as starboard", "misses r", "t0001", "no exchange"
+    )
+    assert holds(warning, "`discard t0002` and record it again") and "[log]" not in warning
+    assert w.discard("t0002").then.verb != "ingest"
+
+
+def test_states_that_earlier_logs_have_in_their_columns_are_exchanged_on_the_robot(w, tmp_path):
+    w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    path = log(w, tmp_path / "b.csv", seed=1)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0].replace("v,r,psi", "psi,r,v"), *lines[1:]]))
+    (warning,) = w.ingest(path, data=True).warnings
+    assert holds(warning, "v", "psi", "t0001", "sensors", "`discard t0002`")
+    assert "paths in [log]" not in warning
+    w.discard("t0001")
+    lone = Workspace(w.folder).status().notes[0]
+    assert holds(lone, "[log]", "discard t0002") and "sensors" not in lone
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(
+    w, tmp_path, before
+):
+    """With the paths in [log] exchanged as advised, `ingest` asked to exchange them back."""
+    toml = w.folder / "grounded.toml"
+    text = toml.read_text().replace("/csv.port", "/csv.m1").replace("/csv.starboard", "/csv.m2")
+    toml.write_text(text)
+    if before:
+        w.ingest(log(w, tmp_path / "a.csv", columns=("m1", "m2")), data=True)
+    plan, path = w.propose().candidate, tmp_path / "run.csv"
+    model = w.base_model
+    crossed = replace(
+        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
+    )
+    ran = Plant(crossed).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
+    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs])
+    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,m1,m2", comments="")
+    found = w.ingest(path)
+    (told,) = (one for one in found.warnings if "what was sent as" in one)
+    assert found.then.verb == "discard" and "Correct the paths" not in told
+    assert holds(told, "no exchange" if before else "[log] is right", f"run {plan.id} again")
+    assert w.discard(found.trial).then == NextCommand("run")  # by its [system]
+    known = w.ingest(path)
+    assert known.then == w.status().then and any(f"run {plan.id}" in s for s in known.warnings)
+
+    text = text.replace("/csv.m1", "/csv.A").replace("/csv.m2", "/csv.m1")
+    toml.write_text(text.replace("/csv.A", "/csv.m2"))
+    with pytest.raises(GroundedError) as refused:
+        Workspace(w.folder).ingest(path)
+    assert holds(str(refused.value), "commands those of", "swap its wires", f"run {plan.id} again")
+    assert refused.value.then == NextCommand("next", ("LOG",))
 
 
 def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
@@ -185,7 +258,8 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     said = str(refused.value)
     assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
     recording = read_foreign(w, path, mapping_of(w, path)).recording
-    assert exchanged_in(recording, w.task, plan) == ("port", "starboard")
+    found = misled(recording, w.task, plan)
+    assert found and holds(found.said, "port and starboard", "each other's column")
     toml = w.folder / "grounded.toml"
     toml.write_text(
         toml.read_text()

@@ -65,9 +65,21 @@ def test_a_run_that_was_leaving_its_prediction_counts_as_failed(tmp_path):
     w, policy = waiting(tmp_path)
     run = driven(w, policy, 0.3).until(29)
     write_trial(tmp_path / "t.mcap", run, {"kind": "trial", "task": w.task.hash})
-    found = w.ingest(tmp_path / "t.mcap")
-    assert (found.verdict, found.then.verb) == ("crashed", "propose")
-    assert any(holds(one, "failed candidate", "only the recording") for one in found.warnings)
+    out = grounded("-C", w.folder, "ingest", tmp_path / "t.mcap")
+    told = " ".join(f"{out.out} {out.err}".split())
+    assert holds(told, "failed candidate", "only the recording", f"{w.folder} propose")
+    assert "no utility, crashed: it did not run to the end" in told  # was "utility failed, crashed"
+
+
+def test_a_state_that_noise_moves_off_for_a_moment_does_not_make_a_crash(tmp_path):
+    """One of a boat's six states was 1.6 times as far off as before, for 0.1 s: a crash."""
+    w, policy = waiting(tmp_path)
+    run, (own, _) = driven(w, policy).until(29), w.candidate("c0001")
+    off = np.zeros_like(run.states)
+    off[22:25, 0], off[27, 1] = 0.3, 0.5
+    assert as_before(w.task, own, replace(run, states=run.states + off))
+    off[26:, 0] = 0.3  # it stays off
+    assert not as_before(w.task, own, replace(run, states=run.states + off))
 
 
 def test_a_run_that_was_about_to_leave_safety_may_have_crashed(tmp_path):

@@ -54,7 +54,7 @@ from grounded_trials.workspace.intake.remarks.log_faults import (
     log_faults,
 )
 from grounded_trials.workspace.intake.remarks.trial_check import warnings_about
-from grounded_trials.workspace.next_step import PROPOSE, after_log
+from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
 from grounded_trials.workspace.unknown_id import refuse_ids
 
@@ -161,9 +161,12 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     warnings = (*read.warnings, *odd, *begun, *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
-    if aside := added.id in workspace.discarded():
-        warnings = (*warnings, f"{added.id} stays set aside and does not count: {_undo(added.id)}")
     now = standing_in(workspace) if trial.candidate else None
+    waits = now.outstanding if now and now.phase == "await-trial" else None
+    if aside := added.id in workspace.discarded():
+        then = f"; if you don't want that, run {waits.id} and record another log" if waits else ""
+        stays = f"{added.id} stays set aside and does not count: {_undo(added.id)}{then}"
+        warnings = (*warnings, stays)
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(workspace, trial, tried)
@@ -221,6 +224,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         off_target=off_target_of(workspace.task, judged),
         then=NextCommand("discard", (added.id,))
         if (odd or wrong) and not aside
+        else another_trial(workspace, now)
+        if now and waits and aside
         else after_log(workspace, verdict, now),
     )
 

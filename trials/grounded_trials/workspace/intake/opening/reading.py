@@ -181,15 +181,15 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
 
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
-    refuse_as_another(path, log.stored, "" if data else candidate)
+    refuse_as_another(workspace, path, log.stored, "" if data else candidate)
     if not (data or ran):
-        refuse_known_data(path, log.stored)
+        refuse_known_data(workspace, path, log.stored, None)
     before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
     if before and before.candidate in workspace.candidate_ids():
         ran = before.candidate
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
-        refuse_as_another(path, log.stored, chosen)
+        refuse_as_another(workspace, path, log.stored, chosen)
         _check_candidate(workspace, path, chosen)
     read = cut_log(log, chosen)
     return replace(read, before=before) if before and chosen == ran else read
@@ -287,7 +287,7 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
         return read
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
-    refuse_as_another(path, (one,), wanted)
+    refuse_as_another(workspace, path, (one,), wanted)
     note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
     return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
 

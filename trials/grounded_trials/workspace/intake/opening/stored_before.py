@@ -20,6 +20,7 @@ from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
@@ -29,10 +30,13 @@ EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
 LEAST = 10  # rows that two recordings must share to count as the same
 
 
-def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | None) -> None:
+def refuse_as_another(
+    workspace: Folder, path: Path, stored: Sequence[StoredTrial], wanted: str | None
+) -> None:
     """Refuse a log that is stored as a run of another candidate, or as data.
 
     Args:
+        workspace: the workspace with the search.
         path: the log.
         stored: the trials that were made from it.
         wanted: the requested candidate, "" for data, None for no preference.
@@ -43,7 +47,9 @@ def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | N
     if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
         return
     identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
-    refuse_known_data(path, stored)  # the wrong file, most likely; a diagnosis may rest on it
+    refuse_known_data(
+        workspace, path, stored, wanted
+    )  # the wrong file, most likely; a diagnosis may rest on it
     raise GroundedError(
         f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
         f"use it as {_what(wanted)} instead, discard {identity} first",
@@ -51,18 +57,26 @@ def refuse_as_another(path: Path, stored: Sequence[StoredTrial], wanted: str | N
     )
 
 
-def refuse_known_data(path: Path, stored: Sequence[StoredTrial]) -> None:
+def refuse_known_data(
+    workspace: Folder, path: Path, stored: Sequence[StoredTrial], wanted: str | None
+) -> None:
     """Refuse a log that is stored as data and was passed as the log of a run, probably by mistake.
+
+    Only who names the candidate is told to discard the data: a diagnosis may rest on it.
 
     Raises:
         GroundedError: if it is stored as data.
     """
-    if stored and not stored[-1].trial.candidate:
-        identity = stored[-1].stored.id
-        raise GroundedError(
-            f"{path} is stored already, as {identity}, data: pass the log of the candidate's run. "
-            f"If this is one, discard {identity} and name the candidate with --candidate ID"
-        )
+    if not stored or stored[-1].trial.candidate:
+        return
+    identity, now = stored[-1].stored.id, standing_in(workspace)
+    known = f"{path} is stored already, as {identity}, data for fit and diagnose"
+    waits = now.outstanding.id if now.outstanding and now.phase == "await-trial" else ""
+    then = to_run(workspace, waits) if waits else NextCommand("status")
+    if wanted:
+        wrong = f"if it really is a run of {wanted}, discard {identity} and ingest it again"
+        raise GroundedError(f"{known}: pass the log of that run; {wrong}", then)
+    raise GroundedError(known + (f": pass the log of the run of {waits}" if waits else ""), then)
 
 
 def _what(candidate: str | None) -> str:

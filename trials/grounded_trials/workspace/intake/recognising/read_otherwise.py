@@ -6,7 +6,7 @@ Tried are: another rate, another unit, two signals in each other's columns, and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -94,23 +94,57 @@ def unit_of(log: Recording, task: Task, own: Candidate) -> tuple[tuple[str, ...]
     return (), 1.0
 
 
-def misled(log: Recording | None, task: Task, own: Candidate) -> str:
-    """Return another fault of a log that hides its run, and how to correct it; or ""."""
+@dataclass(frozen=True)
+class Misled:
+    """A fault of a log that hides its run, and how to correct it."""
+
+    said: str
+    rerun: bool = False  # the robot did not run its candidate as it should: run it again
+
+
+def misled(log: Recording | None, task: Task, own: Candidate) -> Misled | None:
+    """Return another fault of a log that hides its run, or None."""
     if log is None:
-        return ""
+        return None
     if late := begins_late(log, own.policy):
-        return (
+        return Misled(
             f"its first row is {late:.3g} s after {own.id} began: record from before the run, and "
             "cut nothing off; without its beginning the run can't be judged"
         )
-    if pair := exchanged_in(log, task, own):
-        a, b = pair
-        of = "state" if a in task.model.state_names else "input"
-        return (
-            f"{a} and {b} seem to be in each other's column: exchange the paths in "
-            f"[log.{of}.{a}] and [log.{of}.{b}], or the column headers in the log"
-        )
-    return _off_zero(task, offset_in(log, task, own))
+    if found := _exchange(log, task, own):
+        return _in_other_column(log, task, own, *found[:2])
+    off = _off_zero(task, offset_in(log, task, own))
+    return Misled(off) if off else None
+
+
+def _in_other_column(
+    log: Recording, task: Task, own: Candidate, pair: tuple[str, str], begins: float
+) -> Misled:
+    """Return what shows that two columns are exchanged, and whether the robot has them so, too.
+
+    If the model predicts the motion with the commands as they are read, the commands were sent to
+    each other's motor: with the log corrected, the robot would be said to exchange them.
+    """
+    from grounded.instruments.predictions.mistaken import Mistake, contradicted
+
+    (a, b), model = pair, task.model
+    of = "state" if a in model.state_names else "input"
+    said = (
+        f"{a} and {b} seem to be in each other's column: only with them exchanged are its commands "
+        f"those of {own.id}. Exchange the paths in [log.{of}.{a}] and [log.{of}.{b}], or the "
+        "column headers in the log"
+    )
+    run = log.trial_from(begins) if of == "input" else None
+    if run is None:
+        return Misled(said)
+    fault = Mistake(inputs=(model.input_names.index(a), model.input_names.index(b)))
+    if not contradicted(model, run.until(run.known_steps), range(model.n), fault):
+        return Misled(said)
+    return Misled(
+        f"{said}. But the robot moved as if {a} was sent as {b}, and the reverse: swap its wires, "
+        f"or the outputs of its program, back and run {own.id} again",
+        rerun=True,
+    )
 
 
 def zero_in(
@@ -139,18 +173,6 @@ def _off_zero(task: Task, off: tuple[str, float] | None) -> str:
         f"from that of the program? Add {-by:.3g} to the offset in [log.state.{name}] (a missing "
         "offset is 0); if the log is right, the robot's program measures it wrong"
     )
-
-
-def exchanged_in(log: Recording, task: Task, own: Candidate) -> tuple[str, str] | None:
-    """Return two states, or inputs, whose exchange makes the log contain a run of a candidate.
-
-    Args:
-        log: a log in which no run of the candidate was found.
-        task: the task with the control step.
-        own: the candidate.
-    """
-    found = _exchange(log, task, own)
-    return found and found[0]
 
 
 def rather_exchanged(

@@ -171,7 +171,8 @@ def recognised(
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
-        also = turned or gone or misled(None if other else log, task, own)
+        hides = None if turned or gone or other else misled(log, task, own)
+        also = turned or gone or (hides.said if hides else "")
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
             read, assumed = _from_first_change(read, log, task)
@@ -214,12 +215,13 @@ def recognised(
     known = replace(read.trial, id="").until(read.trial.known_steps)
     odd = []
     if not seen.silent:  # without them the model can't tell what moves the robot
-        odd += [*mistaken_in(workspace.base_model, known)]
+        odd += [*mistaken_in(workspace, known)]
         odd += [*dead_sensors(workspace.base_model, whole)]
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
-    if not named and not other and not seen.silent:
-        named += filter(None, [misled(log, task, own)])
+    hides = None if named or other or seen.silent else misled(log, task, own)
+    if hides:
+        named, again = [hides.said], NextCommand("next", ("LOG",)) if hides.rerun else again
     if named:
         raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}", again)
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 FAR = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 NEAR = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
+END = LEAST // 2  # last steps, in most of which a state has to be that far off: noise is not
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,9 @@ def ended_early(workspace: Folder, trial: Trial) -> Asked | None:
 def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     """Return whether a run was as near to its prediction at its end as before, inside [safety].
 
+    A robot that crashes stays off its prediction. Noise, and what feedback makes of it, moves one
+    state or another off it farther than ever before, but only for a moment.
+
     Args:
         task: with [safety].
         own: the candidate that was run.
@@ -167,11 +171,12 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     said = own.predicted_states
     off = np.abs(task.model.difference(run.states, said[: len(run.states)]))
     known = np.maximum(GROWN * off[:-LEAST].max(axis=0), NEAR * np.ptp(said, axis=0))
+    end = np.median(off[-END:], axis=0)
     soon = 2 * run.states[-1] - run.states[-1 - LEAST]  # as many steps later, at the same rate
     assert task.safety_low is not None and task.safety_high is not None
     inside = [((x >= task.safety_low) & (x <= task.safety_high)).all() for x in run.states]
     inside.append(((soon >= task.safety_low) & (soon <= task.safety_high)).all())
-    return bool(all(inside) and (off[-LEAST:] <= known).all())
+    return bool(all(inside) and (end <= known).all())
 
 
 def _complete(workspace: Folder, run: Trial) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,12 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.wording import ranges
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.read_before import paths_of, read_by
+
+if TYPE_CHECKING:
+    from grounded.instruments.predictions.mistaken import Mistake
 
 # multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
 TURNS, WIDER = 5.0, 2.0
@@ -30,6 +36,7 @@ class Fault:
         said: the fault, in a clause or two.
         mend: what to change in [log], an imperative; "" if `said` includes it.
         program: what the program that writes trials should do instead; "" if `said` includes it.
+        robot: why the robot is at fault and not the log, and what to undo on it: sentences.
         inputs: the inputs that are in another unit.
         factor: how many times too large these are, below 1 too small.
     """
@@ -39,9 +46,14 @@ class Fault:
     program: str = ""
     inputs: tuple[str, ...] = ()
     factor: float = 1.0
+    robot: str = ""
 
     def told(self, trial: Trial, *, own: bool) -> str:
         """Return the warning; `own` is for a trial that was written by grounded, not a log."""
+        if self.robot:
+            again = f", `discard {trial.id}`" * bool(trial.id)
+            again += f" and {f'run {trial.candidate}' if trial.candidate else 'record it'} again"
+            return f"{self.said}. {self.robot}{again}"
         if own:
             should = f": it should {self.program}" * bool(self.program)
             again = f", `discard {trial.id}`" * bool(trial.id)
@@ -61,15 +73,15 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
         trial: the trial, with gaps bridged.
     """
     model, known = workspace.base_model, trial.until(trial.known_steps)
-    if exchanged := _by_model(model, known):
+    if exchanged := _by_model(workspace, known):
         return exchanged  # other faults may only be a consequence
-    found = [*_exchanged(model, known), *dead_sensors(model, trial), *_thousands(model, known)]
+    found = [*_exchanged(workspace, known), *dead_sensors(model, trial), *_thousands(model, known)]
     found += [*way_faults(model, known), *positions_faults(model, known)]
     said = {fault.said for fault in found}
     degrees = [one for one in _degrees(model, known) if one.said not in said]
     found += degrees or _beyond_safety(workspace.task, trial)
     found += _clocks_apart(workspace, trial)
-    found += mistaken_in(model, known)
+    found += mistaken_in(workspace, known)
     return tuple(_with_limits(workspace.task, known, one) for one in found)
 
 
@@ -93,24 +105,86 @@ def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
     return replace(fault, mend=f"{fault.mend}; [limits] {unit}: write {', '.join(right)} there")
 
 
-def _exchanged(model: Model, known: Trial) -> Iterator[Fault]:
+def _exchanged(workspace: Folder, known: Trial) -> Iterator[Fault]:
     from grounded.instruments.kinematics.swapped import exchanged, swapped_columns
+    from grounded.instruments.predictions.mistaken import Mistake
     from grounded.places import integrals
 
+    model = workspace.base_model
     if pair := swapped_columns(model, known, relations=integrals(model)):
-        yield Fault(exchanged(pair), "Exchange their paths in [log]")
+        one, *more = (k for k, n in enumerate(model.state_names) if n in pair.split(" and "))
+        fault = Mistake(states=((one, more[0]),)) if more else None  # else one is an input
+        robot = _on_the_robot(workspace, known, fault) if fault else ""
+        yield Fault(exchanged(pair), "" if robot else "Exchange their paths in [log]", robot=robot)
 
 
-def _by_model(model: Model, known: Trial) -> tuple[Fault, ...]:
+def _by_model(workspace: Folder, known: Trial) -> tuple[Fault, ...]:
     """Return a fault for two exchanged states that only the model reveals."""
     from grounded.instruments.kinematics.swapped import swapped_columns
     from grounded.instruments.predictions.exchanged_states import exchanged_states
     from grounded.instruments.predictions.mistaken import SWAP_BACK, described
 
+    model = workspace.base_model
     if swapped_columns(model, known):
         return ()
-    told = exchanged_states(model, known, range(model.n))
-    return () if told is None else (Fault(described(model, told), SWAP_BACK),)
+    if (told := exchanged_states(model, known, range(model.n))) is None:
+        return ()
+    robot = _on_the_robot(workspace, known, told.mistake)
+    said = described(model, told, robot=bool(robot))
+    return (Fault(said, "" if robot else SWAP_BACK, robot=robot),)
+
+
+def _on_the_robot(workspace: Folder, trial: Trial, fault: Mistake) -> str:
+    """Return why an exchange is not the log's, and what to undo on the robot; "" if it may be.
+
+    It is not if other trials that [log] read in the same way show none, or if the commands are
+    those of the candidate only as they are logged: the program then had the same columns.
+    """
+    parts = ("wires", "sends or logs") if fault.inputs else ("sensors", "reads or logs")
+    where = "the robot's {}, or what its program {},".format(*parts)
+    if right := _without(workspace, trial, fault):
+        show = "shows" if len(right) == 1 else "show"
+        return f"{ranges(right)}, read in the same way, {show} no exchange. Swap {where} back"
+    if not _as_sent(workspace, trial, fault):
+        return ""
+    return (
+        f"As logged, its commands are those of {trial.candidate}, so [log] is right. Swap {where} "
+        "back, or exchange them in the model if the robot is as it should be"
+    )
+
+
+def _without(workspace: Folder, trial: Trial, fault: Mistake) -> list[str]:
+    """Return the other trials that were read in the same way and contradict an exchange."""
+    from grounded.instruments.predictions.mistaken import contradicted
+    from grounded_trials.workspace.last_diagnosis import diagnosable
+
+    model, mapping = workspace.base_model, workspace.log_mapping
+    names = [model.input_names[j] for j in fault.inputs]
+    names += [model.state_names[i] for pair in fault.states for i in pair]
+    metas = {one.stored.id: one.meta for one in workspace.whole_trials()}
+    metas |= {one.stored.id: one.meta for one in workspace.aside_trials()}
+    now = read_by(mapping) if mapping else {}
+    read = {name: paths_of(meta, names) for name, meta in metas.items()}
+    own = read.get(trial.id, paths_of(now, names))
+    return [
+        one.id
+        for one in diagnosable(workspace)
+        if one.id != trial.id
+        and read.get(one.id) == own
+        and contradicted(model, one, range(model.n), fault)
+    ]
+
+
+def _as_sent(workspace: Folder, trial: Trial, fault: Mistake) -> bool:
+    """Return whether a run's commands are its candidate's, and would not be without an exchange."""
+    from grounded.search.returned.who_drove import follows, latest
+
+    if trial.candidate not in workspace.candidate_ids():
+        return False
+    policy, late = workspace.candidate(trial.candidate)[0].policy, latest(workspace.task)
+    run = trial.until(policy.horizon)
+    logged, mended = (follows(policy, one, late) for one in (run, fault.mended(run)))
+    return logged is not None and logged.alike and not (mended is not None and mended.alike)
 
 
 def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
@@ -223,11 +297,12 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     return [Fault(too_soon(model, early), mend, "stamp both by one clock")]
 
 
-def mistaken_in(model: Model, known: Trial) -> list[Fault]:
+def mistaken_in(workspace: Folder, known: Trial) -> list[Fault]:
     """Return a fault if the model explains the log better with exchanged columns or other units."""
     from grounded.instruments.predictions.mistaken import as_logged, described, mended_by, mistaken
     from grounded.instruments.preflight import preflight
 
+    model = workspace.base_model
     told = mistaken(model, [known], range(model.n))
     if told is not None:
         try:
@@ -239,6 +314,9 @@ def mistaken_in(model: Model, known: Trial) -> list[Fault]:
             told = told and as_logged(model, told, looked.findings)
     if told is None:
         return []
+    swap = told.mistake.swap and not told.mistake.turned
+    if swap and (robot := _on_the_robot(workspace, known, told.mistake)):
+        return [Fault(described(model, told, robot=True), robot=robot)]
     scaled = () if told.mistake.swap else told.mistake.inputs
     names = tuple(model.input_names[j] for j in scaled)
     should = "write inputs in the model's unit" * bool(names)
