@@ -16,7 +16,8 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.store.trial_file import read_trial, write_trial
-from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate, to_run
+from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.folder import Folder

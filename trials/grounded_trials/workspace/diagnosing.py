@@ -61,7 +61,7 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
     from grounded_trials.workspace.adoptable import diagnosed_again
-    from grounded_trials.workspace.candidates.exporting import to_run
+    from grounded_trials.workspace.candidates.exported_files import to_run
     from grounded_trials.workspace.candidates.search_state import candidate_named
     from grounded_trials.workspace.next_step import (
         DIAGNOSE,

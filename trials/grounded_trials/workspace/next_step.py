@@ -14,7 +14,7 @@ from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Standing
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adoptable import declined, late_open
-from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (

@@ -10,7 +10,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded_trials.wording import ranges, rendered
-from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
