@@ -122,8 +122,6 @@ def _gained(standing: Standing) -> str:
         return "; the model's own policy failed"
     if best.candidate.base == "" or not own.utility:
         return ""
-    if best.excused(own):
-        return ""  # `certainty` says by what it counts as better
     if chance(own, best, standing.history) < SURE:
         return "; the scatter of repeats may explain its lead on the model's own policy"
     share = (best.utility - own.utility) / abs(own.utility)

@@ -123,11 +123,10 @@ def _difference(one: Changed) -> Estimate:
 def gap_sentence(gap: Gap) -> str:
     """Return the gap before and after, with its unit."""
     held = "held out" if gap.held_out else "not held out, too few trials"
-    low = "; below 1, so errors are smaller than that" * (gap.after < gap.floor)
     return (
         f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, {held}, in units of the "
-        f"error that the estimated noise alone causes {gap.horizon_s:.3g} s ahead{low}; not "
-        "comparable between two diagnoses"
+        f"error that the filter's own noise would cause {gap.horizon_s:.3g} s ahead, which is "
+        "not the noise of the tables; not comparable between two diagnoses"
     )
 
 

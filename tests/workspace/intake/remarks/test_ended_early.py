@@ -66,7 +66,7 @@ def test_a_run_that_was_leaving_its_prediction_counts_as_failed(tmp_path):
     run = driven(w, policy, 0.3).until(29)
     write_trial(tmp_path / "t.mcap", run, {"kind": "trial", "task": w.task.hash})
     out = grounded("-C", w.folder, "ingest", tmp_path / "t.mcap")
-    told = " ".join(f"{out.out} {out.err}".split())
+    told = " ".join(f"{out.out} {out.err}".replace("\\\n", "").split())
     assert holds(told, "failed candidate", "only the recording", f"{w.folder} propose")
     assert "no utility, crashed: it did not run to the end" in told  # was "utility failed, crashed"
 

@@ -84,7 +84,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         panels.append(panel)
     caption = (
         f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
-        "inputs that were sent: where the lines differ, the model is wrong."
+        "inputs that were sent: where the lines differ by more than noise in the start makes of "
+        "it, the model is wrong. The diagnosis starts from filtered states, so its errors are less."
     )
     names = better.planner.plan.model.state_names if better is not None else ()
     if true_values(names, names[findings.task.model.n :]):

@@ -157,7 +157,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    begun = [elsewhere.told] if elsewhere and not (read.aside and not elsewhere.again) else []
+    counts = elsewhere is not None and not elsewhere.again  # as the words say
+    begun = [elsewhere.told] if elsewhere and not (counts and (read.aside or odd)) else []
     warnings = (*read.warnings, *odd, *begun, *checked)
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
@@ -180,6 +181,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     early = None if read.fell or aside or wrong else ended_early(workspace, trial)
     if early:
         said = (early.said,)  # after what is doubtful about the log, which may be why
+        if early.aside and counts:
+            warnings = tuple(one for one in warnings if one not in begun)
         warnings, wrong = (*warnings, *said) if read.doubted else (*said, *warnings), early.aside
     if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
         left = left_afterwards(workspace.task, whole)
