@@ -165,7 +165,7 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
     start = same - candidate.base_as_run if elsewhere else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
-    if not {trial.id for trial in best.trials} <= {*candidate.seen}:
+    if candidate.seen and not {trial.id for trial in best.trials} <= {*candidate.seen}:
         mean = 0.0  # it was planned before the latest of them
     off = listed(elsewhere.values())
     reasons = (
