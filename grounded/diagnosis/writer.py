@@ -133,8 +133,8 @@ class Writer:
         named = [row.effect for row in ranking if row.claimed]
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         if remainder and not named:  # what is left elsewhere is no gap
-            gone = {data.model.state_names.index(one.channel) for one in remainder}
-            gain = np.where(np.isin(np.arange(gain.shape[-1]), [*gone]), gain, 0.0)
+            off_too = [data.model.state_names.index(one.channel) for one in remainder]
+            gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
         channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
         first = channels[0] if remainder and not named and channels[0].share > HALF else None
         begins = first.name if first else off  # a position only sums up what its speed misses

@@ -313,8 +313,6 @@ def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> boo
 
 def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown."""
-    if excused := after.excused(before):
-        return -excused
     if not (before.trials and after.trials and began_apart(before, after)):
         return 0.0
 

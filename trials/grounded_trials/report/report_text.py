@@ -105,9 +105,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         text = f"model's policy {figure(first.utility)}, "
         text += f"best {best.candidate.id} {figure(best.utility)}"
         top = findings.standing.incumbent
-        if top is not None and top.excused(history[0]):
-            text += "; by the model, where their runs began explains its loss"
-        elif top is not None and top is not history[0] and chance(history[0], top, history) < SURE:
+        if top is not None and top is not history[0] and chance(history[0], top, history) < SURE:
             text += "; the scatter of repeats may explain its lead"
         elif math.isfinite(first.utility) and first.utility < 0:
             text += f", {percent(1 - best.utility / first.utility)} better"
