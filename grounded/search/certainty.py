@@ -270,7 +270,13 @@ def runs_to_show(gain: float, best: Tried) -> int:
 
 
 def runs_needed(gain: float, best: Tried) -> str:
-    """Say how many runs show a gain: "22 runs", or that it takes more than anyone makes."""
+    """Say how many runs show a gain: "22 runs", or that it takes more than anyone makes.
+
+    Of a single repeat, the scatter is known to a factor of several only, and the number to its
+    square: then none is told.
+    """
+    if best.repeats == 1:
+        return "more runs"
     runs = runs_to_show(gain, best)
     return f"{runs} runs" if runs <= MANY else f"more than {MANY} runs"
 

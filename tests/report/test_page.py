@@ -338,7 +338,7 @@ def test_a_parameter_without_bounds_is_a_constant(cart):
 def test_trials_of_another_task_are_told_beside_those_that_count(cart):
     findings = replace(gather(Folder(cart)), uncounted=("t0091", "t0092"))
     for text in (page(findings), report_text(findings, lambda rows, header: "", lambda v: "")):
-        assert "t0091 to t0092 count only as data" in " ".join(text.split())
+        assert "t0091 and t0092 count only as data" in " ".join(text.split())
 
 
 def test_the_noise_of_whole_runs_is_not_told_where_it_is_not_known(cart):

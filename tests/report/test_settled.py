@@ -60,7 +60,7 @@ def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
     page = (adopted / "reports" / "report.html").read_text().replace("\xa0", " ")
     for text in (words(adopted, "report"), re.sub(r"<[^>]+>", "", page)):
         assert "Found and adopted: " in text and "12 mm instead of 250 mm" in text
-    assert "2 trials, t0001 to t0002" in page
+    assert "2 trials, t0001 and t0002" in page
 
 
 def test_the_status_has_one_line_for_each_adopted_effect_and_parameter(adopted):

@@ -91,6 +91,8 @@ def test_no_line_is_broken_inside_a_quantity(whole):
 def test_trials_are_named_without_hiding_those_between():
     names = ["t0001", *(f"t{k:04d}" for k in range(7, 17))]
     assert ranges(names) == "t0001, t0007 to t0016"
+    assert ranges(names[:2]) == "t0001, t0007" and ranges(names[1:3]) == "t0007 and t0008"
+    assert ranges(names[:3]) == "t0001, t0007, t0008"
     assert ranges(["t0001"]) == "t0001" and ranges(["a", "b"]) == "a, b"
     odd = [f"t{k:04d}" for k in range(1, 22, 2)]
     assert ranges(odd) == "t0001 to t0021 without 10"

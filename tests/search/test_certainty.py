@@ -112,7 +112,9 @@ def test_a_scatter_says_on_how_many_repeats_it_rests():
     assert [one.repeats for one in found] == [1, 9]
     assert [few(one.repeats) for one in found] == [", from a single repeat only", ""]
     made, _ = promising(0.05)
-    assert holds(beyond_one_trial(made, replace(found[0], deviation=0.1)), "single repeat")
+    told = [beyond_one_trial(made, replace(one, deviation=0.1)) for one in found]
+    assert holds(told[0], "single repeat", "takes more runs of each") and "22" not in told[0]
+    assert holds(told[1], f"takes {runs_to_show(0.05, replace(found[1], deviation=0.1))} runs")
 
 
 def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():

@@ -50,9 +50,9 @@ def count(number: int, word: str, many: str = "") -> str:
 
 
 def ranges(names: Sequence[str]) -> str:
-    """Return `t0001, t0007 to t0016`: names in order, consecutive ones as a range.
+    """Return `t0001, t0007 to t0016`: names in order, three consecutive ones or more as a range.
 
-    More than `PIECES` ranges become the first and last name and the number of names missing
+    Two that are consecutive are `t0001 and t0002`, or two of the list. More than `PIECES` ranges become the first and last name and the number of names missing
     between them.
     """
     digits = [name[1:] for name in names]
@@ -63,7 +63,10 @@ def ranges(names: Sequence[str]) -> str:
     pieces = [names[a:b] for a, b in pairwise([0, *cuts, len(names)])]
     if len(pieces) > PIECES:
         return f"{names[0]} to {names[-1]} without {numbers[-1] - numbers[0] + 1 - len(names)}"
-    return ", ".join(" to ".join(dict.fromkeys([piece[0], piece[-1]])) for piece in pieces)
+    if len(pieces) == 1 and len(names) == 2:
+        return " and ".join(names)
+    told = (p if len(p) < 3 else [f"{p[0]} to {p[-1]}"] for p in pieces)
+    return ", ".join(name for piece in told for name in piece)
 
 
 def changed(name: str, old: float, new: float, unit: str) -> str:
