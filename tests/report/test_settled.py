@@ -19,6 +19,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import changed, in_digits_apart, legend
 from grounded_trials.workspace.adoptable import better_model
 from grounded_trials.workspace.adopting import tied_when_adopted
+from grounded_trials.workspace.diagnosing import _not_compared
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.user_files.config import set_in_model
@@ -117,6 +118,20 @@ def test_a_tie_is_remembered_until_the_other_is_adopted_or_the_one_undone(adopte
         del step["ties"]  # a document of an older version
     path.write_text(json.dumps(known))
     assert tied_when_adopted(Folder(adopted)) == {} and "quadratic" not in words(adopted, "status")
+
+
+def test_an_adopted_effect_that_another_equals_in_the_model_is_told_so(cart, tmp_path):
+    """ "The trials could not tell it from input_gain:left" read as if others could."""
+    both = ["viscous_friction:v", "quadratic_drag:v"]
+    for name, same in (("tied", []), ("same", [both])):
+        folder = written(copied(cart, tmp_path / name), equivalent=same)
+        assert grounded("-C", folder, "adopt", both[0]).code == 0
+        (caveat,) = _not_compared(Folder(folder))
+        assert holds(caveat, *both)
+        assert ("no trial can tell them apart" in caveat) == bool(same)
+        assert ("does not compare" in caveat) != bool(same)
+        clause, _ = grounded("-C", folder, "report", "--json").json["adopted"]["clauses"]
+        assert ("no trial can tell them apart in this model" in clause) == bool(same)
 
 
 def test_a_part_of_what_was_adopted_that_may_be_zero_is_not_told(cart, tmp_path):

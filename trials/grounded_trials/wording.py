@@ -50,10 +50,10 @@ def count(number: int, word: str, many: str = "") -> str:
 
 
 def ranges(names: Sequence[str]) -> str:
-    """Return `t0001, t0007 to t0016`: names in order, three consecutive ones or more as a range.
+    """Return `t0001, t0007 to t0016`: names in order, three or more in a row as a range.
 
-    Two that are consecutive are `t0001 and t0002`, or two of the list. More than `PIECES` ranges become the first and last name and the number of names missing
-    between them.
+    Two names alone are `t0001 and t0002` if they follow each other. More than `PIECES` ranges
+    become the first and last name and the number of names missing between them.
     """
     digits = [name[1:] for name in names]
     if not all(map(str.isdecimal, digits)):

@@ -128,7 +128,7 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     proposed = _by_mechanism(search, _plainest(search, proposed, ruler, white), ruler, white)
     proposed = own_numbers(search, proposed, ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
-    if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
+    if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler, white)):
         fit, without, more = _pruned(search, other, ruler, white)
         doubtful += more
     if not _likely(search, fit):
@@ -170,7 +170,7 @@ def _by_mechanism(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bo
     return other if _pays(search, ruler, search.exact_null(), other, white) else fit
 
 
-def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
+def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted | None:
     """After a cause was dropped, find a likelier hypothesis that differs in one effect.
 
     The effects were selected while the parameters were free, so with exact parameters others may be
@@ -178,6 +178,9 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | N
     was dropped, by no more than their scatter, even if it is far likelier alone than the other. A
     changed value of an adopted effect need not predict as well as a new effect: that an adopted
     value is slightly off is known, and an effect that imitates it may fit the rest of the gap too.
+    A friction with more values than predictions support is not likelier, but stands for its plain
+    form: else it would undo what `_plainest` decided. A motor's plain friction, with a gain that is
+    15 % off, was one of 16 % of the load with the right gain.
     """
     h, names = fit.hypothesis, set(fit.hypothesis.names)
     near = [f for f in search.of_size(len(names)) if len(names - {*f.hypothesis.names}) == 1]
@@ -188,7 +191,11 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | N
         others = search.refined(starts[:RIVALS], REFIT) if starts else []
     others = [f for f in others if search.score(f) > search.score(fit) + TIE * (h.spread > 0)]
     others = [f for f in others if not _outdone(ruler.gain(f, fit), _adopted(f, names))]
-    return max(others, key=search.score, default=None)
+    for other in sorted(others, key=search.score, reverse=True):
+        at_plainest = _plainest(search, other, ruler, white)
+        if at_plainest is other or {*at_plainest.hypothesis.names} != names:
+            return at_plainest
+    return None
 
 
 def _outdone(gain: Gain, adopted: bool) -> bool:

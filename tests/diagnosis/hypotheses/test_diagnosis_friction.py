@@ -129,6 +129,26 @@ def test_of_two_frictions_that_tie_the_plain_one_is_claimed(monkeypatch, nats, b
     assert decide._plainest(search, "loaded", ruler, white=False) == claimed
 
 
+@pytest.mark.parametrize("pays", [True, False])
+def test_a_richer_friction_that_predictions_refused_is_not_named_as_likelier(monkeypatch, pays):
+    """A ball's beam: 16 % of the load with the right gain, 12 nats ahead of a gain 15 % off."""
+
+    def fit(*names):
+        return SimpleNamespace(hypothesis=SimpleNamespace(names=names, spread=0.1, effects=()))
+
+    plain, loaded, other = fit("x", "plain"), fit("x", "loaded"), fit("x", "drag")
+    nats = {id(plain): 0.0, id(loaded): 12.0, id(other): 5.0}
+    search = SimpleNamespace(
+        score=lambda f: nats[id(f)], of_size=lambda count: [loaded, other, plain]
+    )
+    gain = SimpleNamespace(beyond=lambda *bar: False)
+    ruler = SimpleNamespace(held_out=True, gain=lambda *fits: gain)
+    monkeypatch.setattr(decide, "plainer", lambda s, f: [plain] if f is loaded else [])
+    monkeypatch.setattr(decide, "_pays", lambda *given: pays)
+    named = decide._likelier(search, plain, ruler, white=False)
+    assert named is (loaded if pays else other)  # what differs otherwise is still found
+
+
 def test_what_a_swap_gives_gets_constants_of_its_own(search):
     effects = {e.name: e for e in search.candidates}
     fit = fitted(search, (effects["coulomb_friction:w"], {"c": 5.2}))

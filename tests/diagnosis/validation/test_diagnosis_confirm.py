@@ -223,11 +223,11 @@ def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
     search, _ = wavy
     alone = Said(lambda c: 1.0)
     singles = [f for f in search.of_size(1) if f.hypothesis.spread == 0][:4]
-    likelier = _likelier(search, singles[-1], alone)
+    likelier = _likelier(search, singles[-1], alone, white=False)
     assert likelier is not None and likelier.hypothesis.spread == 0
     assert search.score(likelier) > search.score(singles[-1])
     assert likelier.hypothesis.names != singles[-1].hypothesis.names
-    assert _likelier(search, likelier, alone) is None
+    assert _likelier(search, likelier, alone, white=False) is None
 
 
 def test_of_stand_ins_that_predict_alike_the_likelier_is_named(wavy):
@@ -246,9 +246,9 @@ def test_of_stand_ins_that_predict_alike_the_likelier_is_named(wavy):
         Said(lambda c: 1.0),
         Said(lambda c: 0.5 if {*c} >= {*first.hypothesis.names} else 1.0),
     )
-    assert _likelier(search, first, alike) is other
-    assert _likelier(search, first, worse) is None
-    assert _likelier(search, other, alike) is None
+    assert _likelier(search, first, alike, white=False) is other
+    assert _likelier(search, first, worse, white=False) is None
+    assert _likelier(search, other, alike, white=False) is None
 
 
 def test_noise_can_not_hide_what_predicts_far_better(wavy):

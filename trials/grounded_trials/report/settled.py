@@ -7,7 +7,7 @@ or claims what was adopted since. Otherwise no gain is reported.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,12 @@ from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adoptable import joined
-from grounded_trials.workspace.adopting import as_adopted, left_behind, tied_when_adopted
+from grounded_trials.workspace.adopting import (
+    as_adopted,
+    equivalent_when_adopted,
+    left_behind,
+    tied_when_adopted,
+)
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
@@ -73,7 +78,10 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     rows = tuple(_rows(task.model, table, known, ties))
     found = Settled(tuple(clauses), rows=rows)
     names = [str(effect["name"]) for effect in table.effects]
-    unsure = [f"{c}{_or_else(ties.get(n, ()))}" for n, c in zip(names, clauses, strict=False)]
+    same = equivalent_when_adopted(workspace)
+    unsure = [
+        f"{c}{_or_else(n, ties.get(n, ()), same)}" for n, c in zip(names, clauses, strict=False)
+    ]
     with_ties = replace(found, adopted=(*unsure, *clauses[len(names) :]))
     if diagnosis is None or diagnosis.no_cause:
         return with_ties
@@ -221,11 +229,17 @@ def _clause(entry: Mapping[str, Any], model: Model, known: _Known) -> str:
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
 
-def _or_else(others: Sequence[str]) -> str:
-    """Return a clause on the effects that an adopted one may stand for; "" for none."""
+def _or_else(name: str, others: Sequence[str], same: Sequence[Collection[str]]) -> str:
+    """Return a clause on the effects that an adopted one may stand for; "" for none.
+
+    `same`: groups of effects that are equivalent in the model.
+    """
     if not others:
         return ""
-    return f" or, as the trials could not tell them apart, {' or '.join(others)} instead"
+    why = "the trials could not tell them apart"
+    if any({name, *others} <= {*group} for group in same):
+        why = "no trial can tell them apart in this model"
+    return f" or, as {why}, {' or '.join(others)} instead"
 
 
 def _rows(

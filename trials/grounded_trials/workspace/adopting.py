@@ -139,7 +139,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     known = _as_estimated(found, names, nominal, calibrated)
     ties = {name: others for name in names if (others := _rivals(found, name))}
-    step = {"names": names, "before": _written(model), "after": after, "known": known, "ties": ties}
+    alike = [sorted(group) for group in found.equivalent if {*group} & {*ties}]
+    step = {"names": names, "before": _written(model), "after": after, "known": known}
+    step |= {"ties": ties, "equivalent": alike}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
@@ -227,6 +229,21 @@ def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
     except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
         return {}
     return {name: tuple(others) for name, others in rest.items() if others}
+
+
+def equivalent_when_adopted(workspace: Folder) -> tuple[frozenset[str], ...]:
+    """Return groups of effects that were equivalent in the model when one of them was adopted.
+
+    Empty if reports/adoptions.json is missing or can't be read, or was written before they were
+    kept.
+    """
+    try:
+        steps = adoptions(workspace)[0]
+        return tuple(
+            frozenset(map(str, group)) for one in steps for group in one.get("equivalent", ())
+        )
+    except (GroundedError, AttributeError, TypeError):
+        return ()
 
 
 def _rewritten(

@@ -17,7 +17,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
 from grounded_trials.wording import count, rendered
-from grounded_trials.workspace.adopting import tied_when_adopted
+from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
@@ -156,7 +156,14 @@ def diagnose_in(
 
 def _not_compared(workspace: Folder) -> Iterator[str]:
     """Yield a sentence for each adopted effect that tied with others when it was adopted."""
+    same = equivalent_when_adopted(workspace)
     for name, others in tied_when_adopted(workspace).items():
+        if any({name, *others} <= group for group in same):
+            yield (
+                f"{name} is part of the model and equivalent in it to {' or '.join(others)}: no "
+                "trial can tell them apart"
+            )
+            continue
         yield (
             f"{name} is part of the model, but when it was adopted the trials could not tell it "
             f"from {' or '.join(others)}; this diagnosis does not compare them again"
