@@ -354,6 +354,15 @@ class Diagnosis(Document):
         return {name for one in self.combinations for name in one.values}
 
     @property
+    def conditions(self) -> dict[str, tuple[str, ...]]:
+        """Parameters by what holds only if they are right: a calibrated parameter or an effect."""
+        found = {one.parameter: tuple(one.given) for one in self.identifiable if one.given}
+        for one in self.combinations:
+            if one.rests_on:
+                found |= dict.fromkeys(one.values, tuple(one.rests_on))
+        return found
+
+    @property
     def jointly(self) -> set[str]:
         """The calibrated parameters that the trials identify only together with the others."""
         return {one.parameter for one in self.identifiable if one.jointly}

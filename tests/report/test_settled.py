@@ -183,6 +183,23 @@ def test_an_effect_that_shows_only_in_combination_is_adopted_and_marked(cart, tm
     assert again["jointly"] == ["viscous_friction:v"]
 
 
+def test_a_value_that_rests_on_a_parameter_is_told_with_it_everywhere(cart, tmp_path):
+    """`thrust 18.080 +- 0.066 N`, of which the trials show only the ratio to a mass."""
+    one = {"parameter": "mass", "verdict": "identifiable", "given": {"radius": 1.0}}
+    both = {"values": ["viscous_friction:v"], "rests_on": {"radius": 0.1}}
+    more = {"identifiable": [one], "combinations": [both]}
+    folder = written(copied(cart, tmp_path / "w"), **more)
+    assert grounded("-C", folder, "report", "--html").code == 0
+    assert "given radius" in (folder / "reports" / "report.html").read_text()
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    written(folder, ranking=[], parameters={}, credit=[], indistinguishable=[])  # a later one
+    assert words(folder, "status").count("given radius as in the model") == 2
+    clauses = grounded("-C", folder, "report", "--json").json["adopted"]["clauses"]
+    assert [text.count("given radius as in the model") for text in clauses] == [1, 1]
+    set_in_model(folder / "grounded.toml", params={"mass": 1.5})  # as a fit does, which tells it
+    assert words(folder, "status").count("given radius as in the model") == 1
+
+
 def test_a_number_of_an_adopted_effect_that_stays_behind_is_told_by_its_effect(cart, tmp_path):
     """A KeyError, with grounded.toml written: it was looked for among the model's parameters."""
     adopted = {"name": "quadratic_drag:v", "k": 0.2}

@@ -14,7 +14,7 @@ from typing import Any
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError
 from grounded.model import Model
-from grounded.result import number
+from grounded.result import listed, number
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
@@ -22,6 +22,7 @@ from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adoptable import joined
 from grounded_trials.workspace.adopting import (
     as_adopted,
+    conditions_when_adopted,
     equivalent_when_adopted,
     left_behind,
     tied_when_adopted,
@@ -71,11 +72,16 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     """
     table, task = workspace.config.model, workspace.origin
     known, ties = _Known(diagnosis, as_adopted(workspace)), tied_when_adopted(workspace)
-    clauses = [_clause(effect, task.model, known) for effect in table.effects]
-    clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set())
+    rests = {
+        name: on
+        for name, on in conditions_when_adopted(workspace).items()
+        if name not in table.params or known.adopted(name, table.params[name])  # else fitted since
+    }
+    clauses = [_clause(effect, task.model, known, rests) for effect in table.effects]
+    clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set(), rests)
     if not clauses:
         return None
-    rows = tuple(_rows(task.model, table, known, ties))
+    rows = tuple(_rows(task.model, table, known, ties, rests))
     found = Settled(tuple(clauses), rows=rows)
     names = [str(effect["name"]) for effect in table.effects]
     same = equivalent_when_adopted(workspace)
@@ -201,6 +207,11 @@ class _Known:
             fitted |= {param_name(ranked.effect, q): e for q, e in ranked.params.items()}
         self.both = fitted, before
 
+    def adopted(self, name: str, value: float) -> bool:
+        """Return whether a value is still the one that was adopted last."""
+        own = self.both[1].get(name)
+        return own is not None and math.isclose(own.value, value, rel_tol=WRITTEN)
+
     def estimate(self, name: str, value: float, unit: str) -> Estimate:
         """Return an adopted value with its standard deviation, NaN if that is unknown."""
         for own in (one[name] for one in self.both if name in one):
@@ -209,7 +220,14 @@ class _Known:
         return Estimate(value, unit=unit)
 
 
-def _clause(entry: Mapping[str, Any], model: Model, known: _Known) -> str:
+def _given(name: str, rests: Mapping[str, Sequence[str]]) -> str:
+    """Return a clause on the parameters that a value rests on; "" for none."""
+    return f", given {listed(rests[name])} as in the model" if rests.get(name) else ""
+
+
+def _clause(
+    entry: Mapping[str, Any], model: Model, known: _Known, rests: Mapping[str, Sequence[str]]
+) -> str:
     """Return an adopted effect in words, with its values; those that may be zero are left out."""
     from grounded.diagnosis.cause_words import meaning
     from grounded.effects import param_name
@@ -224,7 +242,7 @@ def _clause(entry: Mapping[str, Any], model: Model, known: _Known) -> str:
             for q, v in given.items()
             if q in units
         }
-        return meaning(effect, values)
+        return f"{meaning(effect, values)}{_given(name, rests)}"
     except (GroundedError, TypeError, ValueError):
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
@@ -243,7 +261,11 @@ def _or_else(name: str, others: Sequence[str], same: Sequence[Collection[str]]) 
 
 
 def _rows(
-    model: Model, table: ModelTable, known: _Known, ties: Mapping[str, Sequence[str]]
+    model: Model,
+    table: ModelTable,
+    known: _Known,
+    ties: Mapping[str, Sequence[str]],
+    rests: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter."""
     from grounded.diagnosis.cause_words import give_or_take
@@ -264,20 +286,28 @@ def _rows(
         units = {q.name: q.unit for q in quantities if q.name in entry}
         units = units or {key: "" for key in entry if key != "name"}
         each = (f"{q} = {told(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
-        yield name, ", ".join(each) + "".join(f", or {one}" for one in ties.get(name, ()))
+        alike = "".join(f", or {one}" for one in ties.get(name, ()))
+        yield name, f"{', '.join(each)}{_given(name, rests)}{alike}"
     for name, value in table.params.items():
         if name in model.params and model.params[name].value != value:
             first, unit = model.params[name].value, model.params[name].unit
-            yield name, f"{told(name, value, unit)}, was {number(first)}"
+            yield name, f"{told(name, value, unit)}{_given(name, rests)}, was {number(first)}"
 
 
-def _moved(model: Model, params: Mapping[str, float], jointly: set[str]) -> list[str]:
+def _moved(
+    model: Model,
+    params: Mapping[str, float],
+    jointly: set[str],
+    rests: Mapping[str, Sequence[str]],
+) -> list[str]:
     """Return `m 1.00 -> 1.30 kg` for every parameter that grounded.toml changes.
 
     Those that the trials identify only `jointly` are marked.
     """
     known = {n: p for n, p in model.params.items() if n in params and params[n] != p.value}
     return [
-        changed(name, p.value, params[name], p.unit) + ALONE * (name in jointly)
+        changed(name, p.value, params[name], p.unit)
+        + ALONE * (name in jointly)
+        + _given(name, rests)
         for name, p in known.items()
     ]

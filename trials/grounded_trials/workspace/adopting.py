@@ -141,7 +141,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     ties = {name: others for name in names if (others := _rivals(found, name))}
     alike = [sorted(group) for group in found.equivalent if {*group} & {*ties}]
     step = {"names": names, "before": _written(model), "after": after, "known": known}
-    step |= {"ties": ties, "equivalent": alike}
+    held = {n: [*on] for n, on in found.conditions.items() if n in names or n in own}
+    step |= {"ties": ties, "equivalent": alike, "given": held}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
@@ -229,6 +230,22 @@ def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
     except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
         return {}
     return {name: tuple(others) for name, others in rest.items() if others}
+
+
+def conditions_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
+    """Return the parameters that adopted values rest on, by effect or parameter.
+
+    Empty if reports/adoptions.json is missing or can't be read, or was written before they were
+    kept.
+    """
+    found = dict[str, Any]()
+    try:
+        for step in adoptions(workspace)[0]:
+            again = (*step["names"], *step.get("known", {}))
+            found |= dict.fromkeys(again, ()) | dict(step.get("given", {}))
+        return {name: tuple(map(str, others)) for name, others in found.items() if others}
+    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
 
 
 def equivalent_when_adopted(workspace: Folder) -> tuple[frozenset[str], ...]:

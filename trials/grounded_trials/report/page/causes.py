@@ -8,6 +8,7 @@ from grounded.diagnosis.cause_words import OWN, give_or_take, with_worth
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import values_of
+from grounded.result import listed
 from grounded_trials.report.settled import Settled
 
 
@@ -60,4 +61,6 @@ def _calibrated(diagnosis: Diagnosis) -> str:
     """Return the calibrated parameters that may be adopted; those that are off come first."""
     known, off = diagnosis.known_parameters, diagnosis.verdict.parameters
     names = [*(name for name in off if name in known), *(name for name in known if name not in off)]
-    return ", ".join(f"{name} = {give_or_take(known[name])}" for name in names)
+    rests = diagnosis.conditions
+    given = {n: f" given {listed(rests[n])}" if n in rests else "" for n in names}
+    return ", ".join(f"{n} = {give_or_take(known[n])}{given[n]}" for n in names)

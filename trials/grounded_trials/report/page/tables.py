@@ -13,6 +13,7 @@ from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
 from grounded.diagnosis.tables import undetermined, weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
+from grounded.result import listed
 from grounded.search.pictures import MOST, few
 from grounded_trials.report.findings import (
     Findings,
@@ -214,11 +215,14 @@ def leftover_table(diagnosis: Diagnosis) -> list[Block]:
 def parameter_table(findings: Findings) -> list[Block]:
     """Return the model's parameters: in model.py, current, and as diagnosed."""
     estimated = _estimated(findings.diagnosis)
+    rests = findings.diagnosis.conditions if findings.diagnosis else {}
     rows = []
     for name, param in findings.task.model.params.items():
         bounded = param.low is not None or param.high is not None
         limits = _range(param.low, param.high) if bounded else "none" if param.std else "constant"
         found = _interval(estimated[name]) if name in estimated else "-"
+        if name in rests and name in estimated:
+            found += f", given {listed(rests[name])}"
         written = figure(findings.nominal.get(name))
         rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
     if not rows:
