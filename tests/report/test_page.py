@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from facts import holds
+from grounded.diagnosis.error_report import Split
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
 from grounded.model import Param
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.diagnosed import _doubts
+from grounded_trials.report.page.diagnosed import _doubts, _made_of
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN, parameter_table
 from grounded_trials.report.report_text import report_text
@@ -289,6 +291,20 @@ def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
         "predicted<",
     ):
         assert words not in text
+
+
+def test_an_error_that_is_all_noise_is_told_in_a_sentence_and_one_of_no_known_part_not_at_all():
+    def blocks(**parts):
+        one = {"name": "x", "unit": "m", "rms": 0.1}
+        split = {"horizon_s": 1.0, "all": parts, "channels": [one | parts]}
+        known = Split.from_json(split | {"irreducible_from": "repeats"})
+        return _made_of({"horizon": known})
+
+    assert blocks(explained=0.0) == [] == blocks(explained=0.0, unexplained=0.0, irreducible=0.0)
+    (_, noise) = blocks(explained=0.0, unexplained=0.0, irreducible=1.0)
+    assert noise.kind == "text" and holds(noise.text, "within the noise", "scatter of repeated")
+    some = blocks(explained=0.2, unexplained=0.0, irreducible=0.8)
+    assert "table" in [block.kind for block in some]
 
 
 def test_a_leftover_of_which_no_rate_is_known_makes_no_table(cart):

@@ -34,6 +34,7 @@ from grounded_trials.workspace.next_step import DIAGNOSE
 
 MOST = 6  # states whose error without each effect is drawn
 WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
+NOTHING = {"-", "0.0 %"}  # shares that say nothing
 HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
@@ -128,7 +129,10 @@ def _alike(diagnosis: Diagnosis) -> list[Block]:
 
 
 def _made_of(splits: Mapping[str, Split]) -> list[Block]:
-    """The squared error in three parts: at each horizon in all, and by state."""
+    """The squared error in three parts: at each horizon in all, and by state.
+
+    Nothing if no part is known, and one sentence if all of it is noise.
+    """
     if not splits:
         return []
     bound = any(one.bound for one in splits.values())
@@ -152,6 +156,14 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
         "unexplained far more. Repeat a run to know"
     )
     source = known.get(splits[main].irreducible_from, "the estimated noise")
+    cells = [row[1:] for row in [*rows, *by_state]]
+    if NOTHING.issuperset(cell for row in cells for cell in row):
+        return []
+    if NOTHING.issuperset(cell for row in cells for cell in row[:2]):
+        words = (
+            f"Errors of held-out predictions are within the noise, which is taken from {source}."
+        )
+        return [Block("heading", "What the error is made of"), Block("text", words)]
     words = (
         "Explained: the share of the squared error of held-out predictions that the effects "
         f"remove. Unexplained: what they leave above the noise. The noise is taken from {source}."
