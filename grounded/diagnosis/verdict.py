@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
@@ -79,6 +80,7 @@ def verdict(
     changed: Sequence[Changed] | None = None,
     adopted: Collection[str] = (),
     tracked: Sequence[str] = (),
+    off_with: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -100,6 +102,7 @@ def verdict(
         changed: the values that differ between two groups of trials; None for one group.
         adopted: adopted effects, whose values are parameters of the model.
         tracked: the states that the task follows, the most important first.
+        off_with: parameters that are off only with an effect that ties with a claimed one: that.
     """
     from grounded.effects import like_a_load
 
@@ -129,7 +132,9 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted, combinations)
+    causes = _causes(
+        claims, ranking, credit, identified, apart, open_gap, adopted, combinations, off_with or {}
+    )
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -232,6 +237,7 @@ def _causes(
     open_gap: bool = False,
     adopted: Collection[str] = (),
     combinations: Sequence[Combination] = (),
+    off_with: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
@@ -258,7 +264,7 @@ def _causes(
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             text = f"{_moved(claims, adopted)}{OPEN * open_gap}"
-            text += _others(claims, identified, adopted)
+            text += _others(claims, identified, adopted, off_with)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
             text += GIVEN.format(listed(held)) * bool(held)
@@ -386,10 +392,16 @@ OPEN = ", unless the gap that remains is the reason"  # a value that a parameter
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 
-def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collection[str]) -> str:
+def _others(
+    claims: Claims,
+    identified: Sequence[Identifiable],
+    adopted: Collection[str],
+    off_with: Mapping[str, str],
+) -> str:
     """Return a clause on the parameters that are adopted too, though they need not be off.
 
     They were calibrated together with those that are off, whose values are only valid with them.
+    Of one that is off with an effect that ties with a claimed one, the clause says so.
     """
     params, known, off = claims.data.model.params, claims.parameters(), parameters_off(claims)
     lost = {one.parameter for one in identified if one.lost}
@@ -398,6 +410,15 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
         return ""
     it = "it" if len(off) == 1 else "them"
     by = {name: known[name].value / value - 1 for name, value in old.items() if value}
+    ties = dict[str, list[str]]()
+    for name in old:
+        if name in off_with:
+            ties.setdefault(off_with[name], []).append(value_called(name, adopted))
+    unless = " or ".join(
+        f"{tie}, with which {listed(some)} {'is' if len(some) == 1 else 'are'} off"
+        for tie, some in ties.items()
+    )
+    wrong = f"but need not be wrong{f', unless the cause is {unless}' * bool(ties)}"
     if len(old) > NAMED:
         most = sorted(by, key=lambda name: -abs(by[name]))[:NAMED]
         told = [
@@ -405,7 +426,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
             for n in most
         ]
         named = f", most of all {listed(told)}" * bool(told)
-        return f"; {len(old)} others are adjusted with {it}{named}, but need not be wrong"
+        return f"; {len(old)} others are adjusted with {it}{named}, {wrong}"
     one = len(old) == 1
     much = ""
     if len(by) == len(old):
@@ -413,7 +434,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
         much = f" by {'' if one or size.startswith('<') else 'at most '}{size}"
     are = "is" if one else "are"
     names = listed(value_called(name, adopted) for name in old)
-    return f"; {names} {are} adjusted with {it}{much}, but need not be wrong"
+    return f"; {names} {are} adjusted with {it}{much}, {wrong}"
 
 
 def sentence(clauses: Iterable[str]) -> str:

@@ -303,6 +303,16 @@ class Claims:
                 found[other] = f
         return list(found.items())[:2]
 
+    def off_with_rivals(self) -> dict[str, str]:
+        """Return the parameters that are off only with a rival: {parameter: the rival}."""
+        found, own = dict[str, str](), {one.index for one in self.moved}
+        for name in self.names if self.best.hypothesis.spread > 0 else ():
+            for other, fit in self.rivals(name):
+                for one in moved_parameters(self.search, fit, self.ruler):
+                    if one.index not in own:
+                        found.setdefault(self.data.model.param_names[one.index], other)
+        return found
+
     def _ties(self, name: str, other: str, fit: Fitted) -> bool:
         """Check whether a fit with another effect in place of one is as likely, or equivalent.
 

@@ -10,6 +10,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Identifiable
 from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.validation import claims as claims_of
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import _causes
 from grounded.effects import Library
@@ -124,7 +125,27 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
     assert "most of all d of delay:u (+50 %), p4" in told
     known.pop("delay_u_d"), known.pop("p0"), known.pop("p1"), known.pop("p2")
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
-    assert "; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong" in told
+    assert told.endswith("; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong")
+    (tied,) = _causes(claims, (), [Credit("calibration")], (), {}, off_with={"p4": "drag:v"})
+    assert tied == f"{told}, unless the cause is drag:v, with which p4 is off"
+
+
+def test_a_parameter_that_is_off_only_with_an_effect_that_ties_is_found(monkeypatch):
+    """Of a motor `K need not be wrong`: with a plain friction, which tied, it was off by 15 %."""
+    off = {"plain": (Blame(0, 9.0), Blame(1, 9.0)), "drag": (Blame(1, 9.0),)}
+    monkeypatch.setattr(claims_of, "moved_parameters", lambda search, fit, ruler: off[fit])
+    claims = SimpleNamespace(
+        names=("loaded",),
+        moved=(Blame(1, 9.0),),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(spread=0.1)),
+        rivals=lambda name: [("drag:v", "drag"), ("joint_friction:u<-v", "plain")],
+        data=SimpleNamespace(model=motor(1)[0]),
+        search=None,
+        ruler=None,
+    )
+    assert claims_of.Claims.off_with_rivals(claims) == {"m": "joint_friction:u<-v"}
+    claims.best.hypothesis.spread = 0.0  # no parameter is calibrated
+    assert claims_of.Claims.off_with_rivals(claims) == {}
 
 
 def test_a_line_names_no_twenty_parameters():

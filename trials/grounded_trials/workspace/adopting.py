@@ -140,7 +140,12 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     known = _as_estimated(found, names, nominal, calibrated)
     ties = {name: others for name in names if (others := _rivals(found, name))}
     alike = [sorted(group) for group in found.equivalent if {*group} & {*ties}]
-    step = {"names": names, "before": _written(model), "after": after, "known": known}
+    step: dict[str, Any] = {
+        "names": names,
+        "before": _written(model),
+        "after": after,
+        "known": known,
+    }
     held = {n: [*on] for n, on in found.conditions.items() if n in names or n in own}
     step |= {"ties": ties, "equivalent": alike, "given": held}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
