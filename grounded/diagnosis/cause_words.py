@@ -29,6 +29,7 @@ DISAGREE = "but the trials disagree"
 KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
 RESCALE = ("input_gain", "input_curve", "input_fade")  # they change what a volt of an input does
 OWN = "the model's own parameters"
+GIVEN = ", given {} as in the model"
 MOST_TIMES = 1000  # a larger ratio of errors says no more
 HARDLY = 1.001  # ratio of errors below which they count as the same
 FEW = 3  # up to so many causes get a clause each

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import (
+    GIVEN,
     OWN,
     clauses,
     comparison,
@@ -80,7 +80,6 @@ def verdict(
     changed: Sequence[Changed] | None = None,
     adopted: Collection[str] = (),
     tracked: Sequence[str] = (),
-    off_with: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -102,7 +101,6 @@ def verdict(
         changed: the values that differ between two groups of trials; None for one group.
         adopted: adopted effects, whose values are parameters of the model.
         tracked: the states that the task follows, the most important first.
-        off_with: parameters that are off only with an effect that ties with a claimed one: that.
     """
     from grounded.effects import like_a_load
 
@@ -132,9 +130,7 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(
-        claims, ranking, credit, identified, apart, open_gap, adopted, combinations, off_with or {}
-    )
+    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted, combinations)
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -237,7 +233,6 @@ def _causes(
     open_gap: bool = False,
     adopted: Collection[str] = (),
     combinations: Sequence[Combination] = (),
-    off_with: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[str, ...]:
     """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
     from grounded.diagnosis.validation.claims import has_size
@@ -264,7 +259,7 @@ def _causes(
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             text = f"{_moved(claims, adopted)}{OPEN * open_gap}"
-            text += _others(claims, identified, adopted, off_with)
+            text += _others(claims, identified, adopted)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
             text += GIVEN.format(listed(held)) * bool(held)
@@ -387,17 +382,11 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
 
 
 BARELY = 0.01  # share of the improvement below which a claim needs another reason
-GIVEN = ", given {} as in the model"
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 
-def _others(
-    claims: Claims,
-    identified: Sequence[Identifiable],
-    adopted: Collection[str],
-    off_with: Mapping[str, str],
-) -> str:
+def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collection[str]) -> str:
     """Return a clause on the parameters that are adopted too, though they need not be off.
 
     They were calibrated together with those that are off, whose values are only valid with them.
@@ -410,7 +399,7 @@ def _others(
         return ""
     it = "it" if len(off) == 1 else "them"
     by = {name: known[name].value / value - 1 for name, value in old.items() if value}
-    ties = dict[str, list[str]]()
+    ties, off_with = dict[str, list[str]](), claims.off_with_rivals()
     for name in old:
         if name in off_with:
             ties.setdefault(off_with[name], []).append(value_called(name, adopted))

@@ -181,7 +181,6 @@ class Writer:
             changed=apart.changed if apart else None,
             adopted=self.adopted,
             tracked=() if self.task is None else _tracked(self.task),
-            off_with=self.claims.off_with_rivals(),
         )
         differ = bool(apart and apart.changed) and not self.known.no_cause
         return Diagnosis(

@@ -303,6 +303,8 @@ def test_an_error_that_is_all_noise_is_told_in_a_sentence_and_one_of_no_known_pa
     assert blocks(explained=0.0) == [] == blocks(explained=0.0, unexplained=0.0, irreducible=0.0)
     (_, noise) = blocks(explained=0.0, unexplained=0.0, irreducible=1.0)
     assert noise.kind == "text" and holds(noise.text, "within the noise", "scatter of repeated")
+    unknown = blocks(explained=0.0, irreducible=1.0)  # what is left may be more than noise
+    assert "table" in [block.kind for block in unknown]
     some = blocks(explained=0.2, unexplained=0.0, irreducible=0.8)
     assert "table" in [block.kind for block in some]
 

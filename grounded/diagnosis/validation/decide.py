@@ -189,11 +189,15 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
     else:
         starts = [(replace(f.hypothesis, shift=None, spread=0.0), fit.noise, f.track) for f in near]
         others = search.refined(starts[:RIVALS], REFIT) if starts else []
-    others = [f for f in others if search.score(f) > search.score(fit) + TIE * (h.spread > 0)]
-    others = [f for f in others if not _outdone(ruler.gain(f, fit), _adopted(f, names))]
-    for other in sorted(others, key=search.score, reverse=True):
+
+    def likelier(other: Fitted) -> bool:
+        nats = search.score(other) - search.score(fit)
+        refused = nats <= TIE * (h.spread > 0) or {*other.hypothesis.names} == names
+        return not refused and not _outdone(ruler.gain(other, fit), _adopted(other, names))
+
+    for other in sorted(filter(likelier, others), key=search.score, reverse=True):
         at_plainest = _plainest(search, other, ruler, white)
-        if at_plainest is other or {*at_plainest.hypothesis.names} != names:
+        if likelier(at_plainest):
             return at_plainest
     return None
 

@@ -114,6 +114,7 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
         data=SimpleNamespace(model=model),
         moved=(Blame(5, 9.0),),
         parameters=lambda: known,
+        off_with_rivals=dict,
     )
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     most = "5 others are adjusted with it, most of all p4 (+8.0 %), p3 (-7.5 %) and p2 (+6.7 %)"
@@ -126,7 +127,8 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
     known.pop("delay_u_d"), known.pop("p0"), known.pop("p1"), known.pop("p2")
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     assert told.endswith("; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong")
-    (tied,) = _causes(claims, (), [Credit("calibration")], (), {}, off_with={"p4": "drag:v"})
+    claims.off_with_rivals = lambda: {"p4": "drag:v"}
+    (tied,) = _causes(claims, (), [Credit("calibration")], (), {})
     assert tied == f"{told}, unless the cause is drag:v, with which p4 is off"
 
 

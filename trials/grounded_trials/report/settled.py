@@ -7,7 +7,7 @@ or claims what was adopted since. Otherwise no gain is reported.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,7 +86,7 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     names = [str(effect["name"]) for effect in table.effects]
     same = equivalent_when_adopted(workspace)
     unsure = [
-        f"{c}{_or_else(n, ties.get(n, ()), same)}" for n, c in zip(names, clauses, strict=False)
+        f"{c}{_or_else(ties.get(n, ()), n in same)}" for n, c in zip(names, clauses, strict=False)
     ]
     with_ties = replace(found, adopted=(*unsure, *clauses[len(names) :]))
     if diagnosis is None or diagnosis.no_cause:
@@ -222,7 +222,9 @@ class _Known:
 
 def _given(name: str, rests: Mapping[str, Sequence[str]]) -> str:
     """Return a clause on the parameters that a value rests on; "" for none."""
-    return f", given {listed(rests[name])} as in the model" if rests.get(name) else ""
+    from grounded.diagnosis.cause_words import GIVEN
+
+    return GIVEN.format(listed(rests[name])) if rests.get(name) else ""
 
 
 def _clause(
@@ -247,15 +249,15 @@ def _clause(
         return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
 
 
-def _or_else(name: str, others: Sequence[str], same: Sequence[Collection[str]]) -> str:
+def _or_else(others: Sequence[str], same: bool) -> str:
     """Return a clause on the effects that an adopted one may stand for; "" for none.
 
-    `same`: groups of effects that are equivalent in the model.
+    `same`: whether they are equivalent in the model.
     """
     if not others:
         return ""
     why = "the trials could not tell them apart"
-    if any({name, *others} <= {*group} for group in same):
+    if same:
         why = "no trial can tell them apart in this model"
     return f" or, as {why}, {' or '.join(others)} instead"
 

@@ -138,16 +138,16 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     known = _as_estimated(found, names, nominal, calibrated)
-    ties = {name: others for name in names if (others := _rivals(found, name))}
-    alike = [sorted(group) for group in found.equivalent if {*group} & {*ties}]
-    step: dict[str, Any] = {
+    ties = {name: others for name in names if (others := _beside(found.indistinguishable, name))}
+    step = {
         "names": names,
         "before": _written(model),
         "after": after,
         "known": known,
+        "ties": ties,
+        "equivalent": {name: _beside(found.equivalent, name) for name in ties},
+        "given": {n: [*on] for n, on in found.conditions.items() if n in names or n in own},
     }
-    held = {n: [*on] for n, on in found.conditions.items() if n in names or n in own}
-    step |= {"ties": ties, "equivalent": alike, "given": held}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
@@ -215,57 +215,52 @@ def as_adopted(workspace: Folder) -> dict[str, Estimate]:
     return found
 
 
-def _rivals(found: Diagnosis, name: str) -> list[str]:
-    """Return the effects that a diagnosis could not tell from this one."""
-    groups = [group for group in found.indistinguishable if name in group]
-    return list(dict.fromkeys(other for group in groups for other in group if other != name))
+def _beside(groups: Sequence[Sequence[str]], name: str) -> list[str]:
+    """Return the other effects of the groups that an effect is in."""
+    own = [group for group in groups if name in group]
+    return list(dict.fromkeys(other for group in own for other in group if other != name))
+
+
+def _kept(workspace: Folder, key: str) -> dict[str, tuple[str, ...]]:
+    """Return the names that the last adoption of each effect or parameter kept under a key.
+
+    Empty if reports/adoptions.json is missing or can't be read. Steps that were written before the
+    key was kept have none.
+    """
+    found = dict[str, Any]()
+    try:
+        for step in adoptions(workspace)[0]:
+            again = (*step["names"], *step.get("known", {}))
+            found |= dict.fromkeys(again, ()) | dict(step.get(key, {}))
+        return {name: tuple(map(str, others)) for name, others in found.items() if others}
+    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
 
 
 def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
     """Return the effects that the trials could not tell from an adopted one, by its name.
 
     Nothing compares them again, so a tie lasts as long as the one is part of the model and the
-    other is not. Empty if reports/adoptions.json is missing or can't be read.
+    other is not.
     """
-    now, found = [str(one["name"]) for one in workspace.config.model.effects], dict[str, Any]()
-    try:
-        for step in adoptions(workspace)[0]:
-            found |= dict.fromkeys(step["names"], ()) | dict(step.get("ties", {}))
-        rest = {name: [str(one) for one in found.get(name, ()) if one not in now] for name in now}
-    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
-        return {}
-    return {name: tuple(others) for name, others in rest.items() if others}
+    now, ties = (
+        [str(one["name"]) for one in workspace.config.model.effects],
+        _kept(workspace, "ties"),
+    )
+    rest = {name: tuple(o for o in ties.get(name, ()) if o not in now) for name in now}
+    return {name: others for name, others in rest.items() if others}
+
+
+def equivalent_when_adopted(workspace: Folder) -> set[str]:
+    """Return the adopted effects whose ties (`tied_when_adopted`) no trial can tell from them."""
+    same = _kept(workspace, "equivalent")
+    ties = tied_when_adopted(workspace).items()
+    return {name for name, others in ties if {*others} <= {*same.get(name, ())}}
 
 
 def conditions_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
-    """Return the parameters that adopted values rest on, by effect or parameter.
-
-    Empty if reports/adoptions.json is missing or can't be read, or was written before they were
-    kept.
-    """
-    found = dict[str, Any]()
-    try:
-        for step in adoptions(workspace)[0]:
-            again = (*step["names"], *step.get("known", {}))
-            found |= dict.fromkeys(again, ()) | dict(step.get("given", {}))
-        return {name: tuple(map(str, others)) for name, others in found.items() if others}
-    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
-        return {}
-
-
-def equivalent_when_adopted(workspace: Folder) -> tuple[frozenset[str], ...]:
-    """Return groups of effects that were equivalent in the model when one of them was adopted.
-
-    Empty if reports/adoptions.json is missing or can't be read, or was written before they were
-    kept.
-    """
-    try:
-        steps = adoptions(workspace)[0]
-        return tuple(
-            frozenset(map(str, group)) for one in steps for group in one.get("equivalent", ())
-        )
-    except (GroundedError, AttributeError, TypeError):
-        return ()
+    """Return the parameters that adopted values rest on, by effect or parameter."""
+    return _kept(workspace, "given")
 
 
 def _rewritten(

@@ -158,7 +158,7 @@ def _not_compared(workspace: Folder) -> Iterator[str]:
     """Yield a sentence for each adopted effect that tied with others when it was adopted."""
     same = equivalent_when_adopted(workspace)
     for name, others in tied_when_adopted(workspace).items():
-        if any({name, *others} <= group for group in same):
+        if name in same:
             yield (
                 f"{name} is part of the model and equivalent in it to {' or '.join(others)}: no "
                 "trial can tell them apart"

@@ -34,7 +34,8 @@ from grounded_trials.workspace.next_step import DIAGNOSE
 
 MOST = 6  # states whose error without each effect is drawn
 WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
-NOTHING = {"-", "0.0 %"}  # shares that say nothing
+ZERO = "0.0 %"
+NOTHING = {"-", ZERO}  # shares that say nothing
 HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
@@ -159,7 +160,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     cells = [row[1:] for row in [*rows, *by_state]]
     if NOTHING.issuperset(cell for row in cells for cell in row):
         return []
-    if NOTHING.issuperset(cell for row in cells for cell in row[:2]):
+    if all(row[:2] == (ZERO, ZERO) for row in cells):
         words = (
             f"Errors of held-out predictions are within the noise, which is taken from {source}."
         )
