@@ -179,6 +179,9 @@ def main() -> NoReturn:
     sys.exit(code)
 
 
+INTERRUPTED = "interrupted; stored data is safe, run the same command again"
+
+
 def _run() -> tuple[int, str]:
     """Run the command; return its exit code and a final message."""
     stdout = sys.stdout
@@ -192,12 +195,14 @@ def _run() -> tuple[int, str]:
         return error.exit_code, text.getvalue().rstrip()
     except (click.Abort, KeyboardInterrupt) as error:
         found = str(error.__cause__ or "") and f"{error.__cause__}\n"
-        return 130, f"{found}interrupted; stored data is safe, run the same command again"
+        return 130, f"{found}{INTERRUPTED}"
     except SystemExit:
         if sys.stdout is not stdout:  # click found a closed pipe, and would exit with 1
             raise BrokenPipeError from None
         raise
     except Exception as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class
+            return 130, INTERRUPTED
         from grounded.errors import GroundedError
         from grounded_cli.console.terminal import ALARM, style
 

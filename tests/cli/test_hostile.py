@@ -20,6 +20,7 @@ from facts import holding
 from grounded.compile.run import jit
 from grounded.errors import GroundedError
 from grounded.trusted import TRUST, check_own, suspicion
+from grounded_cli import main
 from grounded_cli.console.terminal import harmless, show, show_json, style, table
 from grounded_trials.store.store import Store, write_atomically
 from workspaces import make
@@ -160,6 +161,17 @@ def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+def test_an_interrupt_while_a_class_is_made_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.11 raises `RuntimeError: Error calling __set_name__` from it, in an import."""
+
+    def made(**_: object) -> None:
+        raise RuntimeError("Error calling __set_name__ on 'Field'") from KeyboardInterrupt()
+
+    monkeypatch.setattr(main.cli, "main", made)
+    code, words = main._run()
+    assert code == 130 and words.startswith("interrupted; stored data is safe")
 
 
 @pytest.mark.slow

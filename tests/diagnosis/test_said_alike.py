@@ -47,6 +47,7 @@ def _claims(*effects, moved=(), parameters=None):
         parameters=lambda: parameters or {},
         data=SimpleNamespace(model=MODEL),
         one_clock=(),
+        off_with_rivals=dict,
     )
 
 
