@@ -48,11 +48,12 @@ from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import MOST_EFFECTS, interrupted, with_faults
 from grounded.diagnosis.writer import Writer
-from grounded.effects import Effect, Library
+from grounded.effects import Effect, Library, param_name
 from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, type_of
 from grounded.frozen import positive, whole_number
+from grounded.instruments.finding import SENSOR_DELAY, late_as_positions
 from grounded.instruments.lag import whole_steps
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
@@ -264,7 +265,19 @@ def diagnose(
         found = written.diagnosis(apart)
         said = with_faults(found.verdict, looked.findings)
         said = interrupted(said) if cut_short else said
-        return replace(found, verdict=said, preflight=looked.findings)
+        delays = _sensor_delays(found, data.model, options.but)
+        late = late_as_positions(looked.findings, delays, options.but)
+        return replace(found, verdict=said, preflight=(*looked.findings, *late))
+
+
+def _sensor_delays(found: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:
+    """Return the delays of sensors that are part of the model or claimed, by effect [s]."""
+    late = [name for name in adopted if name.startswith(SENSOR_DELAY)]
+    known = {name: model.params[param_name(name, "d")].value for name in late}
+    for row in found.ranking:
+        if row.claimed and row.effect.startswith(SENSOR_DELAY):
+            known[row.effect] = known.get(row.effect, 0.0) + row.values["d"]
+    return known
 
 
 def _again(effect: Effect, known: float, data: Data) -> Effect:

@@ -95,17 +95,21 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
 
     A signal that is not used gets one line, with its delay in it: nothing of it is corrected here.
     """
-    lines, findings = [], list(findings)
+    findings = list(findings)
+    further = {one.signal: f"; {one.finding}" for one in findings if one.source and one.delay_s}
+    lines, findings = [], [one for one in findings if not (one.source and one.delay_s)]
     unused = {one.signal: one for one in findings if one.kind == "smoothed"}
     late = {one.signal for one in findings if one.kind == "delay"}
     for one in findings:
         left_out = unused.get(one.signal)
         if left_out and (one.kind == "lag" or (one is left_out and one.signal in late)):
             continue  # `left_out` says how old it is, or is said with the delay
+        old = further.get(one.signal, "")  # beside what is said of its position
         cut = one.kind == "unresolved"  # says so itself
         done = "; corrected here" * (one.corrected and not (left_out or cut))
         if left_out and one.kind == "delay":
             done = f"; {left_out.finding}"
+        done += old
         if one.log and one.log in one.advice:  # says when to set it
             lines.append(f"{one.signal}: {one.finding}{done}. {one.advice}")
             continue

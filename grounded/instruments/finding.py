@@ -6,7 +6,7 @@ be corrected.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from grounded.errors import GroundedError, NextCommand
@@ -16,6 +16,7 @@ from grounded.trial import Trial
 DEGREES = 57.29577951308232  # in a radian
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
 LEFT_OUT = "left out of the diagnosis: it adds nothing to"  # the log of its position
+SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
 AS_LATE = "is in one message with, and so as late as,"  # the signal that shows the delay
 ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
 
@@ -38,6 +39,7 @@ class Finding(Document):
         corrected: whether the trials were corrected before the physics was identified.
         log: key and value for the signal's [log] table that correct the logs as well.
         advice: what to change in the log itself, where no key of [log] corrects it.
+        source: the position from which a velocity was computed.
     """
 
     signal: str
@@ -50,6 +52,7 @@ class Finding(Document):
     corrected: bool = False
     log: str = field(default="", metadata={"brief": True})
     advice: str = field(default="", metadata={"brief": True})
+    source: str = field(default="", metadata={"brief": True})
 
 
 def put_right(
@@ -81,25 +84,53 @@ def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
 
     The physics was identified without them, but a feedback controller sees the delayed signals.
     """
-    found = {}
+    found = dict[str, dict[str, float]]()
     for one in findings:
         if one.corrected and one.kind == "lag" and one.delay_s > 0 and not one.log:
             found[f"sensor_lag:{one.signal}"] = {"tau": one.delay_s}
         elif one.corrected and one.kind == "delay" and one.delay_s > 0:
-            found[f"sensor_delay:{one.signal}"] = {"d": one.delay_s}
+            name = f"{SENSOR_DELAY}{one.signal}"
+            found[name] = {"d": found.get(name, {"d": 0.0})["d"] + one.delay_s}
     return found
+
+
+def late_as_positions(
+    findings: Iterable[Finding], delays: Mapping[str, float], known: Container[str]
+) -> Iterator[Finding]:
+    """Yield a finding for each velocity that is computed from a position whose sensor is late.
+
+    It is late by as much, too: what the sensors show of it is only how far behind its position it
+    is. A ball's speed was planned for as 57 ms old, behind a position 32 ms old.
+
+    Args:
+        findings: those of all sensors.
+        delays: delays of sensors that the physics shows [s], by effect: `sensor_delay:x`.
+        known: names of effects that the model has already.
+    """
+    for one in findings:
+        late = {
+            name: delay
+            for name, delay in delays.items()
+            if one.source in (states := name.removeprefix(SENSOR_DELAY).split("+"))
+            if one.signal not in states
+        }
+        if late and sum(late.values()) > 0 and f"{SENSOR_DELAY}{one.signal}" not in known:
+            d, position = sum(late.values()), one.source
+            text = f"is older by another {d:.3g} s, by which the log of {position} itself is late"
+            yield Finding(one.signal, text, "delay", d, corrected=True, source=position)
 
 
 def a_mean(name: str, position: str, over: float) -> Finding:
     """Return the finding of a velocity that is a difference of its position over a time [s]."""
     text = f"is a mean over {over:.2g} s, as from differences of {position}; {LEFT_OUT} {position}"
-    return Finding(name, text, "smoothed", corrected=True)
+    return Finding(name, text, "smoothed", corrected=True, source=position)
 
 
 def derived_from(position: str, age: float) -> str:
     """Return what is said of a velocity that a filter computes from its position."""
     return (
-        f"is a filtered derivative of {position}, {age:.2g} s old on average; {LEFT_OUT} {position}"
+        f"is a filtered derivative of {position}, {age:.2g} s behind it on average; "
+        f"{LEFT_OUT} {position}"
     )
 
 

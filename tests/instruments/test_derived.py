@@ -5,11 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Trial
+from grounded import Model, Trial, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
-from grounded.instruments.finding import a_mean, in_degrees, put_right
+from grounded.instruments.finding import (
+    a_mean,
+    in_degrees,
+    late_as_positions,
+    late_effects,
+    put_right,
+)
 from grounded.instruments.preflight import preflight
 
 DT = 0.04
@@ -100,6 +107,62 @@ def test_a_signal_that_is_not_used_has_one_line():
     (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
     assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
     assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]
+
+
+BALL = Model(
+    name="ball",
+    states={"x": "m", "v": "m/s", "beam": "rad"},
+    inputs={"u": "rad/s"},
+    params={},
+    derivative=lambda s, a, p: {"x": s.v, "v": 7.0 * s.beam, "beam": a.u},
+)
+
+
+def rolled(late, steps=350):
+    """A ball is balanced; x is logged `late` steps late, v is a filter of differences of that."""
+    rng, s, true, u = np.random.default_rng(2), np.array([0.05, 0.0, 0.0]), [], np.zeros(steps)
+    for k in range(steps + 1):
+        true.append(s)
+        there = 0.1 * np.sin(0.8 * k * DT) * np.sign(np.sin(0.31 * k * DT))
+        wanted = -4 * (s[2] + 0.4 * (s[0] - there) + 0.5 * s[1]) + 0.3 * rng.standard_normal()
+        u[min(k, steps - 1)] = wanted
+        for _ in range(10):
+            s = s + DT / 10 * np.array([s[1], 7 * s[2], wanted])
+    true = np.array(true)
+    x = true[np.maximum(np.arange(steps + 1) - late, 0), 0] + 1e-3 * rng.standard_normal(steps + 1)
+    v = np.zeros(steps + 1)
+    for k in range(1, steps + 1):
+        v[k] = 0.7 * v[k - 1] + 0.3 * (x[k] - x[k - 1]) / DT
+    beam = true[:, 2] + 5e-4 * rng.standard_normal(steps + 1)
+    states = np.stack([x, v, beam], axis=1)[5:]
+    return Trial(states, u[5:, None], DT, ("x", "v", "beam"), ("u",))
+
+
+@pytest.mark.slow
+def test_a_speed_that_is_computed_from_a_late_position_is_as_late():
+    """A plan took a speed for 57 ms old that came from a camera 32 ms late: promised too much."""
+    found = diagnose(BALL, [rolled(late=2)], DiagnosisOptions(max_effects=1))
+    assert found.effects == ("sensor_delay:x",)
+    late = found.late_sensors
+    assert late["sensor_delay:v"]["d"] == pytest.approx(found.values("sensor_delay:x")["d"])
+    assert late["sensor_delay:v"]["d"] == pytest.approx(2 * DT, abs=0.01)
+    assert late["sensor_lag:v"]["tau"] == pytest.approx(DT * 0.7 / 0.3, abs=0.03)
+
+
+def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted():
+    seen = [a_mean("v", "x", 0.04)]
+    (late,) = late_as_positions(seen, {"sensor_delay:x": 0.03, "sensor_delay:beam": 0.5}, ())
+    assert (late.signal, late.delay_s, late.source) == ("v", 0.03, "x")
+    (line,) = instrument_lines([*seen, late])
+    assert line.startswith("v: is a mean over") and "older by another 0.03 s" in line
+    assert not [*late_as_positions(seen, {"sensor_delay:x": 0.03}, ("sensor_delay:v",))]
+    assert not [*late_as_positions(seen, {"sensor_delay:x+v": 0.03}, ())]  # v's own delay
+    assert not [*late_as_positions(seen, {}, ())]
+    own = put_right("v", "0.02 s later than the derivative of x", "delay", "", delay_s=0.02)
+    both = late_effects([own, *seen, late])
+    assert both["sensor_delay:v"]["d"] == pytest.approx(0.05)
+    (line,) = instrument_lines([own, *seen, late])
+    assert "0.02 s later" in line and "mean over" in line and "another 0.03 s" in line
 
 
 def test_a_rate_is_in_degrees_a_second():

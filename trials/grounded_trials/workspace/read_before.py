@@ -93,7 +93,7 @@ def changed_since(
         for key in PLAIN
         if key in one.log
     }
-    if any(one.kind == "delay" for one in diagnosis.preflight):  # maybe of another signal
+    if any(one.kind == "delay" and one.log for one in diagnosis.preflight):  # maybe of another
         corrected |= {(name, "delay_s") for name in workspace.base_model.state_names}
     found: tuple[str, ...] = ()
     for one in workspace.whole_trials():
