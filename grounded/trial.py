@@ -8,8 +8,8 @@ that stops one or two steps early is extrapolated to the end of the run (`Trial.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ class Trial:
         candidate: id of the candidate that was run; "" for a log that ran none.
         start_inputs: (m,) input held before t = 0; None if unknown, then the task's `past` is used,
             or zero without a task.
+        start_states: states at t = 0 as the samples before it show them, by name, where they show
+            them better than the first row alone does: of a robot that stood still before its run.
 
     Raises:
         GroundedError: if the shapes do not match.
@@ -53,6 +55,7 @@ class Trial:
     id: str = ""
     candidate: str = ""
     start_inputs: Array | None = None
+    start_states: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         states = numbers(self.states, "trial: states")
@@ -97,6 +100,13 @@ class Trial:
     def steps(self) -> int:
         """T, the number of control steps that were run."""
         return len(self.inputs)
+
+    @property
+    def began(self) -> Array:
+        """Where the run began, (n,): `start_states`, and the first row for the others."""
+        known = self.start_states
+        pairs = zip(self.state_names, self.states[0], strict=True)
+        return np.array([known.get(name, float(first)) for name, first in pairs])
 
     @property
     def finite_steps(self) -> int:

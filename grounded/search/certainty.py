@@ -324,7 +324,7 @@ def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
 
     def worth(one: Tried) -> float:
         s_0 = one.candidate.predicted_states[0]
-        off = np.array([trial.states[0] - s_0 for trial in one.trials])
+        off = np.array([trial.began - s_0 for trial in one.trials])
         if not beyond_noise(one.trials, off, s_0, one.candidate.predicted_states).any():
             return 0.0
         found = [c for t in history if (c := t.candidate).base == one.candidate.id]
@@ -341,7 +341,7 @@ def began_apart(one: Tried, other: Tried) -> bool:
     That is by more than the sensors' noise, and more than the scatter of where repeats begin, which
     the scatter of their utilities includes.
     """
-    first, second = (np.array([t.states[0] for t in tried.trials]) for tried in (one, other))
+    first, second = (np.array([t.began for t in tried.trials]) for tried in (one, other))
     s_0, apart = one.candidate.predicted_states[0], np.ones(first.shape[1], bool)
     if (freedom := len(first) + len(second) - 2) > 0:
         squares = sum(len(starts) * starts.var(axis=0) for starts in (first, second)) / freedom

@@ -46,14 +46,16 @@ FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fracti
 def begun_at(task: Task, trials: Sequence[Trial], predicted: Array) -> Trial:
     """Return the mean of a candidate's trials, begun at s_0 where noise alone may differ from it.
 
+    Elsewhere it begins where the samples before the runs tell, if they do (`Trial.began`).
     Otherwise the bias of the first step would take the error of that sample for motion, and apply
     it to every run that begins at s_0: a noisy speed of 0.04 rad/s promised a tenth of the cost.
     """
     mean = mean_trial(trials, task.model.angle_mask)
-    off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
+    off = np.array([task.model.difference(t.began, task.start) for t in trials])
     near = np.logical_not(beyond_noise(trials, off, task.start, predicted))
+    first = np.array([task.model.difference(t.states[0], task.start) for t in trials])
     states = np.array(mean.states)
-    states[0, near] -= off.mean(axis=0)[near]
+    states[0] += np.where(near, 0.0, off.mean(axis=0)) - first.mean(axis=0)
     return replace(mean, states=states)
 
 

@@ -37,12 +37,12 @@ class Starts:
 
         It is 0 if all runs began alike, and NaN if the model can't tell it.
         """
-        starts = np.array([t.states[0] for tried in (one, other) for t in tried.trials])
+        starts = np.array([t.began for tried in (one, other) for t in tried.trials])
         middle, model = starts.mean(axis=0), self.planner.task.model
         apart = any(
             beyond_noise(
                 (trial,),
-                model.difference(trial.states[0], middle)[None],
+                model.difference(trial.began, middle)[None],
                 tried.candidate.predicted_states[0],
                 tried.candidate.predicted_states,
             ).any()
@@ -61,7 +61,7 @@ class Starts:
     def _of(self, tried: Tried, k: int) -> float:
         key = (tried.candidate.id, k)
         if key not in self._known:
-            task, began = self.planner.task, tried.trials[k].states[0]
+            task, began = self.planner.task, tried.trials[k].began
             off = task.model.difference(began, task.start)
             self._known[key] = -worth_of_start(self.planner, tried.candidate.policy, off)
         cost = self._known[key]

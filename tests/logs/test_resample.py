@@ -72,6 +72,47 @@ def test_a_delay_is_taken_back() -> None:
     np.testing.assert_allclose(grid(mended).states[:, 0], 0.05 * np.arange(41), atol=1e-9)
 
 
+def noisy(f: Callable[[np.ndarray], np.ndarray], seed: int, **spec: object) -> Series:
+    rng = np.random.default_rng(seed)
+    return pose(lambda t: f(t) + 0.02 * rng.standard_normal(len(t)), rate=20.3, **spec)
+
+
+def test_where_a_run_began_is_told_by_the_samples_before_it() -> None:
+    """A boat that was held read -0.088 m, its start was -0.029 m: 'more than the noise'."""
+
+    def left(t: np.ndarray) -> np.ndarray:
+        return 0.3 + 0.8 * np.maximum(t, 0.0) ** 2
+
+    rows, told = [], []
+    for seed in range(40):
+        v = noisy(lambda t: 1.6 * np.maximum(t - 0.5, 0), 100 + seed)
+        log = {"x": noisy(lambda t: left(t - 0.5), seed), "v": v, "u": command(0.5)}
+        found = to_grid(log, 0.05, ["x", "v"], ["u"], rates=["v"])
+        rows.append(found.states[0, 0] - 0.3)
+        told.append(found.start_states.get("x", np.nan) - 0.3)
+    assert np.isfinite(told).mean() > 0.8  # now and then noise itself looks like a motion
+    assert np.nanstd(told) < 0.5 * np.std(rows) and abs(np.nanmean(told)) < 0.003
+
+
+def test_a_start_in_motion_or_after_few_samples_is_the_first_row() -> None:
+    swings = noisy(lambda t: np.sin(5 * t), 1)
+    assert not grid(swings, command(0.7)).start_states
+    assert not grid(noisy(np.ones_like, 1), command(-0.3)).start_states  # 4 samples before
+    slow = grid(noisy(lambda t: 0.2 * t, 3), command(0.7)).start_states  # drifts at one speed
+    assert slow["x"] == pytest.approx(0.14, abs=0.02)
+
+
+def test_a_start_is_no_mean_while_a_speed_is_off_zero() -> None:
+    """A slow drift hides in the noise of a position, but not in that of its speed."""
+    speeds = {"x": noisy(lambda t: 0.05 * t, 4), "v": noisy(lambda t: 0.05 + 0 * t, 5)}
+    log = {**speeds, "u": command(0.7)}
+    drifts = to_grid(log, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
+    assert drifts["x"] == pytest.approx(0.035, abs=0.02) and drifts["v"] != pytest.approx(0.0)
+    rests = {**log, "v": noisy(np.zeros_like, 5)}
+    held = to_grid(rests, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
+    assert held["x"] < drifts["x"]  # the mean, of half a second before
+
+
 def test_scale_offset_and_unwrapping() -> None:
     def wrapped_degrees(t: np.ndarray) -> np.ndarray:
         return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)

@@ -210,6 +210,17 @@ def test_the_noise_of_a_first_sample_is_no_motion():
     assert away[0] > 0.05  # where it really began elsewhere, that is kept
 
 
+def test_a_run_begins_where_the_samples_before_it_tell():
+    """Of a boat that was held before its run, one noisy sample was taken for where it began."""
+    task = cart_task()
+    run = begun(task, off=0.1, noise=0.02)
+    told = replace(run, start_states={"x": 0.12})
+    assert told.began[0] == 0.12 and told.began[1] == run.states[0, 1]
+    assert begun_at(task, [told], begun(task).states).states[0, 0] == pytest.approx(0.12)
+    near = begun_at(task, [replace(run, start_states={"x": 0.001})], begun(task).states)
+    assert near.states[0, 0] == task.start[0]
+
+
 def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
     """A ball at rest read -0.031 m/s: `discard` its best run, it was said."""
     task, false = cart_task(), 0

@@ -84,6 +84,7 @@ class Gridded:
     states: Floats  # (T + 1, n)
     inputs: Floats  # (T, m)
     start_inputs: Floats | None  # (m,) held before t = 0; None if the log does not contain them
+    start_states: Mapping[str, float]  # at t = 0, as the samples before show them; see `Trial`
     start_ns: int  # t = 0 on the signals' clock [ns]
     origin_ns: int  # stamp of the first sample of any signal, on the same clock [ns]
     late_s: float  # shift of the start because a state was not known yet [s]
@@ -189,6 +190,7 @@ def to_grid(
         states=np.column_stack(columns[: len(states)]),
         inputs=np.column_stack(columns[len(states) :]),
         start_inputs=held if np.isfinite(held).all() else None,
+        start_states=_start_states(tracked, rates, start),
         start_ns=start,
         origin_ns=origin,
         late_s=late,
@@ -197,6 +199,19 @@ def to_grid(
         last_ns=min(int(samples[name].t[-1]) for name in states),
         told=told,
     )
+
+
+def _start_states(states: Sequence[Samples], rates: Sequence[str], start: int) -> dict[str, float]:
+    """Return the values at t = 0 as the samples before tell, for the states of which they do.
+
+    That is their mean if no state moves and no velocity is off zero, else, or without a velocity,
+    where a line leads: a boat that drifts is not where it was on average.
+    """
+    leads = {one.name: one.leading_to(start) for one in states}
+    still = bool(rates) and all(
+        one and not one.moves and not (one.off and name in rates) for name, one in leads.items()
+    )
+    return {name: one.mean if still else one.line for name, one in leads.items() if one}
 
 
 def _extent(

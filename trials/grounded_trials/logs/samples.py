@@ -20,11 +20,24 @@ from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
 GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # without max_age_s a gap exceeds all of these
+STILL_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value there; how many
+WHITE, BETTER = 1.3, 0.7  # largest scatter about a line, and std of its end, by a sample's noise
+OFF, SURE = 4.0, 3.0  # std by which the value itself may differ, and from which a motion shows
 JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
 SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
 REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
+
+
+@dataclass(frozen=True)
+class Lead:
+    """What the samples before a time say of the value there."""
+
+    line: float  # by a straight line through them
+    mean: float
+    moves: bool  # the line is not level, by more than noise
+    off: bool  # the mean is not 0, by more than noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +133,27 @@ class Samples:
             k = int(np.argmax(age > limits))
             self._refuse(self.t[i[k]], at[k], limits[k], origin)
         return self.y[i]
+
+    def leading_to(self, at: int) -> Lead | None:
+        """Return what the samples of the second before a time [ns] say of the value there.
+
+        None if that is no better than the sample there: with few samples, or if these scatter more
+        about a straight line than from one to the next, as those of a robot that moves do.
+        """
+        before = (self.t <= at) & (self.t > at - round(STILL_S * 1e9))
+        t, y = 1e-9 * (self.t[before] - at), self.y[before]
+        if len(y) < FEWEST:
+            return None
+        tilt, level = np.polyfit(t, y, 1)
+        noise = float(np.sqrt((np.diff(y) ** 2).mean() / 2))
+        scatter = float(np.sqrt(((y - level - tilt * t) ** 2).sum() / (len(y) - 2)))
+        spread = float(((t - t.mean()) ** 2).sum())
+        end = float(np.sqrt(1 / len(y) + t.mean() ** 2 / spread))
+        there = self.y[min(int(np.searchsorted(self.t, at)), len(self.t) - 1)]
+        if scatter > WHITE * noise or end > BETTER or abs(there - level) > OFF * noise:
+            return None
+        moves, mean = abs(tilt) * spread**0.5 > SURE * noise, float(y.mean())
+        return Lead(float(level), mean, bool(moves), abs(mean) > SURE * noise / len(y) ** 0.5)
 
     def held_from(self, at: int, value: float) -> Samples:
         """Return the samples with a value added at an earlier time [ns], if it is earlier."""

@@ -13,6 +13,7 @@ the lists feedforward[m], gain[m * nz] row by row, reference[nz]), `/predicted_s
     states, inputs    JSON objects, name -> unit, in array order
     candidate         (trial) the candidate that was run, "" for none
     start_inputs      (trial) JSON list, the inputs held before t = 0, or null
+    start_states      (trial) JSON object, states at t = 0 as the samples before show them, if any
     start_ns          (trial) time stamp of t = 0 [ns]; detects a trial without its beginning
     steps             (candidate) H; detects a candidate without its end
     policy            (candidate) JSON object: low, high (null: no limit), past, depths, angles, z

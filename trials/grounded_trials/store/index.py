@@ -24,7 +24,7 @@ from grounded_trials.store.known import KnownTrial, Worth
 from grounded_trials.store.store import Stored
 
 KEPT = 2**20  # [bytes] arrays of larger trials are not kept in the index
-_VERSION = 4  # of the tables and of the result of `_about`
+_VERSION = 5  # of the tables and of the result of `_about`
 _TABLES = """
 CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
 CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);
@@ -150,6 +150,7 @@ class Index:
                     id=about["id"],
                     candidate=about["candidate"],
                     start_inputs=about["start_inputs"] and np.array(about["start_inputs"]),
+                    start_states=about["start_states"],
                 )
         return self._read(stored)[0]
 
@@ -187,6 +188,7 @@ def _about(trial: Trial, meta: dict[str, str], policy: bytes | None) -> dict[str
         "states": trial.state_names,
         "inputs": trial.input_names,
         "start_inputs": None if held is None else held.tolist(),
+        "start_states": dict(trial.start_states),
         "gaps": whole is not trial,
         "ran": "" if policy is None else hashlib.sha256(policy).hexdigest(),
         "meta": meta,

@@ -29,6 +29,7 @@ class KnownTrial(Trial):
             id=about["id"],
             candidate=about["candidate"],
             start_inputs=None if held is None else readonly(held),
+            start_states=about["start_states"],
             _known=about,
             _load=load,
             _worth=worth,

@@ -50,7 +50,7 @@ NAME_LIMIT = 1000  # number of states or of inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
 RESERVED = ["format", "dt", "states", "inputs", "policy", "steps"]
-RESERVED += ["candidate", "start_inputs", "start_ns", "sha256"]
+RESERVED += ["candidate", "start_inputs", "start_states", "start_ns", "sha256"]
 DOUBLES = ArrayType(Number("f8"))
 
 Counts = NDArray[np.integer[Any]]

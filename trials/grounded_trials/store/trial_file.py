@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import zip_longest
 from pathlib import Path
@@ -36,6 +36,7 @@ class TrialWriter:
         candidate: the candidate that is run, "" for none.
         policy: the bytes of the candidate's file.
         start_inputs: inputs held before t = 0, (m,); None: zero.
+        start_states: states at t = 0 as the samples before show them, by name.
         start_ns: absolute time of t = 0 [ns], for display. If it is negative (simulation time),
             stamps count from 0, since those of MCAP are unsigned.
 
@@ -54,6 +55,7 @@ class TrialWriter:
         candidate: str = "",
         policy: bytes | None = None,
         start_inputs: Array | None = None,
+        start_states: Mapping[str, float] | None = None,
         start_ns: int = 0,
     ) -> None:
         from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter
@@ -68,6 +70,7 @@ class TrialWriter:
             candidate=candidate,
             start_inputs=json.dumps(held),
             start_ns=str(int(start_ns)),
+            **({"start_states": json.dumps(dict(start_states))} if start_states else {}),
         )
         self._n, self._m, self._start_ns = len(states), len(inputs), start_ns
         self._owned = isinstance(target, str | Path)
@@ -176,6 +179,7 @@ def trial_bytes(
         candidate=trial.candidate,
         policy=policy,
         start_inputs=trial.start_inputs,
+        start_states=trial.start_states,
         start_ns=about.get("start_ns", 0),
     ) as writer:
         writer.extend(trial)
@@ -227,6 +231,8 @@ def read_trial(
     held = None
     if own.entry("start_inputs") != "null":
         held = own.floats(own.json("start_inputs", list), "start_inputs", len(inputs))
+    begun = own.json("start_states", dict) if "start_states" in own.meta else {}
+    known = own.floats([*begun.values()], "start_states", len(begun))
     trial = Trial(
         states=x,
         inputs=u,
@@ -236,6 +242,7 @@ def read_trial(
         id=own.sha256,
         candidate=own.meta.get("candidate", ""),
         start_inputs=held,
+        start_states=dict(zip(begun, known.tolist(), strict=True)),
     )
     return trial, own.meta, own.attachments.get("policy")
 

@@ -281,7 +281,7 @@ def began_elsewhere(
     Differences within the sensors' noise or below their resolution do not count, nor do `estimated`
     states, whose error no sensor's noise bounds.
     """
-    off = np.array([task.model.difference(t.states[0], task.start) for t in trials])
+    off = np.array([task.model.difference(t.began, task.start) for t in trials])
     mean = off.mean(axis=0)
     told = beyond_noise(trials, off, task.start, predicted) & (np.abs(mean) > _resolution(trials))
     return {

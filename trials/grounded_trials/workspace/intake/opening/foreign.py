@@ -75,7 +75,7 @@ class ForeignLog:
             angles=model.angles,
             steps=task.horizon if candidate else None,
             rest=None if candidate else rest,
-            rates=() if candidate else rates_of(model),
+            rates=rates_of(model),
             past=self.workspace.task.past if candidate and start is not None else None,
         )
         logged = tuple(one for one in found.reports if one.name in self.series), found.warnings
@@ -88,6 +88,7 @@ class ForeignLog:
             input_names=model.input_names,
             candidate=candidate,
             start_inputs=found.start_inputs,
+            start_states=found.start_states if candidate else {},
         )
         return trial, found
 

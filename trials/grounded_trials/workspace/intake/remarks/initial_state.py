@@ -64,7 +64,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     trial = trial.until(task.horizon)
     if not trial.candidate or trial.finite_steps < 0:
         return None
-    off = task.model.difference(trial.states[0], task.start)
+    off = task.model.difference(trial.began, task.start)
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     failed = len(states) <= trial.finite_steps
     usual = np.ptp(states, axis=0)
@@ -122,7 +122,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
 def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
     """Return where one state started, and by how much that is off."""
     name, unit = list(task.model.states.items())[i]
-    began, start = in_digits_apart(float(trial.states[0, i]), float(task.start[i]))
+    began, start = in_digits_apart(float(trial.began[i]), float(task.start[i]))
     turned = f" ({np.rad2deg(off):+.2g} degrees)" if unit == "rad" else ""
     return (
         f"{name} = {with_unit(began, unit)}, the task's start is {start}: "
@@ -169,7 +169,7 @@ def _starts_before(workspace: Folder, identity: str) -> Array:
     """Return how far from s_0 the other runs of this task started, (N, n)."""
     task = workspace.task
     runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
-    off = [task.model.difference(one.states[0], task.start) for one in runs]
+    off = [task.model.difference(one.began, task.start) for one in runs]
     return np.array(off).reshape(len(off), task.model.n)
 
 
