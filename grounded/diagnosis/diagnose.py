@@ -266,8 +266,8 @@ def diagnose(
         said = with_faults(found.verdict, looked.findings)
         said = interrupted(said) if cut_short else said
         delays = _sensor_delays(found, data.model, options.but)
-        late = late_as_positions(looked.findings, delays, options.but)
-        return replace(found, verdict=said, preflight=(*looked.findings, *late))
+        older = late_as_positions(looked.findings, delays, options.but)
+        return replace(found, verdict=said, preflight=(*looked.findings, *older))
 
 
 def _sensor_delays(found: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:
