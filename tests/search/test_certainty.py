@@ -22,6 +22,7 @@ from grounded.search.certainty import (
 )
 from grounded.search.scatter import with_errors
 from grounded.search.standing import PATIENCE, _hardly
+from grounded.trial import Trial
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -204,17 +205,22 @@ def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repea
         assert holds(said, f"probability {history[-1].probability:.2f}")
 
 
+def from_to_zero(off):
+    """A trial of one state, from `off` to 0."""
+    states = np.linspace(off, 0.0, 30)[:, None]
+    return Trial(states, np.zeros((29, 1)), 0.05, ("x",), ("u",))
+
+
 def test_what_a_start_is_worth_is_no_improvement():
     """A robot that starts 7 cm nearer to the target has not improved with probability 1.00."""
 
     def ran(name, base, utility, off, as_run=np.nan):
         """Return a run from `off` beside s_0; the model gives its base -4 from s_0."""
-        states = np.linspace(off, 0.0, 30)[:, None]
         candidate = SimpleNamespace(
             id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
         )
         candidate.predicted_states = np.zeros((30, 1))
-        trials = tuple(SimpleNamespace(states=states, dt=0.05, finite_steps=29) for _ in range(2))
+        trials = (from_to_zero(off),) * 2
         return Tried(candidate, trials, (utility, utility + 0.01), True)
 
     first = ran("c0001", "", -6.0, off=0.07)
@@ -246,10 +252,7 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
             id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
         )
         candidate.predicted_states = np.zeros((30, 1))
-        trials = tuple(
-            SimpleNamespace(states=np.linspace(o, 0.0, 30)[:, None], dt=0.05, finite_steps=29)
-            for o in offs
-        )
+        trials = tuple(map(from_to_zero, offs))
         return Tried(candidate, trials, tuple(utility for _ in offs), True)
 
     first = ran("c0001", "", -6.0, (-3.1, 0.0, 1.5, 1.5, -3.1, -3.1))
