@@ -97,6 +97,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials, rest_value
+    from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import without_range
@@ -199,7 +200,9 @@ def command(
         if family != "sensor_bias" or name not in columns:
             continue
         begins = float(workspace.config.task.start.get(name, columns[name][0]))
-        asked = {"the target ends at": float(columns[name][-1]), "[task] start is": begins}
+        asked = {"the target ends at": float(columns[name][-1])}
+        if not read_at_start(workspace, name, effect["b"]):
+            asked["[task] start is"] = begins
         off = [
             f"{what} {with_unit(number(value), model.states[name])}"
             for what, value in asked.items()
