@@ -94,6 +94,8 @@ def summary(status: Status) -> str:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{noise_share(best)}"
         lines.append(field("best", text + _gained(standing)))
+        if less := standing.less_in_log:
+            lines.append(field("predicted", less))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     exported = "then " * (status.again.verb == "next")

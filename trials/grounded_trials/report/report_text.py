@@ -112,6 +112,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")
+    if less := findings.standing.less_in_log:
+        lines += _wrapped(less, "  ")
     lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}", "  ")
     return "\n".join(lines)
 

@@ -216,7 +216,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
-            *filter(None, [*read.notes, told]),
+            *filter(None, [*read.notes, *(() if odd or wrong else read.aged), told]),
             *(no_longer(workspace, added.id, now) if now and not added.known else ()),
             *(
                 odd_run(workspace, now, added.id, aside=bool(read.aside))

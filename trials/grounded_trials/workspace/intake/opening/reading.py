@@ -52,6 +52,7 @@ class Read:
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
     notes: tuple[str, ...] = ()
+    aged: tuple[str, ...] = ()  # notes on the age of its samples, told if nothing else is wrong
     copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
