@@ -284,9 +284,9 @@ def _at_the_end(
     named, it = listed(added), "them" if len(added) > 1 else "it"
     told = ", ".join(f"{name} = {OFFERED * usual[name]:.4g}" for name in added)
     return (
-        f". To ask for rest there, but at the end only: add `--to {rest}={at:.3g}`, then remove "
-        f"{named} from [reward] state, where a weight holds {it} all the way, and give {it} to "
-        f"terminal in [reward]: {told}"
+        f". To ask for rest there, but at the end only: draw it again with `--to {rest}={at:.3g}` "
+        f"as well. The weights that [reward] state then gets for {named} would hold {it} all the "
+        f"way: remove them there, and give terminal in [reward] {told}"
     )
 
 
