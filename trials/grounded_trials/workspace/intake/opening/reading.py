@@ -69,6 +69,14 @@ class Read:
         return self.log is None and not self.copy
 
     @property
+    def silent(self) -> tuple[str, ...]:
+        """The states without a value from the end of the trial on, though its log goes on."""
+        if self.log is None or self.cut is None:
+            return ()
+        ends = self.cut.start_ns + round(1e9 * self.trial.steps * self.trial.dt)
+        return self.log.silent_from(ends)
+
+    @property
     def hole(self) -> str:
         """A sentence on the longest gap in a log; "" if there is no long one."""
         longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)

@@ -163,7 +163,7 @@ def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
     odd = [i for i, name in enumerate(names) if same[i] and name in clearly and name in given]
     if not odd:
         return ""
-    whole = given | {names[i]: float(first[i]) for i in odd}
+    whole = {**given, **{names[i]: float(first[i]) for i in odd}}
     start = ", ".join(f"{name} = {value:.4g}" for name, value in whole.items())
     where = "; ".join(_placed(task, trial, i, off[i]) for i in odd)
     return (
