@@ -156,7 +156,7 @@ def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
         return ""
     first = trial.states[0]
     apart = [task.model.difference(x, first) for x in (*began.values(), *stood.values())]
-    same = (np.abs(apart) <= SAME * np.abs(off)).all(axis=0)
+    same = np.all(np.abs(apart) <= SAME * np.abs(off), axis=0).tolist()
     predicted = workspace.candidate(trial.candidate)[0].predicted_states
     clearly = began_elsewhere(task, [trial.until(task.horizon)], predicted)
     names = task.model.state_names
