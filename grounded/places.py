@@ -225,19 +225,21 @@ def only_read(model: Model) -> dict[str, str]:
 
 
 def levelled(model: Model) -> list[str]:
-    """Return angles and positions that act on their own velocity alone, such as a balance's.
+    """Return angles and positions that act on one velocity alone.
 
-    Gravity or a spring that acts about another angle than the model's then looks in every log like
-    a sensor with another zero.
+    A balance's angle acts on its own, a beam's on that of the ball. Gravity or a spring that acts
+    about another angle than the model's then looks in every log like a sensor with another zero.
     """
     dt, found = probe(model, 1e-6), []
     f_x, _ = model.system.linearise(*samples(model, 8), model.values, dt)
     felt = (np.abs(f_x - np.eye(model.n)) / dt).max(axis=0)
-    for name, (rate, _) in integrated(model).items():
+    places = integrated(model)
+    rates = [model.state_names.index(rate) for rate, _ in places.values()]
+    for name in places:
         column = felt[:, model.state_names.index(name)]
-        own = model.state_names.index(rate)
-        others = np.delete(column, own).max(initial=0.0)
-        if column[own] > 0 and others < 1e-4 * column[own]:
+        most = int(np.argmax(column))
+        others = np.delete(column, most).max(initial=0.0)
+        if most in rates and others < 1e-4 * column[most]:
             found.append(name)
     return found
 

@@ -30,9 +30,9 @@ BESIDE = (
 )
 
 BIASED = (
-    "the robot is steered by its sensor of {state}, which reads {by}: [task] start and the target "
-    "are off by that unless this sensor measured them. Do one of two things: keep the effect and "
-    "add {bias:.3g} to them; or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
+    "the robot is steered by its sensor of {state}, which reads {by}: {given} off by that unless "
+    "this sensor measured {them}. Do one of two things: keep the effect and "
+    "add {bias:.3g} to {them}; or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
     "the same in the robot's program), remove sensor_bias:{state} from [model] effects, `discard` "
     "the trials and ingest their logs again"
 )
@@ -75,6 +75,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if undo:
         _undo(workspace, json_)
         return
+    from grounded_trials.workspace.candidates.standstill import read_at_start
+
     before = workspace.base_model.params
     done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
@@ -89,7 +91,12 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         if family == "sensor_bias" and effect["name"] in effects:
             b = effect["b"]
             by = misread(b, units[state])
-            remark("note", BIASED.format(state=state, by=by, off=-b, bias=b))
+            given, them = "[task] start and the target are", "them"
+            if seen := read_at_start(workspace, state, b):
+                given = f"[task] start is what it read at a standstill in {seen}, but the target is"
+                them = "it"
+            told = BIASED.format(state=state, by=by, off=-b, bias=b, given=given, them=them)
+            remark("note", told)
         if family == "sensor_scale" and effect["name"] in effects:
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))

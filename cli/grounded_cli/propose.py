@@ -84,12 +84,14 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         from grounded_trials.workspace.identity import estimated_in
 
         guessed = estimated_in(workspace.trials())
-        text, *parts = _so_far(candidate, standing.incumbent, workspace.task, guessed).split("\n")
+        best, missed = standing.incumbent, proposed.noise_cost
+        text, *parts = _so_far(candidate, best, workspace.task, guessed, missed).split("\n")
         show(field("so far", text, "  "))
         for part in parts:
             show(field("", part, "    "))
     lacks = "; this model lacks what the last diagnosis found" * bool(proposed.lacks)
-    show(field("trust", _trust(candidate, standing, workspace) + lacks, "  "))
+    trust = _trust(candidate, standing, workspace, proposed.noise_cost)
+    show(field("trust", trust + lacks, "  "))
     show_extent(candidate, workspace.task)
     if last:
         show(f"\n{next_line(proposed.then)}")
@@ -133,7 +135,13 @@ def _otherwise(candidate: Candidate, best: Tried) -> bool:
     return candidate.base == best.candidate.id and candidate.unlike(best.utility)
 
 
-def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection[str] = ()) -> str:
+def _so_far(
+    candidate: Candidate,
+    best: Tried,
+    task: Task,
+    estimated: Collection[str] = (),
+    missed: float = 0.0,
+) -> str:
     """Return the best one's utility and, if it differs clearly, what the model gives it and why.
 
     The gain of the candidate is counted from what the model gives the best one. Parts of the
@@ -148,7 +156,8 @@ def _so_far(candidate: Candidate, best: Tried, task: Task, estimated: Collection
 
     text = f"{number(best.utility)} by {best.candidate.id}{noise_share(best)}"
     if not _otherwise(candidate, best):
-        return text
+        less = candidate.less_in_log(best, missed)
+        return f"{text}. {less[:1].upper()}{less[1:]}" if less else text
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
     own = f"{text}. For {best.candidate.id} itself the model predicts {number(same)}"
     if same < ASTRAY * best.utility:
@@ -297,15 +306,23 @@ def _span(low: float, high: float) -> str:
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 
-def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> str:
+def _trust(
+    candidate: Candidate, standing: Standing, workspace: Workspace, missed: float = 0.0
+) -> str:
     """Return how far recent predictions were off, and whether the promised gain exceeds that.
 
     If no run has tested the current model yet, return what it was compared with instead.
+
+    Args:
+        candidate: what to run next.
+        standing: where the search stands.
+        workspace: the workspace with the model.
+        missed: cost of the sensor noise in its log that its prediction lacks.
     """
     ran = [tried for tried in standing.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
     if same:
-        return _came_true(candidate, same, standing)
+        return _came_true(candidate, same, standing, missed)
     measured = _measured(workspace)
     if ran:
         since = "the model was changed since the last run"
@@ -326,8 +343,13 @@ def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> st
     )
 
 
-def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) -> str:
-    """Return by how much the last predictions missed, and the gain that this one promises."""
+def _came_true(
+    candidate: Candidate, same: Sequence[Tried], standing: Standing, lacks: float = 0.0
+) -> str:
+    """Return by how much the last predictions missed, and the gain that this one promises.
+
+    The gain is one of predictions, which may lack some of the sensor noise in a log (`lacks`).
+    """
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     promises = [one.promised for one in last]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
@@ -357,7 +379,9 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
         return f"{text}; the model does not swing with any gains, so it can't say what these gain"
     if not gain > 0:
         return text
-    promise = f"{text}; this one promises a gain of {number(gain)}"
+    said = number(candidate.predicted_utility)
+    scale = " in the model" * (number(candidate.predicted_utility - lacks) != said)
+    promise = f"{text}; this one promises a gain of {number(gain)}{scale}"
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
     doubt = f"{promise}, less than such an error"

@@ -94,6 +94,8 @@ def summary(status: Status) -> str:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{noise_share(best)}"
         lines.append(field("best", text + _gained(standing)))
+        if less := standing.less_in_log:
+            lines.append(field("predicted", less))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     exported = "then " * (status.again.verb == "next")
@@ -113,7 +115,7 @@ def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
     from grounded.result import percent
     from grounded.search.candidate import SURE
-    from grounded.search.certainty import chance, owed_to_start
+    from grounded.search.certainty import chance, owed_to_start, share_of_cost
 
     best, own = standing.incumbent, standing.history[0]
     if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
@@ -124,9 +126,9 @@ def _gained(standing: Standing) -> str:
         return ""
     if chance(own, best, standing.history) < SURE:
         return "; the scatter of repeats may explain its lead on the model's own policy"
-    share = (best.utility - own.utility) / abs(own.utility)
-    gain = f", {percent(share)} better than the model's own policy"
+    share = share_of_cost(own, best, standing.history)
+    gain = f", {share} better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):
-        share = start / abs(own.utility)
-        return f"{gain}; {percent(share)} is due to different start states, by the model"
+        part = percent(start / abs(own.utility))
+        return f"{gain}; {part} is due to different start states, by the model"
     return gain

@@ -97,6 +97,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials, rest_value
+    from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import without_range
@@ -199,7 +200,9 @@ def command(
         if family != "sensor_bias" or name not in columns:
             continue
         begins = float(workspace.config.task.start.get(name, columns[name][0]))
-        asked = {"the target ends at": float(columns[name][-1]), "[task] start is": begins}
+        asked = {"the target ends at": float(columns[name][-1])}
+        if not read_at_start(workspace, name, effect["b"]):
+            asked["[task] start is"] = begins
         off = [
             f"{what} {with_unit(number(value), model.states[name])}"
             for what, value in asked.items()
@@ -281,9 +284,9 @@ def _at_the_end(
     named, it = listed(added), "them" if len(added) > 1 else "it"
     told = ", ".join(f"{name} = {OFFERED * usual[name]:.4g}" for name in added)
     return (
-        f". To ask for rest there, but at the end only: add `--to {rest}={at:.3g}`, then remove "
-        f"{named} from [reward] state, where a weight holds {it} all the way, and give {it} to "
-        f"terminal in [reward]: {told}"
+        f". To ask for rest there, but at the end only: draw it again with `--to {rest}={at:.3g}` "
+        f"as well. The weights that [reward] state then gets for {named} would hold {it} all the "
+        f"way: remove them there, and give terminal in [reward] {told}"
     )
 
 

@@ -121,10 +121,11 @@ def verdict(
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
         elif row is not None and row.floor_at_most:
-            what = (
-                f"No known effect explains what this model leaves{floor(row)}.{unknown_noise(row)}"
-            )
-            return _said("unknown", what, *once, first=first)
+            found = "No known effect explains what this model leaves"
+            if adopted:  # in one that was just mended, that would read as an alarm
+                found = "Nothing more is found beside what was adopted"
+            what = f"{found}{floor(row)}.{unknown_noise(row)}"
+            return _said("none" if adopted else "unknown", what, *once, first=first)
         else:
             text = explained(rows)
         return _said("none", text, *once, first=first)
@@ -294,8 +295,9 @@ def _level(model: Model, claimed: Sequence[str]) -> list[str]:
     if not names:
         return []
     return [
-        f"Gravity or a spring that acts about another {listed(names)} than the model's 0 looks the "
-        "same in any log as a sensor's wrong zero, and is adopted in the same way."
+        f"Gravity or a spring that acts about another {listed(names)} than the model's 0 (a table "
+        "or mount out of level) looks the same in any log as a sensor's wrong zero, and is adopted "
+        "in the same way: check the level before you correct the sensor."
     ]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import Result, document
+from grounded.result import Result, document, figure
 from grounded.trial import Trial
 
 Way = Literal[
@@ -119,6 +119,27 @@ class Candidate(Result):
         if own and self.unlike(best.utility):
             return self.predicted_gain
         return self.predicted_utility - best.utility
+
+    def less_in_log(self, best: Tried, missed: float) -> str:
+        """Return why it may be run though its log is expected to show less than the best; or "".
+
+        The gain is one within the model, which replays the best one's run with the noise in it.
+
+        Args:
+            best: the best so far.
+            missed: what its log costs more than its prediction, due to sensor noise.
+        """
+        gain, in_log = self.promised_over(best), self.predicted_utility - missed
+        if not (gain > 0 and in_log < best.utility and self.base == best.candidate.id):
+            return ""
+        if self.unlike(best.utility) or not self.grounded:  # told by what the model gives the best
+            return ""
+        return (
+            f"in the model, which replays {self.base} with the noise in its log, {self.id} is "
+            f"{figure(gain)} better; about {figure(in_log)} is expected of its log, which will "
+            f"have {figure(missed)} of noise that the prediction lacks: only the run tells whether "
+            "more than noise is gained"
+        )
 
     def doubt(self, best: Tried | None) -> str:
         """Return a sentence that says why a `doubtful` candidate may lose."""

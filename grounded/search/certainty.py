@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.result import with_error
+from grounded.result import percent, with_error
 from grounded.search.candidate import PART, Candidate, Tried
 from grounded.search.scatter import (
     NoiseSoFar,
@@ -203,6 +203,19 @@ def chance(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     if not freedom or (error and _start_unknown(before, after, history)):
         return math.nan
     return student(gain / error, freedom) if error else float(gain > 0)
+
+
+def share_of_cost(before: Tried, after: Tried, history: Sequence[Tried]) -> str:
+    """Return the difference of two candidates' costs as a share of the first: `16 % (+- 4.3 %)`.
+
+    The standard error is told if repeats tell it, with on how few of them it rests.
+    """
+    share = percent(abs((after.utility - before.utility) / before.utility))
+    error, freedom = error_between(before, after, history)
+    if not (freedom and error):
+        return share
+    on = few(Repeats(history).near(after.utility).repeats)
+    return f"{share} (+- {percent(error / abs(before.utility))}{on})"
 
 
 def last_improvement(history: Sequence[Tried], again: str = "") -> str:

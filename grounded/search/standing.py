@@ -104,6 +104,16 @@ class Standing(Result):
             return {"propose": "going on", "await-trial": "waiting"}.get(self.phase, self.phase)
         return self.ending
 
+    @property
+    def less_in_log(self) -> str:
+        """Why the candidate that waits for its first run may show less than the best; or ""."""
+        made = self.outstanding
+        waiting = (t for t in self.history if t.candidate is made and not t.trials)
+        tried = next(waiting, None)
+        if made is None or tried is None or self.incumbent is None:
+            return ""
+        return made.less_in_log(self.incumbent, tried.noise_missed)
+
     def verdict(self, tried: Tried) -> str:
         """Return the verdict on a candidate, see `Tried.verdict`."""
         return tried.verdict(tried.candidate is (self.outstanding or self.history[-1].candidate))

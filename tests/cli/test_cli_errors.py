@@ -193,7 +193,7 @@ def rewritten(trial, path, change):
 RUNS = {
     "short": (
         lambda s, u: (s[:21], u[:20]),
-        ["ends after 20 of 40 steps", "counts as failed"],
+        ["all states are known for 20 of 40 steps", "counts as failed"],
     ),
     "nothing": (lambda s, u: (s[:1], u[:0]), ["ended after 0 of 40 steps"]),
     "nan": (

@@ -2,8 +2,11 @@
 
 from types import SimpleNamespace
 
-from grounded.search.candidate import Tried
-from grounded_cli.propose import _came_true, _predicted, _samples, _what
+import pytest
+
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.standing import Standing
+from grounded_cli.propose import _came_true, _predicted, _samples, _so_far, _what
 
 
 def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
@@ -61,3 +64,25 @@ def test_the_noise_in_a_log_is_told_as_that_of_the_best_one():
     )
     rest = SimpleNamespace(candidate=made, noise_cost=0.002, noise_in_log=0.001, off_target=())
     assert _predicted(rest).endswith("in its log, including sensor noise")
+
+
+@pytest.mark.parametrize(("missed", "less"), [(0.105, True), (0.01, False)])
+def test_a_gain_beside_a_log_that_is_to_show_a_loss_is_told_on_its_scale(missed, less):
+    """A gain of 0.0606 was promised by -1.085 "in its log" over -1.040, without a word why."""
+    shape = (None, None, -0.98)
+    base = Candidate("c0002", None, 1, 1.0, "c0001", "m", *shape)
+    made = Candidate("c0003", None, 2, 1.0, "c0002", "m", *shape, predicted_gain=0.06)
+    run = SimpleNamespace(id="t0002")
+    best = Tried(base, (run,), (-1.04,), True, noise_cost=0.36)
+    waits = Tried(made, (), (), None, noise_cost=0.0, noise_missed=missed)
+    told = _so_far(made, best, None, (), missed)
+    reason = "In the model, which replays c0002 with the noise in its log, c0003 is 0.06000 better"
+    assert (reason in told) == less and ("about -1.085 is expected of its log" in told) == less
+    standing = Standing(
+        *("await-trial", 1, best, made, 1, None, "", 0, (best, waits), 1),
+        "c0003 is waiting for 1 trial",
+    )
+    assert bool(standing.less_in_log) == less
+    now = SimpleNamespace(incumbent=best, history=(best,))
+    assert "promises a gain of 0.06000 in the model" in _came_true(made, [best], now, missed)
+    assert not _came_true(made, [best], now).endswith("in the model")

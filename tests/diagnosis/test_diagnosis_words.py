@@ -351,10 +351,15 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
         rows = (row({"x": 1.0}, {"x": after}, {"x": floor}, floor_at_most=bound),)
         return verdict(_claims(), (), (), (), rows, ()), open_noise(rows)
 
+    unsure = row({"x": 1.0}, {"x": 0.9}, {"x": 0.89}, floor_at_most=True)
     unknown, state = said(0.9, 0.89)
     assert unknown.kind == "unknown" and state == "x"
     assert holds(unknown.sentence, "misses x by 900 mm", "noise is not known: repeat one run")
     assert "890 mm" not in unknown.sentence and "explains the data" not in unknown.sentence
+    mended = verdict(_claims(), (), (), (), (unsure,), (), adopted=("viscous_friction:v",))
+    assert mended.kind == "none"  # after an adoption, "unknown - No known effect" was an alarm
+    assert mended.sentence.startswith("Nothing more is found beside what was adopted: 1 s ahead")
+    assert "noise is not known: repeat one run" in mended.sentence
     known, state = said(0.9, 0.89, bound=False)
     assert known.kind == "none" and "890 mm" in known.sentence and not state
     assert "at least 9 times" in said(0.9, 0.1)[0].sentence

@@ -20,7 +20,7 @@ from grounded.errors import NextCommand
 from grounded.model import Param
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.diagnosed import _doubts, _made_of
+from grounded_trials.report.page.diagnosed import _doubts, _made_of, _rest
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN, parameter_table
 from grounded_trials.report.report_text import report_text
@@ -190,7 +190,8 @@ def test_a_gain_that_scatter_may_explain_is_headed_perhaps(car):
     found = replace(findings, standing=replace(now, history=unsure, incumbent=unsure[1]))
     text = page(found)
     assert re.search(r"<h2>What perhaps improved \(probability 0\.[67]\d\)</h2>", text)
-    assert "which the scatter of repeats may explain" in text
+    assert ": the scatter of repeats may explain the difference" in text
+    assert "cost reduced" not in text and "cost raised" not in text
     assert "bias in 1 s, c0" in text and "bias per s" not in text  # its column is in rad, not rad/s
 
 
@@ -307,6 +308,24 @@ def test_an_error_that_is_all_noise_is_told_in_a_sentence_and_one_of_no_known_pa
     assert "table" in [block.kind for block in unknown]
     some = blocks(explained=0.2, unexplained=0.0, irreducible=0.8)
     assert "table" in [block.kind for block in some]
+
+
+def test_a_state_left_out_of_the_diagnosis_has_no_row(cart):
+    """`v: 0.0 %, 0.0 %, 0.0 %` and `p = 1, white noise` were told of a state that was not used."""
+    shares = {"explained": 0.2, "unexplained": 0.0, "irreducible": 0.8}
+    each = [
+        {"name": "x", "unit": "m", "rms": 0.1} | shares,
+        {"name": "v", "unit": "m/s", "rms": 0.0} | dict.fromkeys(shares, 0.0),
+    ]
+    unknown = {"horizon_s": 1.0, "all": {}, "channels": each, "irreducible_from": "repeats"}
+    found = _made_of({"horizon": Split.from_json(unknown)})
+    assert [block.kind for block in found] == ["heading", "text", "folded"]  # no row of "-"
+    assert [row[0] for row in found[-1].blocks[0].rows] == ["x"]
+    (one, *_) = DIAGNOSIS["where"]["channels"]
+    channels = [one | {"name": "x", "rms": 0.1}, one | {"name": "v", "rms": None}]
+    where = DIAGNOSIS["where"] | {"channels": channels, "whiteness": {"x": 0.4, "v": 1.0}}
+    (_, _, rest) = _rest(Diagnosis.from_json(DIAGNOSIS | {"where": where}))
+    assert [row[0] for row in rest.rows] == ["x"]
 
 
 def test_a_leftover_of_which_no_rate_is_known_makes_no_table(cart):

@@ -12,6 +12,7 @@ import pytest
 from cli import grounded, plain
 from facts import holds
 from grounded.diagnosis.report import Diagnosis
+from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import settled_in, told
@@ -380,3 +381,22 @@ def test_a_sensor_s_bias_is_said_to_move_start_and_target(cart, tmp_path, value)
 def test_status_has_no_two_empty_lines_in_a_row(adopted):
     out = grounded("-C", adopted, "status").out
     assert "adopted" in out and "\n\n\n" not in out
+
+
+def test_a_repeat_that_has_come_in_is_said_to_need_a_new_diagnosis(cart, tmp_path):
+    """`Only a repeat of one run tells` stood in `status` after one, and `next:` was to export."""
+    unsure = ROW | {"noise_floor": {"x": 0.0115, "v": 0.019}, "floor_at_most": True}
+    alone = {"leftover": [], "indistinguishable": [], "unconfirmed": []}
+    folder = written(copied(cart, tmp_path / "w"), prediction_error=[unsure], **alone)
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    asks = "Only a repeat of one run tells how much of what is left in v is noise"
+    before = words(folder, "status")
+    assert asks in before and "repeat one run" not in before
+    run = Workspace(folder).run("best").trial_file
+    added = Workspace(folder).ingest(run).trial
+    for command in ("status", "report"):
+        told = words(folder, command)
+        assert asks not in told, command
+        assert holds(told, f" and {added} repeat one run: diagnose again to know how much of")
+    assert "A new diagnosis tells how much of what is left in v is noise" in told
+    assert Workspace(folder).status().then.verb == "diagnose"

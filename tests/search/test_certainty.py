@@ -17,6 +17,7 @@ from grounded.search.certainty import (
     last_improvement,
     owed_to_start,
     runs_to_show,
+    share_of_cost,
     student,
     with_chances,
 )
@@ -116,6 +117,15 @@ def test_a_scatter_says_on_how_many_repeats_it_rests():
     told = [beyond_one_trial(made, replace(one, deviation=0.1)) for one in found]
     assert holds(told[0], "single repeat", "takes more runs of each") and "22" not in told[0]
     assert holds(told[1], f"takes {runs_to_show(0.05, replace(found[1], deviation=0.1))} runs")
+
+
+def test_a_share_of_cost_has_its_error_if_repeats_tell_it():
+    """A page's headline said "cost reduced by 16 %" of 8 %: the first policy's run was unlucky."""
+    first, best = tried(-1.05, base=""), tried(-0.85, -0.9)
+    assert share_of_cost(first, tried(-0.875), (first, tried(-0.875))) == "17 %"
+    told = share_of_cost(first, best, (first, best))
+    error = (0.05**2 / 2 * 1.5) ** 0.5 / 1.05  # by the scatter of the two, of a mean and a run
+    assert told == f"17 % (+- {100 * error:.2g} %, from a single repeat only)"
 
 
 def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():

@@ -61,6 +61,20 @@ def test_a_wrong_zero_of_a_sensor_may_be_another_level():
     )
     assert levelled(coupled) == []
     assert len(_level(pendulum, ["sensor_bias:theta"])) == 1
+    ball = Model(  # the verdict named the encoder alone, and the student's table was not level
+        name="ball",
+        states={"x": "m", "v": "m/s", "beam": "rad", "w": "rad/s"},
+        inputs={"volt": "V"},
+        params=params,
+        derivative=lambda s, a, p: {
+            "x": s.v,
+            "v": 5 / 7 * p.g * np.sin(s.beam),
+            "beam": s.w,
+            "w": 8 * (0.5 * a.volt - s.w),
+        },
+    )
+    assert levelled(ball) == ["beam"]
+    assert holds(*_level(ball, ["sensor_bias:beam"]), "another beam", "out of level")
     assert not _level(pendulum, ["sensor_bias:omega", "dead_zone:torque"])
 
 

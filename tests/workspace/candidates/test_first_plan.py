@@ -416,6 +416,8 @@ def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
     line = ("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "2", "--hold", "0.5")
     said = " ".join(grounded(*line).out.split())
     assert holds(said, "at the end only", "--to th=0", "[reward] state", "th = 1000, w = 100")
+    assert "then remove" not in said  # they are not there yet
+    assert "weights that [reward] state then gets for th and w" in said
     plain_line = Workspace(w).propose().candidate
     assert grounded(*line, "--to", "th=0").code == 0
     held = Workspace(w).propose().candidate

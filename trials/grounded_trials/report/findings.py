@@ -27,7 +27,7 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
-from grounded_trials.workspace.next_step import EXPORT, nothing_to_do, outlook
+from grounded_trials.workspace.next_step import EXPORT, left_open, nothing_to_do, outlook
 from grounded_trials.workspace.off_target import (
     WITHIN,
     rates_among,
@@ -123,7 +123,7 @@ class Findings:
         if self.diagnosis is None or self.since.sentence:
             return ""
         best = self.standing.incumbent
-        if self.then == EXPORT and best is not None and self.diagnosis.kind != "none":
+        if self.then == EXPORT and best is not None and left_open(self.diagnosis):
             return nothing_to_do(self.diagnosis, best.candidate.id)
         return self.diagnosis.next_trial
 

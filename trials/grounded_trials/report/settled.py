@@ -94,13 +94,14 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     if not since.changed:
         text = gained(diagnosis, task, now="crude", before="outset", who=NOW)
         causes = diagnosis.verdict.causes or diagnosis.effects
-        left, briefly = (_still(diagnosis, some) for some in (causes, diagnosis.effects))
+        left, briefly = (_still(diagnosis, some, since) for some in (causes, diagnosis.effects))
         return replace(with_ties, gained=text, left=left, briefly=briefly)
     if not _as_claimed(diagnosis, table):
         return with_ties
     before = "outset" if gained(diagnosis, task, before="outset") else "crude"
     text = gained(diagnosis, task, before=before, who=NOW)
-    left, briefly = still_open(diagnosis), still_open(diagnosis, ties=False)
+    repeated = bool(since.repeats)
+    left, briefly = (still_open(diagnosis, ties=ties, repeated=repeated) for ties in (True, False))
     told = found if set(ties) <= set(diagnosis.effects) else with_ties  # `left` has its ties
     return replace(told, gained=text, left=left, closed=True, briefly=briefly)
 
@@ -166,11 +167,14 @@ def so_far(
     return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
 
 
-def _still(diagnosis: Diagnosis, causes: Sequence[str]) -> str:
-    """Return the first sentence of a diagnosis of the current planning model; its `causes`."""
+def _still(diagnosis: Diagnosis, causes: Sequence[str], since: Since) -> str:
+    """Return the first sentence of a diagnosis of the current planning model; its `causes`.
+
+    If a run was repeated since, which tells the noise that it asks for, that is told instead.
+    """
     if diagnosis.effects:
         return f"Found, not adopted: {'; '.join(causes)}."
-    return diagnosis.verdict.lines[0]
+    return still_open(diagnosis, repeated=True) if since.repeats else diagnosis.verdict.lines[0]
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:

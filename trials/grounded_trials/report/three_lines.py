@@ -121,8 +121,14 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
     return math.hypot(*(errors.get(name, math.nan) for name in names))
 
 
-def still_open(diagnosis: Diagnosis, *, ties: bool = True) -> str:
-    """What ties (unless `ties` is False), and what no known effect explains."""
+def still_open(diagnosis: Diagnosis, *, ties: bool = True, repeated: bool = False) -> str:
+    """What ties (unless `ties` is False), and what no known effect explains.
+
+    Args:
+        diagnosis: what was found.
+        ties: whether effects that the trials can't tell apart are told.
+        repeated: whether a run was repeated since, which tells the noise that was not known.
+    """
     same, claimed = diagnosis.equivalent, diagnosis.effects
     groups = diagnosis.indistinguishable if ties else ()
     alike = [told_apart(group, same, claimed) for group in groups]
@@ -133,7 +139,8 @@ def still_open(diagnosis: Diagnosis, *, ties: bool = True) -> str:
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     rows = diagnosis.prediction_error
     if not found and (name := open_noise(rows)):
-        found.append(f"only a repeat of one run tells how much of what is left in {name} is noise")
+        tells = "a new diagnosis" if repeated else "only a repeat of one run"
+        found.append(f"{tells} tells how much of what is left in {name} is noise")
     nothing = in_doubt(rows) or "nothing is left above the noise"
     if worsened(rows):  # which is said elsewhere
         nothing = "it is open why predictions get worse with it there"

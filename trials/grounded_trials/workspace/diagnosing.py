@@ -70,6 +70,7 @@ def diagnose_in(
         REPORT,
         TARGET,
         after_diagnosis,
+        left_open,
         nothing_to_do,
     )
 
@@ -145,7 +146,7 @@ def diagnose_in(
     write_diagnosis(workspace.reports, found)  # again, now with `next_trial`
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
-    if then == EXPORT and found.kind != "none":
+    if then == EXPORT and left_open(found):
         words = nothing_to_do(found, candidate_named(workspace, "best"))
         found = replace(found, next_trial=words)
     elif found.contested and then in (TARGET, PROPOSE):
@@ -219,10 +220,12 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     """
     from grounded.search.standing import LOST
     from grounded_trials.workspace.candidates.search_state import standing_in
+    from grounded_trials.workspace.next_step import left_open
 
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
     paid = gain(found.prediction_error, "outset", "crude") > 0
-    if not names or found.no_cause or found.kind != "unknown" or paid:
+    claims = found.kind in ("effect", "several")
+    if not names or found.no_cause or claims or not left_open(found) or paid:
         return ""
     lost, model = 0, workspace.planner.fingerprint
     for tried in reversed(standing_in(workspace).history):

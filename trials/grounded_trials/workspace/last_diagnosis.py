@@ -108,6 +108,7 @@ class Since:
     changed: bool = False  # the diagnosis was made with another model
     reread: tuple[str, ...] = ()  # signals that [log] reads in another way now
     further: bool = False  # it left more to be found than it was allowed to claim
+    repeats: tuple[str, ...] = ()  # runs of one candidate that tell the noise it did not know
 
     @property
     def settled(self) -> bool:
@@ -132,6 +133,11 @@ class Since:
             parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
         elif self.changed:
             parts.append("the model was changed since")
+        if self.repeats:
+            parts.append(
+                f"{listed(self.repeats)} repeat one run: diagnose again to know how much of what "
+                "is left is noise"
+            )
         return "; ".join(parts)
 
 
@@ -171,7 +177,23 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         changed=not same or params not in (None, dict(model.params)),
         reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
+        repeats=_new_repeats(workspace, diagnosis, usable),
     )
+
+
+def _new_repeats(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> tuple[str, ...]:
+    """Return the runs of one candidate that tell the noise, if a diagnosis did not know it."""
+    from grounded.diagnosis.ruler_words import open_noise
+
+    if not open_noise(diagnosis.prediction_error):
+        return ()
+    runs = dict[str, list[str]]()
+    for trial in workspace.task_trials():
+        if trial.candidate and trial.id in usable:
+            runs.setdefault(trial.candidate, []).append(trial.id)
+    seen = set(made_from(diagnosis).trials)
+    new = (tuple(same) for same in runs.values() if len(seen.intersection(same)) < 2 <= len(same))
+    return next(new, ())
 
 
 def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:

@@ -115,7 +115,7 @@ def _follows(
         logs = follow is not None and not now.history
         due = logs or _of_another_model(workspace, diagnosis, since)
         return DIAGNOSE if due or doubted(now, since, usable) else PROPOSE
-    if not since.settled and not _came_true(workspace, now, diagnosis):
+    if since.repeats or not (since.settled or _came_true(workspace, now, diagnosis)):
         return DIAGNOSE
     if now.asks_again and now.incumbent:
         return to_run(workspace, now.incumbent.candidate.id, "best")
@@ -218,6 +218,13 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
         then = another_trial(workspace, now)
         return to_plan(workspace) if then == PROPOSE else then
     return next_command(workspace, now, found, usable_ids(workspace))
+
+
+def left_open(found: Diagnosis) -> bool:
+    """Return whether a diagnosis leaves something that noise is not known to explain."""
+    from grounded.diagnosis.ruler_words import open_noise
+
+    return found.kind != "none" or bool(open_noise(found.prediction_error))
 
 
 def nothing_to_do(found: Diagnosis, best: str) -> str:

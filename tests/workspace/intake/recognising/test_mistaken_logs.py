@@ -13,6 +13,7 @@ from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
+from grounded_trials.workspace.intake.recognising import recognise
 from grounded_trials.workspace.intake.recognising.read_otherwise import misled
 from workspaces import make
 
@@ -242,6 +243,25 @@ def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), plan.id, "port and starboard 100", "in percent", "by 0.01")
+
+
+@pytest.mark.parametrize("crossed", [False, True])
+def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
+    w, tmp_path, monkeypatch, crossed
+):
+    """Its saturated commands showed samples of 5 ms, true were 12: the user looked for a timer."""
+    monkeypatch.setattr(recognise, "old_samples", lambda *_: ["samples 5 ms old"])
+    plan, path = w.propose().candidate, tmp_path / "run.csv"
+    model = w.base_model
+    wired = replace(
+        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
+    )
+    ran = Plant(wired if crossed else model).run(plan.policy, {}, RNG)
+    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs])
+    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
+    found = w.ingest(path)
+    assert (found.then.verb == "discard") == crossed
+    assert ("samples 5 ms old" in found.notes) != crossed
 
 
 def test_a_run_with_exchanged_commands_names_them(w, tmp_path):

@@ -203,7 +203,7 @@ def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
     for candidate in ("c0001", "c0002"):
         short = said_to_have_run("", ran, tmp_path / f"{candidate}.mcap", 20, nudge=1e-9)
         found = w.ingest(short, candidate=candidate)
-        (said,) = [one for one in found.warnings if "after 20 of 40 steps" in one]
+        (said,) = [one for one in found.warnings if "20 of 40 steps" in one]
         assert f"`discard {found.trial}`" in said
         assert ("ran to the end before" in said) == (candidate == "c0001")
         assert found.verdict == "crashed" or candidate == "c0001"

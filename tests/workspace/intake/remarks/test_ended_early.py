@@ -40,6 +40,21 @@ def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
     assert w.status().then.verb != "discard"
 
 
+def test_a_state_without_values_in_a_log_that_goes_on_is_named(tmp_path):
+    """A camera lost its ball: "the log ends after 45 of 175 steps", though the rest was logged."""
+    w, policy = waiting(tmp_path)
+    log = record(w, tmp_path / "a.csv", policy, 0.7)
+    header, *rows = log.read_text().splitlines()
+    x, cut = header.split(",").index("x"), round(len(rows) * 0.55)
+    lost = [row.split(",") for row in rows[cut:]]
+    for row in lost:
+        row[x] = ""
+    log.write_text("\n".join([header, *rows[:cut], *(",".join(row) for row in lost)]) + "\n")
+    (told,) = (one for one in w.ingest(log).warnings if "steps" in one)
+    assert holds(told, "as x has no values after that, though the log goes on", "sensor of x")
+    assert "log ends" not in told and "recording cut off" not in told
+
+
 def test_a_log_that_stays_set_aside_is_not_said_to_be_used(tmp_path):
     """It was "used as a run of c0001 again", and "does not count"."""
     w, policy = waiting(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import give_or_take
@@ -157,6 +158,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
         "unexplained far more. Repeat a run to know"
     )
     source = known.get(splits[main].irreducible_from, "the estimated noise")
+    rows = [row for row in rows if {*row[1:]} != {"-"}]
+    by_state = [row for row in by_state if not NOTHING.issuperset(row[1:])]  # left out of it
     cells = [row[1:] for row in [*rows, *by_state]]
     if NOTHING.issuperset(cell for row in cells for cell in row):
         return []
@@ -176,11 +179,12 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
             "too."
         )
     each = table("split-states", ("state", *header[1:]), by_state)
+    folded = Block("folded", f"By state, {named[main]} ahead", blocks=[each])
     return [
         Block("heading", "What the error is made of"),
         Block("text", words),
-        table("split", header, rows),
-        Block("folded", f"By state, {named[main]} ahead", blocks=[each]),
+        *[table("split", header, rows)] * bool(rows),
+        *[folded] * bool(by_state),
     ]
 
 
@@ -201,8 +205,10 @@ def _doubts(splits: Mapping[str, Split]) -> str:
 
 
 def _rest(diagnosis: Diagnosis) -> list[Block]:
-    """Whether what the effects leave is noise, by state."""
-    whiteness = diagnosis.where.whiteness
+    """Whether what the effects leave is noise, by state, without those that were left out."""
+    where = diagnosis.where
+    known = {one.name for one in where.channels if math.isfinite(one.rms)}
+    whiteness = {name: p for name, p in where.whiteness.items() if not known or name in known}
     if not whiteness:
         return []
     rows = [

@@ -235,7 +235,7 @@ def _probability(findings: Findings) -> float:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    from grounded.search.certainty import owed_to_start
+    from grounded.search.certainty import owed_to_start, share_of_cost
 
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
@@ -243,12 +243,12 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
     if first is not None and best is not None and not same:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
-            share = 1 - best.utility / first.utility
-            gain = f": cost {'reduced' if share > 0 else 'raised'} by {percent(abs(share))}"
-            if _probability(findings) < SURE:
-                gain += ", which the scatter of repeats may explain"
             tried = {one.candidate.id: one for one in findings.history}
             two = tried[first.candidate.id], tried[best.candidate.id]
+            did = "reduced" if best.utility > first.utility else "raised"
+            gain = f": cost {did} by {share_of_cost(*two, findings.history)}"
+            if _probability(findings) < SURE:
+                gain = ": the scatter of repeats may explain the difference"
             if start := owed_to_start(*two, findings.history):
                 did = "reduced" if start > 0 else "raised"
                 by = f"{did} it by {percent(abs(start / first.utility))}"

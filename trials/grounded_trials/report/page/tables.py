@@ -110,7 +110,12 @@ def candidate_table(findings: Findings) -> list[Block]:
         Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
     ]
     why = legend("", [t.candidate.iteration for t in kept])
-    return [made, *[Block("soft", f"{why}.")] * bool(why), *more * bool(left)]
+    told = [
+        f"{words[:1].upper()}{words[1:]}."
+        for words in (why, findings.standing.less_in_log)
+        if words
+    ]
+    return [made, *(Block("soft", words) for words in told), *more * bool(left)]
 
 
 def error_table(findings: Findings) -> list[Block]:

@@ -4,5 +4,6 @@ Read `proposing.py` first (propose and status); `search_state.py` derives where 
 `standing_without.py` what single runs change in it. `handover.py` checks each candidate before it
 leaves, for `exporting.py` (other programs; `exported_files.py`: the formats) and `running.py` (the
 robot, or a simulated one).
-`first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks.
+`first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks;
+`standstill.py` finds where the robot stood in its logs.
 """

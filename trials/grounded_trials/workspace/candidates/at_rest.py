@@ -23,6 +23,7 @@ from grounded.places import integrals, true_values
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import per_second, with_unit
+from grounded_trials.workspace.candidates.standstill import STEADY, held_there, standstill
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import FILE
 
@@ -37,9 +38,6 @@ MOVED = 0.01  # fraction of the same by which a given input must differ to be re
 SETTLED = 10  # least steps over which a rest is tried
 SLOW = 0.05  # fraction of its range in the target that a state may move in that time
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
-STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
-LEAST = 3  # steps of it
-STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
 NEWTON, PROBE = 10, 1e-4  # iterations for a state at rest, difference for its slope
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
@@ -87,22 +85,23 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
     for memory_state, own in true_values(states, states[n:]).items():
         rate[own] = max(rate[own], moved[memory_state], key=abs)
+    told = np.abs(stands - given) > STILL * (1 + np.abs(stands))
+    told[n:] = True
+    if held_there(workspace, given, np.where(told, stands, given), rate):
+        return []
     k = int(np.argmax(np.abs(rate)))
-    other = {
-        name: to
-        for name, at, to in zip(units, given, stands, strict=True)
-        if name in names or abs(to - at) > STILL * (1 + abs(to))
-    }
+    other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
     before = dict(zip(units, given, strict=True))
     held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
     whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
     whole |= {name: f"{to:.4g}" for name, to in other.items()}
-    told = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
+    start = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
     return [
         f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
         f"{with_unit(f'{rate[k]:.3g}', per_second(units[states[k]]))}; after its end the runner "
-        "holds that input again. If the robot is at rest before the run, put what holds it into "
-        f"[task] of {FILE} and propose again (if not, just propose again): start = {{ {told} }}"
+        "holds that input again. If nothing but its inputs holds the robot before the run (no "
+        f"hand, no stop), put what does into [task] of {FILE} and propose again (if something else "
+        f"holds it, or it moves, just propose again): start = {{ {start} }}"
     ]
 
 
@@ -278,44 +277,14 @@ def _rest_of(model: Model, trial: Trial) -> dict[str, float]:
 
     Empty if it moves there, or rests where all of these are zero.
     """
-    steps = max(LEAST, round(STOOD / trial.dt))
-    x, u = trial.states[: steps + 1], trial.inputs[:steps]
-    if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
+    if (stand := standstill(model, trial)) is None:
         return {}
-    whole, sent = np.nan_to_num(np.ptp(trial.states, axis=0)), np.ptp(trial.inputs, axis=0)
+    at, held = stand.states, stand.inputs
+    whole = np.nan_to_num(np.ptp(trial.states, axis=0))
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
-    fastest = np.abs(trial.states).max(axis=0)
-    off = np.where(rates, np.abs(x.mean(axis=0)), np.abs(drift(x)))
-    most = np.where(rates, fastest, whole)
-    if (off > STEADY * most).any() or not steady(u, sent).all():
-        return {}
-    at, held = np.median(x, axis=0), np.median(u, axis=0)
     a = model.system.linearise(at[None], held[None], model.values, trial.dt)[0][0]
     needed = np.abs(np.nan_to_num(a) - np.eye(model.n)).max(axis=0) > DEPENDS
     told = needed & ~rates & (np.abs(at) > STEADY * whole)
     found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
     inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
     return found | {n: v for n, v in inputs.items() if found and v}
-
-
-def steady(sent: Array, span: Array | float) -> Array:
-    """Return whether inputs (T,) or (T, m) neither drift nor scatter by more than `STEADY`.
-
-    The scatter is judged by its rms: a controller that holds a robot answers the noise of its
-    sensors, so that commands tremble by several times that around what holds it.
-
-    Args:
-        sent: the inputs.
-        span: their range in the whole log.
-    """
-    most = STEADY * np.asarray(span)
-    return np.asarray((np.abs(drift(sent)) <= most) & (sent.std(axis=0) <= most))
-
-
-def drift(values: Array) -> Array:
-    """Return the change from first to last of the straight line through values (T,) or (T, n)."""
-    steps = len(values)
-    if steps < 2:
-        return np.zeros(values.shape[1:])
-    t = np.arange(steps) - (steps - 1) / 2
-    return np.asarray(np.tensordot(t, values, axes=1) / (t**2).sum() * (steps - 1))

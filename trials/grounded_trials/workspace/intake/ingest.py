@@ -178,7 +178,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:
             warnings, wrong = (asked.said, *warnings), asked.aside
-    early = None if read.fell or aside or wrong else ended_early(workspace, trial)
+    early = None if read.fell or aside or wrong else ended_early(workspace, trial, read.silent)
     if early:
         said = (early.said,)  # after what is doubtful about the log, which may be why
         if early.aside and counts:
@@ -216,7 +216,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
-            *filter(None, [*read.notes, told]),
+            *filter(None, [*read.notes, *(() if odd or wrong else read.aged), told]),
             *(no_longer(workspace, added.id, now) if now and not added.known else ()),
             *(
                 odd_run(workspace, now, added.id, aside=bool(read.aside))

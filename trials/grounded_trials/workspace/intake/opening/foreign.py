@@ -39,6 +39,7 @@ from grounded_trials.workspace.read_before import hashed, read_by
 from grounded_trials.workspace.user_files.config import FILE
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
+SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
 FEW = 12  # largest number of a log's signals that a message lists
 
 
@@ -91,6 +92,16 @@ class ForeignLog:
             start_states=found.start_states if candidate else {},
         )
         return trial, found
+
+    def silent_from(self, ns: int) -> tuple[str, ...]:
+        """Return the states without a value from a time [ns] on, if others have some then."""
+        last = {
+            name: int(one.t[np.isfinite(one.values)].max(initial=0))
+            for name, one in self.series.items()
+        }
+        least, states = ns + round(1e9 * SILENT_S), self.workspace.base_model.states
+        on = any(end > least for end in last.values())
+        return tuple(name for name, end in last.items() if on and end < least and name in states)
 
     def refuse_late(self, found: Gridded) -> None:
         """Refuse a candidate's run if its beginning was not recorded.

@@ -52,6 +52,7 @@ class Read:
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
     notes: tuple[str, ...] = ()
+    aged: tuple[str, ...] = ()  # notes on the age of its samples, told if nothing else is wrong
     copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
@@ -66,6 +67,14 @@ class Read:
     def own(self) -> bool:
         """Whether it was written by grounded, in the model's units, and not read through [log]."""
         return self.log is None and not self.copy
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """The states without a value from the end of the trial on, though its log goes on."""
+        if self.log is None or self.cut is None:
+            return ()
+        ends = self.cut.start_ns + round(1e9 * self.trial.steps * self.trial.dt)
+        return self.log.silent_from(ends)
 
     @property
     def hole(self) -> str:

@@ -125,8 +125,7 @@ def recognised(
         unsure = filter(None, [loosely(found.loose_s, ran) if loose else "", doubtful(found, ran)])
         read = replace(read, warnings=(*read.warnings, *unsure))
     if look.old is not None:
-        aged = old_samples(workspace, own, whole, look.old)
-        read = replace(read, notes=(*read.notes, *aged))
+        read = replace(read, aged=tuple(old_samples(workspace, own, whole, look.old)))
     why, other = seen.why, seen.other
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task

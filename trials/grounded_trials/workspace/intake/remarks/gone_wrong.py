@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import NextCommand
+from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import like_predicted
 from grounded.search.returned.who_drove import LEAST
@@ -126,31 +127,39 @@ def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
     )
 
 
-def ended_early(workspace: Folder, trial: Trial) -> Asked | None:
+def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Asked | None:
     """Return what a run that ended early counts as, and what to do; None if it did not.
 
     Args:
         workspace: the workspace with the task and the candidates.
         trial: the trial as stored.
+        silent: states without a value in the rest of its log, where others have some.
     """
     task, run = workspace.task, interpolate_gaps(trial).trial
     if not run.candidate or run.steps >= task.horizon or run.whole(task.horizon) is not run:
         return None
     own, _ = workspace.candidate(run.candidate)
-    name, ends = own.id, f"after {run.steps} of {task.horizon} steps ({run.steps * run.dt:.2f} s)"
+    name, part = own.id, f"{run.steps} of {task.horizon} steps ({run.steps * run.dt:.2f} s)"
+    ends = f"all states are known for {part} only"
+    why = "Was the recording cut off, or the robot stopped?"
+    if silent:
+        has = "has" if len(silent) == 1 else "have"
+        ends += f", as {listed(silent)} {has} no values after that, though the log goes on"
+        why = (
+            f"Did the sensor of {listed(silent)} fail or lose the robot, or was the robot stopped?"
+        )
     complete = _complete(workspace, run)
     before = f"{name} ran to the end before ({complete}). " if complete else ""
     if as_before(task, own, run):
         return Asked(
-            f"the log ends {ends}, with the robot as near to its prediction as until then. {before}"
-            f"Was the recording cut off, or the robot stopped? Then `discard {run.id}`, run {name} "
-            f"again and record it to its end. If it crashed there, `propose` goes on: {name} "
-            "counts as failed"
+            f"{ends}; the robot was as near to its prediction there as before. {before}{why} Then "
+            f"`discard {run.id}`, run {name} again and record it to its end. If it crashed there, "
+            f"`propose` goes on: {name} counts as failed"
         )
     return Asked(
-        f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose. "
-        f"{before}Use `discard {run.id}` if you stopped it for another reason, or if only the "
-        "recording was cut off",
+        f"the run ended after {part}: a failed candidate; its data stay usable for fit and "
+        f"diagnose. {before}Use `discard {run.id}` if you stopped it for another reason, or if "
+        "only the recording was cut off",
         aside=False,
     )
 

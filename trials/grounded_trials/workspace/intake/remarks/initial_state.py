@@ -19,7 +19,10 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import in_digits_apart, with_unit
 from grounded_trials.workspace.candidates.standing_without import standing_without
+from grounded_trials.workspace.candidates.standstill import SAME, standstills
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import began_elsewhere
+from grounded_trials.workspace.user_files.config import FILE
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
 # without weight along the way, share of its range in the run
@@ -28,6 +31,7 @@ SURE = 3.0  # the start must also be off by this many std of sensor noise and of
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much
+ALWAYS = 3  # runs that begin alike, from which on they always do
 FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
 
 
@@ -65,6 +69,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     if not trial.candidate or trial.finite_steps < 0:
         return None
     off = task.model.difference(trial.began, task.start)
+    if always := _always_there(workspace, trial, off):
+        return Begun(always, again=False)
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     failed = len(states) <= trial.finite_steps
     usual = np.ptp(states, axis=0)
@@ -127,6 +133,43 @@ def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
     return (
         f"{name} = {with_unit(began, unit)}, the task's start is {start}: "
         f"{with_unit(f'{off:+.2g}', unit)}{turned} off"
+    )
+
+
+def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
+    """Return a warning if the robot never begins at a value that [task] start has; or "".
+
+    All other logs of runs, and of driving from a standstill, then begin where this run did. One in
+    which it stood is enough to show that, else `ALWAYS` runs are: two may begin alike by chance.
+
+    Args:
+        workspace: the workspace with the other logs.
+        trial: the run.
+        off: its first state less s_0 (n,).
+    """
+    task, given = workspace.task, workspace.config.task.start
+    others = [one for one in workspace.task_trials() if one.id != trial.id]
+    began = {one.id: one.began for one in others if one.candidate}
+    stood = {one.trial: one.states for one in standstills(workspace) if one.trial not in began}
+    stood.pop(trial.id, None)
+    if not stood and len(began) + 1 < ALWAYS:
+        return ""
+    first = trial.began
+    apart = [task.model.difference(x, first) for x in (*began.values(), *stood.values())]
+    same = np.all(np.abs(apart) <= SAME * np.abs(off), axis=0).tolist()
+    predicted = workspace.candidate(trial.candidate)[0].predicted_states
+    clearly = began_elsewhere(task, [trial.until(task.horizon)], predicted)
+    names = task.model.state_names
+    odd = [i for i, name in enumerate(names) if same[i] and name in clearly and name in given]
+    if not odd:
+        return ""
+    whole = {**given, **{names[i]: float(first[i]) for i in odd}}
+    start = ", ".join(f"{name} = {value:.4g}" for name, value in whole.items())
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in odd)
+    return (
+        f"the run started with {where}, and so did {listed([*stood, *began])}. "
+        f"If the robot always starts there, write start = {{ {start} }} in [task] of {FILE} and "
+        "propose again: the search begins again, and all logs stay for fit and diagnose"
     )
 
 
