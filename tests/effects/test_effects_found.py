@@ -96,7 +96,6 @@ CASES = [
     (car, Truth(ahead=0.12), "lever_arm:x+y", {"a": 0.12, "b": 0.0}),
     (car, Truth(right=0.7), "input_curve:steer", {"a": 0.3 / 1.7, "b": 0.0}),  # beside a gain
     (towed, Truth(under=0.1), "understeer:psi", {"k": 0.1}),
-    (towed, Truth(grip=2.5), "grip_limit:psi", {"a": 2.5}),
 ]
 
 
