@@ -102,7 +102,7 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "truth", "effect", "values"), CASES, ids=lambda c: str(c)[:40])
 def test_the_cause_is_found_with_its_size(model, truth, effect, values):
-    found = gr.diagnose(model, driven(model, truth))
+    found = gr.diagnose(model, driven(model, truth, count=3))
     assert found.ranking[0].effect == effect and found.ranking[0].claimed
     for name, value in values.items():
         assert found.ranking[0].params[name].value == pytest.approx(value, rel=0.1, abs=0.02)
