@@ -20,10 +20,16 @@ EXTRAS = {
     "studies": "joblib",
     "cluster": "distributed",
 }
+# Files with tests of more than 20 s: they go first, so that no worker waits at the end for one.
+LONG = ("test_notebooks", "test_diagnosis_real", "test_drive", "test_docs", "test_diagnosis_tuning")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "extra(*names): skipped where such an extra is missing")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in LONG)  # the others stay in their order
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

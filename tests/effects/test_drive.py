@@ -104,7 +104,7 @@ def test_the_loss_of_a_wheel_turns_the_robot():
     assert after == pytest.approx(more, abs=1e-6)
 
 
-def driven(seed, dry, steps=400, parts=10):
+def driven(seed, dry, steps=250, parts=10):
     """A run of the real rover [V]: dry friction of each wheel, 4.4 kg for 4, 0.135 kg m^2."""
     rng, model = np.random.default_rng(seed), rover.with_values({"m": 4.4, "I": 0.135})
     f, phase = rng.uniform(1.2, 5.0, (2, 3)), rng.uniform(0, 6.28, (2, 3))

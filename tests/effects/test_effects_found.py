@@ -96,14 +96,13 @@ CASES = [
     (car, Truth(ahead=0.12), "lever_arm:x+y", {"a": 0.12, "b": 0.0}),
     (car, Truth(right=0.7), "input_curve:steer", {"a": 0.3 / 1.7, "b": 0.0}),  # beside a gain
     (towed, Truth(under=0.1), "understeer:psi", {"k": 0.1}),
-    (towed, Truth(grip=2.5), "grip_limit:psi", {"a": 2.5}),
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "truth", "effect", "values"), CASES, ids=lambda c: str(c)[:40])
 def test_the_cause_is_found_with_its_size(model, truth, effect, values):
-    found = gr.diagnose(model, driven(model, truth))
+    found = gr.diagnose(model, driven(model, truth, count=3))
     assert found.ranking[0].effect == effect and found.ranking[0].claimed
     for name, value in values.items():
         assert found.ranking[0].params[name].value == pytest.approx(value, rel=0.1, abs=0.02)

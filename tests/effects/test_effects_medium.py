@@ -274,7 +274,7 @@ SEA = [
 @pytest.mark.parametrize(("truth", "name"), SEA, ids=lambda v: v if isinstance(v, str) else "")
 def test_the_cause_is_found_with_its_size(truth, name):
     """Of a boat whose drag is not known either."""
-    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(**truth))
+    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(**truth, steps=100))
     first = found.ranking[0]
     assert found.verdict.effects == (name,) and first.effect == name and first.claimed
     (size,) = truth.values()
@@ -284,5 +284,5 @@ def test_the_cause_is_found_with_its_size(truth, name):
 
 @pytest.mark.slow
 def test_none_is_claimed_in_still_water():
-    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven())
+    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(steps=100))
     assert not {n for n in found.verdict.effects if n.startswith(("current", "push_world"))}

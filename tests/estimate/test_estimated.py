@@ -64,9 +64,9 @@ def test_a_car_that_runs_away_ends_its_trial(filmed, policy):
 
 @pytest.mark.slow
 def test_the_search_learns_from_estimated_states(monkeypatch):
-    for name, value in {"BUDGET": 6, "FRESH": 2, "NAMES": ("circle",)}.items():
+    for name, value in {"BUDGET": 4, "FRESH": 2, "NAMES": ("circle",)}.items():
         monkeypatch.setattr(estimated, name, value)
-    monkeypatch.setattr(estimated, "DRIVING", 20.0)
+    monkeypatch.setattr(estimated, "DRIVING", 10.0)
     result = estimated.run([0], manoeuvres=("circle",))
     document = json.loads(json.dumps(result.to_json(), allow_nan=False))
     camera, true = (result.of("circle", way)[0] for way in estimated.WAYS)

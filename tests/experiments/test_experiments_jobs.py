@@ -201,7 +201,7 @@ def runs_of(model, count, steps):
 def test_a_fit_and_a_diagnosis_on_a_cluster_give_the_same_bits(cluster, tmp_path, monkeypatch):
     (tmp_path / "lag.py").write_text(LAG)  # as in a workspace: no worker can import it
     model = load_module(tmp_path, "lag.py").model
-    trials, engine = runs_of(model, 20, 150), Engine(name="dask", address=cluster[0])
+    trials, engine = runs_of(model, 12, 100), Engine(name="dask", address=cluster[0])
     monkeypatch.setattr(sys.modules["grounded.fit.point"], "SMALL", 0)
     one, many = (fit(model, trials, engine=e) for e in (None, engine))
     assert one.to_json() == many.to_json() and one.loglik == many.loglik

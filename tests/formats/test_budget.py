@@ -37,8 +37,11 @@ def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in BOMBS if name not in QUICK])
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
-    """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9)."""
-    told = {what: cost.wrong for what, cost in explode(name, tmp_path).items()}
+    """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9).
+
+    A budget of 1 s in place of 3 s, so that these take less of a CI's time.
+    """
+    told = {what: cost.wrong for what, cost in explode(name, tmp_path, budget_s=1.0).items()}
     assert not any(told.values()), told
 
 

@@ -21,5 +21,5 @@ def test_a_little_of_each_attack_breaks_nothing(name: str, seconds: float) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kills", "short writes", "crowds"])
 def test_commands_that_are_attacked_break_nothing(name: str) -> None:
-    tally = ATTACKS[name][1](random.Random(5), 15)
+    tally = ATTACKS[name][1](random.Random(5), 6)
     assert tally.failures == [] and tally.tries > 0

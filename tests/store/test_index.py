@@ -105,7 +105,7 @@ def test_flipped_bytes_of_the_index_never_change_an_answer(indexed):
     answer = Workspace(w.folder).status().to_json()
     data, rng = file.read_bytes(), np.random.default_rng(0)
     (utility,) = {repr(t.utilities[0]) for t in w.status().standing.history[:1]}
-    for place in (data.index(utility.encode()) + 2, *rng.integers(0, len(data), 12).tolist()):
+    for place in (data.index(utility.encode()) + 2, *rng.integers(0, len(data), 6).tolist()):
         file.write_bytes(data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
         assert Workspace(w.folder).status().to_json() == answer, place
 

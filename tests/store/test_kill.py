@@ -106,7 +106,7 @@ def test_caches_reports_and_the_place_do_not_matter(tmp_path, undisturbed):
         found = (moved / "candidates" / "c0003.mcap").read_bytes()
         expected = expected or found
         assert found == expected and str(tmp_path).encode() not in found
-        status = process("status", "--json", cwd=moved, GROUNDED_CACHE=str(cache)).json
+        status = grounded("-C", moved, "status", "--json").json
         assert status["trials"] == 2 and status["outstanding"] == "c0003"
     assert expected == (undisturbed / "candidates" / "c0003.mcap").read_bytes()
 

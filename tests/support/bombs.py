@@ -21,6 +21,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from grounded.trial import Trial
+from grounded_trials.formats.budget import SECONDS
 from grounded_trials.formats.mcap_records import CHUNK
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.store.trial_file import trial_bytes
@@ -247,16 +248,17 @@ class Cost:
     peak_mb: float
     text: str  # of both outputs
     size_mb: float = 0.0  # of the file that it read
+    budget_s: float = 3.0  # of CPU time, for an empty file
 
     @property
     def wrong(self) -> str:
         """Return why this is not a clean end, or "": no traceback, under 500 MB, and in time.
 
-        The time allowed is the budget (3 s, and 1 s per MB) and 4 s to start and end.
+        The time allowed is the budget (and 1 s per MB) and 4 s to start and end.
         """
         if "Traceback" in self.text or self.exit not in (0, 1, 3):
             return f"exit {self.exit}: {self.text[-300:]}"
-        allowed = 7.0 + self.size_mb
+        allowed = self.budget_s + 4.0 + self.size_mb
         slow = self.cpu_s > allowed and self.cpu_s > allowed * slowness()
         over = slow or self.peak_mb > 500 or len(self.text) > 20_000
         took = f"{self.cpu_s:.1f} s, {self.peak_mb:.0f} MB, {len(self.text)} letters"
@@ -307,7 +309,7 @@ def measured(
         return Cost(child.returncode, used.ru_utime + used.ru_stime, mb, text)
 
 
-def explode(name: str, folder: Path) -> dict[str, Cost]:
+def explode(name: str, folder: Path, budget_s: float = 3.0) -> dict[str, Cost]:
     """Read, inspect and recover a bomb that is built in its own process."""
     here = Path(__file__).parent
     make = (
@@ -318,14 +320,14 @@ def explode(name: str, folder: Path) -> dict[str, Cost]:
     assert made.exit == 0, made.text
     path = str(folder / "bomb.mcap")
     size = Path(path).stat().st_size / 1e6
-    saved = folder / "saved.mcap"
+    saved, env = folder / "saved.mcap", {SECONDS: str(budget_s)}
     costs = {
-        "read": measured([path, (BOMBS | LONG)[name][1]], _READ),
-        "inspect": measured(["inspect", path]),
-        "recover": measured(["recover", path, "-o", str(saved)]),
+        "read": measured([path, (BOMBS | LONG)[name][1]], _READ, env=env),
+        "inspect": measured(["inspect", path], env=env),
+        "recover": measured(["recover", path, "-o", str(saved)], env=env),
     }
     saved.unlink(missing_ok=True)
-    return {what: replace(cost, size_mb=size) for what, cost in costs.items()}
+    return {what: replace(cost, size_mb=size, budget_s=budget_s) for what, cost in costs.items()}
 
 
 def main() -> None:

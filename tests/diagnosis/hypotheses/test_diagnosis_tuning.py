@@ -56,7 +56,7 @@ def test_frictions_are_compared_at_the_width_that_each_needs():
     assert row.fixed["width"] == pytest.approx(0.02, rel=0.5)
 
 
-def carts(width, trials=3, steps=150):
+def carts(width, trials=2, steps=120):
     """A cart with a hanging pole that a dry friction of 1 N opposes, and its crude model."""
 
     def rates(s, a, p, friction):

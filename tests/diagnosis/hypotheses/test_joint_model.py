@@ -46,7 +46,7 @@ def of_all_joints(model, trials, alone=False):
 
 
 def test_friction_and_inertia_of_every_joint_are_found_at_once():
-    values = of_all_joints(arm, real_trials(c=C, J=J))
+    values = of_all_joints(arm, real_trials(count=2, c=C, J=J))
     for pair, dry, more in zip(PAIRS, C, J, strict=True):
         assert values[f"joint_friction:{pair}"]["c"] == pytest.approx(dry, rel=0.1)
         assert values[f"added_inertia:{pair}"]["J"] == pytest.approx(more, rel=0.1)
@@ -54,7 +54,7 @@ def test_friction_and_inertia_of_every_joint_are_found_at_once():
 
 
 def test_joints_that_are_as_modelled_are_left_out():
-    values = of_all_joints(arm, real_trials(c=C, J=(J[0], 0.0)))
+    values = of_all_joints(arm, real_trials(count=2, c=C, J=(J[0], 0.0)))
     inertia, *frictions = f"added_inertia:{PAIRS[0]}", *(f"joint_friction:{p}" for p in PAIRS)
     assert set(values) == {inertia, *frictions}
 
@@ -83,7 +83,7 @@ def late_by_a_step():
         replace(trial, inputs=np.vstack([trial.inputs[1:], trial.inputs[-1:]])).until(
             trial.known_steps - 1
         )
-        for trial in real_trials(c=C, J=J)
+        for trial in real_trials(count=2, c=C, J=J)
     ]
 
 
@@ -111,7 +111,7 @@ def test_a_single_joint_has_no_such_start():
 
 
 def test_a_search_grows_from_all_joints_where_no_effect_alone_is_nearly_as_likely(monkeypatch):
-    data = prepare(arm, real_trials(c=C, J=J))
+    data = prepare(arm, real_trials(count=2, c=C, J=J))
     offered = Library().candidates(arm, data.scales)
     candidates = [e for e in offered if e.family.name in OF_JOINTS]
     joints = Library().joints(arm, data.scales)

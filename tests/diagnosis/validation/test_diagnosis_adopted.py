@@ -403,7 +403,7 @@ def seen_late(trials=3, steps=260):
 @pytest.mark.slow
 def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_still_seen():
     """Adopting exactly what was claimed made predictions worse than model.py, and a new cause."""
-    model, runs = seen_late()
+    model, runs = seen_late(steps=180)
     first = diagnose(model, runs)
     assert first.effects == ("sensor_delay:x+v",)
     (told,) = (f for f in first.preflight if f.kind == "lag")

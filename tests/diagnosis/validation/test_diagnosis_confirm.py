@@ -263,7 +263,7 @@ def test_noise_can_not_hide_what_predicts_far_better(wavy):
 
 @pytest.mark.slow
 def test_one_long_log_is_held_out_by_pieces():
-    model, trials = axis(WAVE, trials=1)
+    model, trials = axis(WAVE, trials=1, steps=300)
     data = prepare(model, trials, np.zeros(1))
     assert len(np.unique(folds(data))) == 5
     found = diagnose(model, trials)

@@ -74,10 +74,8 @@ def driven(tmp_path_factory):
     "names, factor",
     [
         ("x y u", 0.8),  # a wheel that is larger than the program believes
-        ("u", 1.3),
         ("psi r", -1.0),  # an IMU that is mounted upside down
         ("r", 2.5),  # its turn was said to be in degrees
-        ("psi r", 0.7),
         ("x y psi u r", 1.2),
         ("drive turn", 1e3),  # in mV, both
     ],

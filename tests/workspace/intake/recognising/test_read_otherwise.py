@@ -33,8 +33,7 @@ def refused(w, log):
     return error.value
 
 
-@pytest.mark.parametrize("by", [0.4, -0.4])
-@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize(("before", "by"), [(0.0, 0.4), (1.0, -0.4)])
 def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, before):
     def moved(table):
         table[:, 1] += by
