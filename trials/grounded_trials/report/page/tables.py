@@ -150,7 +150,11 @@ def forecast_table(findings: Findings) -> list[Block]:
         each = zip(names, errors, strict=True)
         rows = [(*name, *(figure(float(v), 3) for v in values)) for name, values in each]
         made = table("forecasts", ("trial", "model ", *states), rows)
-    return [title, made]
+    words = (
+        "These predictions start from measured states and are not held out. The diagnosis predicts "
+        "from filtered states, in all of its trials, so its errors differ."
+    )
+    return [title, made, *[Block("soft", words)] * (findings.diagnosis is not None)]
 
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
