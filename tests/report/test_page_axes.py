@@ -36,6 +36,7 @@ from grounded_trials.report.figures.runs import (
 )
 from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.page import tables
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
 from grounded_trials.report.reporting import Report
@@ -184,12 +185,27 @@ def test_many_logs_are_rows_of_the_table_of_forecasts(cart, logs, states_first):
     few = replace(findings, runs=(), logs=data, better=None)
     _, made, *_ = forecast_table(few)
     states = findings.task.model.states
-    assert len(made.header) == (2 + logs if states_first else 2 + len(states))
+    assert len(made.header) == (2 + logs if states_first else 1 + len(states))
     assert len(made.rows) == (len(states) if states_first else logs)
     assert all(len(row) == len(made.header) for row in made.rows)
     _, single, *_ = forecast_table(replace(few, logs=data[:1]))
     of_first = [row[2] for row in single.rows]
-    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][2:]))
+    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][1:]))
+
+
+@pytest.mark.parametrize(("most", "header"), [(6, ("trial",)), (3, ("trial", "model "))])
+def test_errors_of_two_models_stand_side_by_side_if_there_is_room(cart, most, header, monkeypatch):
+    monkeypatch.setattr(tables, "MOST_COLUMNS", most)
+    model = gather(Folder(cart)).task.model
+    errors = [np.array([k, 10.0 * k]) for k in range(1, 5)]
+    made = tables._of_trials(("t1", "t2"), ("crude", "better"), errors, model)
+    assert made.header[: len(header)] == header
+    assert list(made.rows) == (
+        [("t1", "1.00", "2.00", "10.0", "20.0"), ("t2", "3.00", "4.00", "30.0", "40.0")]
+        if most == 6
+        else [("t1", "crude", "1.00", "10.0"), ("t1", "better", "2.00", "20.0"),
+              ("t2", "crude", "3.00", "30.0"), ("t2", "better", "4.00", "40.0")]
+    )  # fmt: skip
 
 
 def test_inputs_far_from_their_limits_are_drawn_without_them(cart):

@@ -588,6 +588,10 @@ def test_a_crash_is_marked_where_it_happened(car):
     cut = replace(short, trial=replace(run.trial, states=states[:20], inputs=run.trial.inputs[:19]))
     (same,) = path_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels[0].dots
     assert same.note == cross.note  # its log ends there: it ended "after 0.95 s of 0.95 s"
+    for panel in error_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels:
+        (mark,) = panel.dots  # as in the figures of states
+        (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
+        assert mark.shape == "cross" and mark.y == off[19]
 
 
 def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):

@@ -203,7 +203,11 @@ def _unsure(split: Split, parts: Parts | ChannelParts) -> bool:
 
 def _doubts(splits: Mapping[str, Split]) -> str:
     """Up to how many times the noise errors may be noise: 1.3, more where repeats are few."""
-    unsure = [s for s in splits.values() if any(_unsure(s, p) for p in (s.whole, *s.channels))]
+    unsure = [
+        one
+        for one in splits.values()
+        if _unsure(one, one.whole) or any(_unsure(one, state) for state in one.channels)
+    ]
     factors = [doubt_of(one.irreducible_unsure) for one in unsure]
     ends = dict.fromkeys(f"{factor:.2g}" for factor in (min(factors), max(factors)))
     return f"{' to '.join(ends)} times its estimate{', by horizon,' * (len(ends) > 1)}"
