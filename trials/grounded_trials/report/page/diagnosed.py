@@ -9,6 +9,7 @@ from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays
+from grounded.diagnosis.validation.agreement import APART
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
@@ -101,7 +102,8 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     each = table("per-trial", header, rows, strong)
     words = (
         "Linear estimates from one trial each, all other values held. A trial that hardly shows an "
-        "effect may give a value that is not possible, with a large standard deviation."
+        "effect may give a value that is not possible, with a large standard deviation. Trials "
+        f"agree if they scatter by at most {percent(APART)} of the value more than their ± tells."
     )
     blocks = [Block("soft", words), each]
     return [Block("folded", "Trial by trial", blocks=blocks, wide=bool(strong))]

@@ -165,6 +165,7 @@ def _of_trials(
 ) -> Block:
     """Return a row for each trial with its models side by side, or one for each model of many."""
     states = [labelled(name, shown(unit)) for name, unit in model.states.items()]
+    names: list[tuple[str, ...]]
     columns = np.reshape(errors, (len(trials), len(planners), model.n))
     if len(planners) * model.n > MOST_COLUMNS:
         header = ("trial", "model ", *states)
