@@ -9,18 +9,23 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.tables import larger
+from grounded.diagnosis.tables import larger, weighed_beside
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import figure, measured, measured_alike, number, percent, shown
+from grounded.result import figure, listed, measured, measured_alike, number, percent, shown
 
 MOST = 12  # bars
 BEFORE = "before these causes"  # also where they were adopted since, or others before
+ALL = "with all causes"
 APART = 0.01  # relative difference of errors below which curves coincide
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
-SHOWS = 1.02  # ratio of errors without and with a cause from which bars show its worth
+SHOWS = 1.02  # ratio of errors, such as without and with a cause, from which bars show it
 SPARED = "All but: with every cause of this diagnosis except one, fitted again."
 OFFSET = f" Where such a bar is longer than that of the model {BEFORE}, causes offset each other."
+SHORTER = (
+    " A cause is claimed for the mean over all states and horizons. If predictions of one state "
+    "are better without it, its bar is shorter than that of all."
+)
 CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
@@ -152,7 +157,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
-    caption = (SPARED + OFFSET * _longer(panels[1:])) * (len(panels) > 1 and len(credit) > 1)
+    caption = _all_but(panels[1:]) * (len(credit) > 1)
     return Figure("credit", "What each is worth", caption, tuple(panels))
 
 
@@ -184,26 +189,22 @@ def worth_figure(
         else:
             hidden.append(credit.of)
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
-    known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
-    caption = (SPARED + OFFSET * _longer(panels)) * (len(diagnosis.credit) > 1)
-    caption += (
-        " A cause is claimed for the mean over all states and horizons. If predictions of one "
-        "state are better without it, its bar is shorter than that of all."
-    ) * any(0 < loss < 1 for loss in known)
+    caption = _all_but(panels) * (len(diagnosis.credit) > 1)
     caption += (
         f" The improvement by {', '.join(hidden)} shows at other horizons, in no state 1 s ahead."
     ) * bool(hidden)
     return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
 
 
-def _longer(panels: Sequence[Bars]) -> bool:
-    """Check whether a bar of all but one cause is longer than that of the model before them."""
+def _all_but(panels: Sequence[Bars]) -> str:
+    """What the bars of all causes but one say where they are unusually long or short."""
+    longer = shorter = False
     for panel in panels:
         by = {bar.label: bar.value for bar in panel.bars}
         without = [value for name, value in by.items() if name.startswith("all but")]
-        if max(without, default=0.0) > by.get(f"model {BEFORE}", math.inf):
-            return True
-    return False
+        longer |= max(without, default=0.0) > SHOWS * by.get(f"model {BEFORE}", math.inf)
+        shorter |= SHOWS * min(without, default=math.inf) < by.get(ALL, 0.0)
+    return (SPARED + OFFSET * longer + SHORTER * shorter) * bool(panels)
 
 
 def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
@@ -237,7 +238,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows = [((MODELS["outset"][0], "model.py, nothing adopted"), error.outset)]  # {} if it is so
     rows += [(("model", f"model {said}"), error.crude)]
     if diagnosis.credit:  # else nothing was found: the same error once more
-        rows += [(("best", "with all causes"), error.with_effects)]
+        rows += [(("best", ALL), error.with_effects)]
     if len(diagnosis.credit) > 1:  # without the only one, it is the model before
         rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
@@ -291,17 +292,30 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
         panels.append(Bars("Evidence for an effect [nats]", _ranking(diagnosis)))
     if not panels:
         return None
-    caption = (
-        "Evidence is the gain in log-likelihood less a price for parameters. Blue: the loss "
-        "without a claimed effect, 3 nats or more. Grey: the gain of another effect alone, in "
-        "place of the claimed ones; below 0, it is not worth its parameters."
-    )
-    if by_channel:
-        more = f"Beside a channel's share: the model's prediction error{_ahead(diagnosis)}."
-        caption = f"{caption} {more}"
     located = by_channel or by_time or by_region
+    caption = "Shares are of the squared one-step errors beyond the noise." * bool(located)
+    if by_channel:
+        caption += f" Beside a channel's share: the model's prediction error{_ahead(diagnosis)}."
+    if diagnosis.ranking:
+        caption += f" {_evidence_words(diagnosis)}"
     title = "Where the gap is" if located else "Effects compared"
-    return Figure("gap", title, caption, tuple(panels))
+    return Figure("gap", title, caption.strip(), tuple(panels))
+
+
+def _evidence_words(diagnosis: Diagnosis) -> str:
+    """What the lengths and colours of the bars of evidence mean."""
+    beside = weighed_beside(diagnosis) - {*diagnosis.effects}
+    tied = listed([r.effect for r in diagnosis.ranking[:MOST] if r.effect in beside])
+    words = "Evidence is the gain in log-likelihood less a price for parameters. "
+    if diagnosis.effects:
+        words += "Blue: the loss without a claimed effect, 3 nats or more. "
+    words += "Grey: the gain of another effect alone"
+    if diagnosis.effects:
+        words += ", in place of all claimed ones, so compare it with other grey bars only"
+    words += "; below 0, it is not worth its parameters."
+    return words + f" {tied}: beside the other claimed effects, in place of a tied one." * bool(
+        tied
+    )
 
 
 def _ahead(diagnosis: Diagnosis) -> str:

@@ -342,7 +342,7 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
     named, texts, again = parameters_off(claims), list[str](), dict[str, dict[str, str]]()
     for name in named[:NAMED]:
         old = params[name].value
-        change = 100 * (known[name].value - old) / abs(old) if old else 0.0
+        change = 100 * (known[name].value / old - 1) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
         beside += ended(known[name], old)
         part = f" ({', '.join(beside)})" * bool(beside)

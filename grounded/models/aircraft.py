@@ -42,15 +42,15 @@ def about(value: float, unit: str) -> Param:
 # yaw, so a fin and its derivatives are added: those values are marked "chosen".
 PARAMS: dict[str, Param] = {
     "mass": Param(1.0, "kg"),  # paper, footnote 13
-    "Jx": about(0.0818, "kg m2"),  # Zagi 0.1147, scaled
-    "Jy": about(0.0411, "kg m2"),  # Zagi 0.0576, scaled
-    "Jz": about(0.1221, "kg m2"),  # Zagi 0.1712, scaled
-    "Jxz": about(0.00107, "kg m2"),  # Zagi 0.0015, scaled
-    "S": Param(0.2879, "m2"),  # wing area: Zagi 0.2589 (1.5 / 1.4224)^2
+    "Jx": about(0.0818, "kg m^2"),  # Zagi 0.1147, scaled
+    "Jy": about(0.0411, "kg m^2"),  # Zagi 0.0576, scaled
+    "Jz": about(0.1221, "kg m^2"),  # Zagi 0.1712, scaled
+    "Jxz": about(0.00107, "kg m^2"),  # Zagi 0.0015, scaled
+    "S": Param(0.2879, "m^2"),  # wing area: Zagi 0.2589 (1.5 / 1.4224)^2
     "b": Param(1.5, "m"),  # span: paper, footnote 13
     "c": Param(0.3482, "m"),  # mean chord: Zagi 0.3302 (1.5 / 1.4224)
-    "rho": Param(1.2682, "kg/m3"),  # air density: Beard & McLain, Table E.1
-    "S_prop": Param(0.0314, "m2"),  # Zagi
+    "rho": Param(1.2682, "kg/m^3"),  # air density: Beard & McLain, Table E.1
+    "S_prop": Param(0.0314, "m^2"),  # Zagi
     "C_prop": about(1.0, "1"),  # Zagi
     "k_motor": about(20.0, "m/s"),  # Zagi
     "z_T": about(0.01, "m"),  # chosen: thrust line below the centre of mass
@@ -63,8 +63,8 @@ PARAMS: dict[str, Param] = {
     "M_s": about(50.0, "1"),  # sharpness of the stall: Zagi M
     "CD0": about(0.04171, "1"),  # Zagi: C_D0 0.01631 + C_Dp 0.0254
     "e_osw": about(0.9, "1"),  # Oswald's efficiency: Zagi
-    "CDde": about(0.3045, "1/rad2"),  # Zagi's C_Dde, used with the square (smooth)
-    "CDb": about(0.1, "1/rad2"),  # chosen: drag of sideslip
+    "CDde": about(0.3045, "1/rad^2"),  # Zagi's C_Dde, used with the square (smooth)
+    "CDb": about(0.1, "1/rad^2"),  # chosen: drag of sideslip
     "Cm0": about(-0.02338, "1"),  # Zagi
     "Cma": about(-0.5675, "1/rad"),  # Zagi
     "Cmq": about(-1.399, "1/rad"),  # Zagi

@@ -20,11 +20,13 @@ from grounded.places import integrals
 from grounded_trials import Workspace
 from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.logs.inspection.joint_names import from_base
+from grounded_trials.report.gathering import gather
 from grounded_trials.starting.begin import begin
-from grounded_trials.starting.first_toml import held_first
+from grounded_trials.starting.first_toml import _inline, _span, held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.candidates.exporting import void_exports
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import to_plan
 from grounded_trials.workspace.off_target import logged_target, rates_beside
 from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
@@ -324,6 +326,12 @@ def test_the_real_car_of_a_laboratory(tmp_path):
     assert not by["steering"].sure and len(by["steering"].others) == 1
 
 
+def test_an_input_that_is_held_at_its_largest_value_is_not_rounded_beyond_it():
+    """DART's throttle of 0.359677 was held at 0.3597, so that no command opened the workspace."""
+    held, (low, high) = _inline({"u": 0.3596774}), json.loads(_span((0.0, 0.3596774)))
+    assert low <= float(held.partition("= ")[2].removesuffix(" }")) <= high
+
+
 @pytest.mark.parametrize("name", ["flybag", "pitch-45bag", "roll2bag", "yx3bag"])
 def test_a_real_drone_s_commands_are_asked_for(tmp_path, name):
     """A Pose is abused for torques: no name says which, all that is commanded is offered."""
@@ -333,6 +341,7 @@ def test_a_real_drone_s_commands_are_asked_for(tmp_path, name):
     by = {g.name: g for g in found.states}
     assert by["x"].path.startswith("/vicon/") and not by["x"].sure
     assert not any(by[name].path or by[name].sure for name in ("vx", "vy", "vz"))
+    assert gather(Folder(tmp_path / "w")).then.verb == "inspect"  # was `target` in the report
 
 
 def test_a_robot_in_the_plane_without_commands(tmp_path):

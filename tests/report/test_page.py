@@ -7,7 +7,6 @@ import re
 import time
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from grounded.errors import NextCommand
 from grounded.model import Param
 from grounded_trials.report.findings import Improved, improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.diagnosed import _doubts, _made_of, _rest
+from grounded_trials.report.page.diagnosed import _made_of, _rest
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN, parameter_table
 from grounded_trials.report.report_text import report_text
@@ -456,7 +455,28 @@ def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     assert "0.280 to 0.320" not in text
 
 
+def _split_rows(irreducible_from, unexplained, irreducible):
+    parts = {"unexplained": unexplained, "irreducible": irreducible}
+    parts["explained"] = 1 - unexplained - irreducible
+    split = {"horizon_s": 1.0, "all": parts, "channels": [{"name": "x"} | parts]}
+    split |= {"irreducible_from": irreducible_from, "irreducible_unsure": 1.0}
+    _, text, all_states, _ = _made_of({"horizon": Split.from_json(split)})
+    return text.text, all_states.rows[0][1:]
+
+
+def test_the_parts_of_an_error_say_what_may_be_noise_without_two_signs_in_a_cell():
+    """`≤ < 0.1 %`, and `≥ < 0.1 %` in a column of noise "at most", said nothing."""
+    text, row = _split_rows("alike", 0.0003, 0.0002)
+    assert row == ("> 99.9 %", "< 0.1 %", "< 0.1 %") and "≤" not in text
+    text, row = _split_rows("alike", 0.06, 0.04)
+    assert row == ("90 %", "≤ 6.0 %", "10 %") and "≤" in text and "≥" not in text
+    text, row = _split_rows("repeats", 0.001, 0.0004)
+    assert row == ("99.9 %", "≤ 0.1 %", "≥ 0.0 %") and "≤ and ≥" in text
+    _, row = _split_rows("at most", 0.0003, 0.0002)  # unexplained, at least: < 0.1 %
+    assert row == ("> 99.9 %", "0.0 %", "< 0.1 %")
+
+
 def test_noise_that_is_zero_everywhere_breaks_no_page():
     """A diagnosis without a cause, of exact trials: the page died by the minimum of nothing."""
-    exact = SimpleNamespace(whole=SimpleNamespace(irreducible=0.0), irreducible_unsure=0.5)
-    assert float(_doubts({"x": exact})) > 1
+    text, row = _split_rows("repeats", 0.5, 0.0)
+    assert row == ("50 %", "50 %", "0.0 %") and "≤" not in text

@@ -11,7 +11,7 @@ from test_page import unwrapped
 
 from grounded.diagnosis.error_report import UtilityPrediction
 from grounded.diagnosis.pictures import where_figure
-from grounded.diagnosis.report import Diagnosis, Verdict
+from grounded.diagnosis.report import Diagnosis, Ranked, Verdict
 from grounded.figures.figure import Curve, log_ticks
 from grounded.figures.interactive import in_lines, notebook_figure
 from grounded.model import Model
@@ -36,6 +36,7 @@ from grounded_trials.report.figures.runs import (
 )
 from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.page import tables
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
 from grounded_trials.report.reporting import Report
@@ -92,8 +93,20 @@ def test_a_residual_is_drawn_over_its_own_input_if_another_only_moves_with_it(le
 def test_the_evidence_says_what_bars_below_zero_mean(cart):
     figure = where_figure(gather(Folder(cart)).diagnosis)
     assert "below 0, it is not worth its parameters" in figure.caption
+    assert "Shares are of the squared one-step errors" in figure.caption
     tall = [_rows(one) for one in (figure, replace(figure, caption=""))]
     assert tall[0] > tall[1]  # the picture has the caption, too
+
+
+def test_a_grey_bar_of_a_tied_effect_is_told_apart_from_those_of_effects_alone():
+    """Its evidence is beside the other claimed effects; other grey bars are longer than blue."""
+    rows = (("delay:u", 66.0, True), ("first_order_lag:u", 65.0, False), ("gain:u", 300.0, False))
+    ranking = tuple(Ranked(name, evidence, claimed=claimed) for name, evidence, claimed in rows)
+    verdict, alike = Verdict("effect", effects=("delay:u",)), ("delay:u", "first_order_lag:u")
+    tied = Diagnosis(verdict, ranking=ranking, indistinguishable=(alike,))
+    caption = where_figure(tied).caption
+    assert "first_order_lag:u: beside" in caption and "gain:u:" not in caption
+    assert "beside" not in where_figure(replace(tied, indistinguishable=())).caption
 
 
 def _rows(figure):
@@ -170,14 +183,29 @@ def test_many_logs_are_rows_of_the_table_of_forecasts(cart, logs, states_first):
         Log(replace(trial, id=f"d{k:02d}"), findings.runs[0].residual) for k in range(logs)
     )
     few = replace(findings, runs=(), logs=data, better=None)
-    _, made = forecast_table(few)
+    _, made, *_ = forecast_table(few)
     states = findings.task.model.states
-    assert len(made.header) == (2 + logs if states_first else 2 + len(states))
+    assert len(made.header) == (2 + logs if states_first else 1 + len(states))
     assert len(made.rows) == (len(states) if states_first else logs)
     assert all(len(row) == len(made.header) for row in made.rows)
-    _, single = forecast_table(replace(few, logs=data[:1]))
+    _, single, *_ = forecast_table(replace(few, logs=data[:1]))
     of_first = [row[2] for row in single.rows]
-    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][2:]))
+    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][1:]))
+
+
+@pytest.mark.parametrize(("most", "header"), [(6, ("trial",)), (3, ("trial", "model "))])
+def test_errors_of_two_models_stand_side_by_side_if_there_is_room(cart, most, header, monkeypatch):
+    monkeypatch.setattr(tables, "MOST_COLUMNS", most)
+    model = gather(Folder(cart)).task.model
+    errors = [np.array([k, 10.0 * k]) for k in range(1, 5)]
+    made = tables._of_trials(("t1", "t2"), ("crude", "better"), errors, model)
+    assert made.header[: len(header)] == header
+    assert list(made.rows) == (
+        [("t1", "1.00", "2.00", "10.0", "20.0"), ("t2", "3.00", "4.00", "30.0", "40.0")]
+        if most == 6
+        else [("t1", "crude", "1.00", "10.0"), ("t1", "better", "2.00", "20.0"),
+              ("t2", "crude", "3.00", "30.0"), ("t2", "better", "4.00", "40.0")]
+    )  # fmt: skip
 
 
 def test_inputs_far_from_their_limits_are_drawn_without_them(cart):

@@ -261,6 +261,21 @@ def test_a_forecast_of_a_wrong_model_parts_from_the_trial():
     assert 1e-6 < short < long
 
 
+def test_the_error_of_forecasts_is_taken_from_more_of_them_than_are_drawn():
+    """In a trial of 1.5 s one was drawn, whose end lay on the log by chance: an error of 0."""
+    task = pendulum_task(pendulum.model)
+    t = 0.02 * np.arange(76)
+    states = np.column_stack([np.where(np.abs(t - 1.0) < 1e-9, 0.0, 1.0), 0 * t])
+    names = (task.model.state_names, task.model.input_names)
+    trial = Trial(states, np.zeros((75, 1)), 0.02, *names)
+    few = forecast(Planner(task, task), trial)
+    many = forecast(Planner(task, task), trial, every=1)
+    assert [int((f.steps[:, -1] >= 0).sum()) for f in (few, many)] == [1, 26]
+    ends = task.model.difference(many.states[:26, -1], states[50:])
+    expected = np.sqrt(np.mean(ends**2, axis=0))
+    np.testing.assert_allclose(forecast_error(Planner(task, task), trial), expected)
+
+
 def test_forecasts_go_no_farther_than_the_diagnosis_could_judge():
     """Of a robot that falls without its feedback no model tells where it is after a second."""
     findings = many_flights(2)
@@ -360,6 +375,9 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     names += ["all but dead_zone:u", "noise alone"]
     assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
     assert "except one" in figure.caption and "offset" not in figure.caption
+    assert "shorter" not in figure.caption
+    needless = replace(dry, without_it={"x": 0.09, "v": 0.04})  # better without it than with all
+    assert "shorter" in credit_figure(replace(found, credit=(late, needless))).caption
     worse = replace(late, without_it={"x": 0.15, "v": 0.6})
     figure = credit_figure(replace(found, credit=(worse, dry)))  # longer than the model's
     assert "offset each other" in figure.caption
@@ -570,6 +588,10 @@ def test_a_crash_is_marked_where_it_happened(car):
     cut = replace(short, trial=replace(run.trial, states=states[:20], inputs=run.trial.inputs[:19]))
     (same,) = path_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels[0].dots
     assert same.note == cross.note  # its log ends there: it ended "after 0.95 s of 0.95 s"
+    for panel in error_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels:
+        (mark,) = panel.dots  # as in the figures of states
+        (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
+        assert mark.shape == "cross" and mark.y == off[19]
 
 
 def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):

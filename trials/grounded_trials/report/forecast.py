@@ -7,6 +7,7 @@ true value, as a filter tells it. All rollouts are simulated at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from grounded.solve.bias import residuals
 from grounded.trial import Trial
 
 SECONDS = 1.0
+STARTS = 500  # most rollouts of which an rms error is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +49,16 @@ class Forecast:
         return found
 
 
-def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Forecast | None:
+def forecast(
+    planner: Planner, trial: Trial, seconds: float = SECONDS, every: int = 0
+) -> Forecast | None:
     """Forecast a trial with the planner's model, restarted every `seconds`.
 
     Args:
         planner: planner of the crude model, or of one with effects.
         trial: the trial, of which the finite part is used.
-        seconds: time between two starts [s].
+        seconds: length of a rollout [s].
+        every: steps between two starts; 0: a rollout starts where the last one ends.
 
     Returns:
         The forecast; None if the trial has no complete step.
@@ -68,7 +73,7 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
     z = augmented(problem, lifted.states, lifted.inputs, past)
     received = problem.queue.effective(z[:-1], lifted.inputs)
     length = max(1, min(round(seconds / trial.dt), whole))
-    starts = np.arange(0, whole, length)
+    starts = np.arange(0, whole, every or length)
     x = lifted.states[starts]
     states, steps = [x[:, :n]], [starts]
     with np.errstate(all="ignore"):
@@ -132,8 +137,13 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
 
 
 def forecast_error(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Array:
-    """Return the rms error (n,) at the end of complete rollouts; NaN if none is complete."""
-    found, n = forecast(planner, trial, seconds), planner.task.model.n
+    """Return the rms error (n,) at the end of complete rollouts; NaN if none is complete.
+
+    They start at every step, of a long trial at every few: those that are drawn are too few, one in
+    a trial of 1.5 s, which may by chance end near the log.
+    """
+    every, n = math.ceil(max(trial.finite_steps, 1) / STARTS), planner.task.model.n
+    found = forecast(planner, trial, seconds, every)
     if found is None:
         return np.full(n, np.nan)
     ends = found.steps[:, -1]

@@ -26,6 +26,7 @@ from grounded_trials.report.forecast import anchored
 from grounded_trials.report.settled import settled_in
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adoptable import Better, better_model
+from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.proposing import uncounted, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder, Lost
@@ -74,7 +75,7 @@ def gather(workspace: Folder) -> Findings:
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=known_optimum(workspace.reports),
-        then=asked or next_command(workspace, now, diagnosis, usable),
+        then=asked or _next(workspace, now, diagnosis, usable),
         better=better,
         since=since,
         settled=settled_in(workspace, diagnosis, since),
@@ -95,6 +96,13 @@ def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
     names = {t.candidate.id for t in compared}
     latest = {t.id for t in trials[-MOST:]}
     return [t for t in trials if t.id in latest or t.candidate in names]
+
+
+def _next(
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: list[str]
+) -> NextCommand:
+    """Return the next command, as `status` does."""
+    return INSPECT if unmapped(workspace) else next_command(workspace, now, diagnosis, usable)
 
 
 def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextCommand | None]:

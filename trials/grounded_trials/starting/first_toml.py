@@ -179,4 +179,4 @@ def _span(ends: Sequence[float]) -> str:
 
 
 def _inline(values: Mapping[str, float]) -> str:
-    return "{ " + ", ".join(f"{key(name)} = {value:.4g}" for name, value in values.items()) + " }"
+    return "{ " + ", ".join(f"{key(name)} = {value:.6g}" for name, value in values.items()) + " }"

@@ -85,7 +85,7 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
     caption = (
         f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
         "inputs that were sent: where the lines differ by more than noise in the start makes of "
-        "it, the model is wrong. The diagnosis starts from filtered states, so its errors are less."
+        "it, the model is wrong."
     )
     names = better.planner.plan.model.state_names if better is not None else ()
     if true_values(names, names[findings.task.model.n :]):

@@ -53,12 +53,14 @@ def all_figures(findings: Findings) -> list[Figure]:
 def _distance(findings: Findings, axes: list[int]) -> Panel:
     """Draw the distance of the position from the desired one at the same time."""
     task = findings.task
-    curves = []
-    for role, run in compared(findings):
-        off = np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1)
-        curves.append(_over_time(off, task.dt, role, name_of(role, run)))
-    unit = task.model.states[task.model.state_names[axes[0]]]
-    return _timed("distance from the desired position", unit, curves, spare=50.0)
+    shown = compared(findings)
+    off = [np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1) for _, run in shown]
+    curves = [
+        _over_time(values, task.dt, role, name_of(role, run))
+        for values, (role, run) in zip(off, shown, strict=True)
+    ]
+    unit, marks = task.model.states[task.model.state_names[axes[0]]], _crashes(findings, off)
+    return _timed("distance from the desired position", unit, curves, spare=50.0, marks=marks)
 
 
 def state_figure(findings: Findings) -> Figure | None:
@@ -74,7 +76,8 @@ def state_figure(findings: Findings) -> Figure | None:
             for role, words, states in named_paths(findings)
             if role != "desired" or i in known
         ]
-        panels.append(_timed(name, unit, curves, marks=_crashes(findings, i)))
+        marks = _crashes(findings, [run.trial.states[:, i] for _, run in compared(findings)])
+        panels.append(_timed(name, unit, curves, marks=marks))
     return Figure("states", "States over time", "", tuple(panels), legend(panels))
 
 
@@ -89,14 +92,16 @@ def error_figure(findings: Findings) -> Figure | None:
         panels.append(_distance(findings, list(scene.axes)))
     for i in (i for i in reading_order(task) if i in tracked(task)):
         name, unit = list(task.model.states.items())[i]
+        off = [tracking_error(task, run.trial)[:, i] for _, run in shown]
         curves = [
-            _over_time(tracking_error(task, run.trial)[:, i], task.dt, role, name_of(role, run))
-            for role, run in shown
+            _over_time(values, task.dt, role, name_of(role, run))
+            for values, (role, run) in zip(off, shown, strict=True)
         ]
         _, run = shown[-1]
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
-        panels.append(_timed(f"{name} − target", unit, curves, spare=50.0))
+        marks = _crashes(findings, off)
+        panels.append(_timed(f"{name} − target", unit, curves, spare=50.0, marks=marks))
     caption = "Error of each run from its target, and from the model's prediction for that run."
     return Figure("error", "Tracking error", caption, tuple(panels), legend(panels))
 
@@ -174,14 +179,14 @@ def _held(values: Array, dt: float, role: str, name: str) -> Curve:
     return replace(curve, style="steps")
 
 
-def _crashes(findings: Findings, state: int) -> list[Dot]:
-    """Return crosses where compared runs ended early."""
+def _crashes(findings: Findings, drawn: Sequence[Array]) -> list[Dot]:
+    """Return crosses at the ends of the drawn values of compared runs that ended early."""
     dots = []
-    for role, run in compared(findings):
+    for values, (role, run) in zip(drawn, compared(findings), strict=True):
         last = crash(run)
         if last is not None:
             at, note = last * findings.task.dt, f"{name_of(role, run)} ended early"
-            dots.append(Dot(at, float(run.trial.states[last, state]), role, note, "cross"))
+            dots.append(Dot(at, float(values[last]), role, note, "cross"))
     return dots
 
 

@@ -10,6 +10,7 @@ from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays
+from grounded.diagnosis.validation.agreement import APART
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
@@ -34,6 +35,7 @@ from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import DIAGNOSE
 
 MOST = 6  # states whose error without each effect is drawn
+DIGITS = 3  # of a share, which is printed to 0.1 %
 WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
 ZERO = "0.0 %"
 NOTHING = {"-", ZERO}  # shares that say nothing
@@ -101,7 +103,8 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     each = table("per-trial", header, rows, strong)
     words = (
         "Linear estimates from one trial each, all other values held. A trial that hardly shows an "
-        "effect may give a value that is not possible, with a large standard deviation."
+        "effect may give a value that is not possible, with a large standard deviation. Trials "
+        f"agree if they scatter by at most {percent(APART)} of the value more than their ± tells."
     )
     blocks = [Block("soft", words), each]
     return [Block("folded", "Trial by trial", blocks=blocks, wide=bool(strong))]
@@ -154,8 +157,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     known = {"repeats": "the scatter of repeated trials"}
     known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
     known["at most"] = (
-        "one-step errors, which hold errors of the model too, so it may be far less, and what is "
-        "unexplained far more. Repeat a run to know"
+        "one-step errors, which hold errors of the model too, so it may be far less; then as much "
+        "more is unexplained. Repeat a run to know"
     )
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     rows = [row for row in rows if {*row[1:]} != {"-"}]
@@ -174,9 +177,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     )
     if any("≤" in cell for row in [*rows, *by_state] for cell in row):
         words += (
-            f" ≤ and ≥: the noise is not known well enough to tell errors of up to "
-            f"{_doubts(splits)} times its estimate from noise, so what is unexplained may be noise "
-            "too."
+            f" ≤{' and ≥' * (not bound)}: the noise is not known well enough to tell errors of up "
+            f"to {_doubts(splits)} from noise, so what is unexplained may be noise too."
         )
     each = table("split-states", ("state", *header[1:]), by_state)
     folded = Block("folded", f"By state, {named[main]} ahead", blocks=[each])
@@ -191,17 +193,30 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
 def _shares(split: Split, parts: Parts | ChannelParts) -> tuple[str, str, str]:
     shares = (parts.explained, parts.unexplained, parts.irreducible)
     explained, unexplained, noise = map(percent, shares)
-    if parts.unexplained > 0 and split.may_be_noise(parts):
-        return explained, f"≤ {unexplained}", f"≥ {noise}"
-    return explained, unexplained, noise
+    if split.irreducible_from == "at most":  # the column says "unexplained, at least"
+        return explained, percent(round(parts.unexplained, DIGITS)), noise
+    if not _unsure(split, parts):
+        return explained, unexplained, noise
+    if split.bound:  # the column says "noise, at most"
+        return explained, f"≤ {unexplained}", percent(parts.unexplained + parts.irreducible)
+    return explained, f"≤ {unexplained}", f"≥ {percent(round(parts.irreducible, DIGITS))}"
+
+
+def _unsure(split: Split, parts: Parts | ChannelParts) -> bool:
+    """Check whether what is unexplained can be seen in the table, and may be noise too."""
+    return round(parts.unexplained, DIGITS) > 0 and split.may_be_noise(parts)
 
 
 def _doubts(splits: Mapping[str, Split]) -> str:
     """Up to how many times the noise errors may be noise: 1.3, more where repeats are few."""
-    known = [one for one in splits.values() if one.whole.irreducible > 0] or [*splits.values()]
-    factors = [doubt_of(one.irreducible_unsure) for one in known]
+    unsure = [
+        one
+        for one in splits.values()
+        if _unsure(one, one.whole) or any(_unsure(one, state) for state in one.channels)
+    ]
+    factors = [doubt_of(one.irreducible_unsure) for one in unsure]
     ends = dict.fromkeys(f"{factor:.2g}" for factor in (min(factors), max(factors)))
-    return " to ".join(ends)
+    return f"{' to '.join(ends)} times its estimate{', by horizon,' * (len(ends) > 1)}"
 
 
 def _rest(diagnosis: Diagnosis) -> list[Block]:

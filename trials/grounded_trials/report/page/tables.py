@@ -9,10 +9,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
 from grounded.diagnosis.tables import undetermined, weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
+from grounded.frozen import Array
+from grounded.model import Model
 from grounded.result import listed
 from grounded.search.pictures import MOST, few
 from grounded_trials.report.findings import (
@@ -39,6 +43,7 @@ from grounded_trials.wording import (
 from grounded_trials.workspace.last_diagnosis import Since
 
 FEW = 4  # columns of errors from which the table of forecasts has a row for each trial instead
+MOST_COLUMNS = 6  # of errors beside a trial; more take a row for each model
 UNKNOWN = "–, not determined by these trials"
 
 
@@ -151,11 +156,34 @@ def forecast_table(findings: Findings) -> list[Block]:
         words = (f"{trial}, {name}" for trial, name in names)
         made = table("forecasts", ("state", "unit", *words), by_state(model, errors))
     else:  # many logs are rows: as columns they left the screen
-        states = (labelled(name, shown(unit)) for name, unit in model.states.items())
-        each = zip(names, errors, strict=True)
-        rows = [(*name, *(figure(float(v), 3) for v in values)) for name, values in each]
-        made = table("forecasts", ("trial", "model ", *states), rows)
-    return [title, made]
+        ids = [trial.id or trial.candidate for trial in trials]
+        made = _of_trials(ids, [words for words, _ in planners], errors, model)
+    note = (
+        "These predictions start from measured states and are not held out. The diagnosis predicts "
+        "from filtered states, in all of its trials, so its errors differ."
+    )
+    return [title, made, *[Block("soft", note)] * (findings.diagnosis is not None)]
+
+
+def _of_trials(
+    trials: Sequence[str], planners: Sequence[str], errors: Sequence[Array], model: Model
+) -> Block:
+    """Return a row for each trial with its models side by side, or one for each model of many."""
+    states = [labelled(name, shown(unit)) for name, unit in model.states.items()]
+    names: list[tuple[str, ...]]
+    columns = np.reshape(errors, (len(trials), len(planners), model.n))
+    if len(planners) * model.n > MOST_COLUMNS:
+        header = ("trial", "model ", *states)
+        names = [(trial, words) for trial in trials for words in planners]
+        cells = columns.reshape(len(names), -1)
+    else:
+        header = ("trial", *(f"{state}, {words}" for state in states for words in planners))
+        names = [(trial,) for trial in trials]
+        cells = columns.swapaxes(1, 2).reshape(len(names), -1)
+    rows = [
+        (*name, *(figure(float(v), 3) for v in row)) for name, row in zip(names, cells, strict=True)
+    ]
+    return table("forecasts", header, rows)
 
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
