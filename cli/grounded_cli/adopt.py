@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.result import listed
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import LABEL, field, number, remark, sentence, show, show_json
@@ -43,8 +44,8 @@ SCALED = (
     "from [model] effects, `discard` the trials and ingest their logs again"
 )
 OLD = (
-    "the target and the reported distance of {state} from it are in readings of its sensor, which "
-    "are {by:.3g} s old: when they are on the target, {state} itself is ahead of it by that time"
+    "the target and the reported distance of {states} from it are in readings that are {by:.3g} s "
+    "old: when they are on the target, the robot itself is ahead of it by that time"
 )
 DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
 REMEASURE = (
@@ -85,7 +86,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     for name in dict.fromkeys(effects):
         alone = ALONE * (name in done.jointly)
         sentence(f"{name} is part of the model now ({workspace.config.file}){alone}")
-    units = workspace.base_model.states
+    units, late = workspace.base_model.states, dict[float, list[str]]()
     for effect in done.effects:
         family, _, state = str(effect["name"]).partition(":")
         if family == "sensor_bias" and effect["name"] in effects:
@@ -101,7 +102,9 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))
         if family == "sensor_delay" and effect["name"] in effects:
-            remark("note", OLD.format(state=state, by=effect["d"]))
+            late.setdefault(effect["d"], []).extend(state.split("+"))
+    for by, states in late.items():
+        remark("note", OLD.format(states=listed(states), by=by))
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.beside:
