@@ -74,7 +74,7 @@ def test_a_wrong_zero_of_a_sensor_may_be_another_level():
         },
     )
     assert levelled(ball) == ["beam"]
-    assert holds(*_level(ball, ["sensor_bias:beam"]), "another beam", "out of level")
+    assert holds(*_level(ball, ["sensor_bias:beam"]), "0 of beam", "out of level")
     assert not _level(pendulum, ["sensor_bias:omega", "dead_zone:torque"])
 
 
