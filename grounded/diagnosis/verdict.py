@@ -295,9 +295,9 @@ def _level(model: Model, claimed: Sequence[str]) -> list[str]:
     if not names:
         return []
     return [
-        f"A table or mount out of level, or a spring at rest elsewhere than at 0 of {listed(names)}, "
-        "looks the same in any log as a sensor's wrong zero, and is adopted in the same way: check "
-        "the level before you correct the sensor."
+        f"A table or mount out of level, or a spring that rests elsewhere than at 0 of "
+        f"{listed(names)}, looks the same in any log as a sensor's wrong zero, and is adopted in "
+        "the same way: check the level before you correct the sensor."
     ]
 
 
