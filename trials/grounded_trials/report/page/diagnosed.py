@@ -10,7 +10,6 @@ from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays
-from grounded.diagnosis.validation.agreement import APART
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
@@ -88,6 +87,8 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     found = diagnosis.per_trial
     if not found:
         return []
+    from grounded.diagnosis.validation.agreement import APART  # imports the effects
+
     rows = [
         (
             p.effect,
