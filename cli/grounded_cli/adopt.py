@@ -103,8 +103,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
             remark("note", SCALED.format(state=state, by=by, more=more))
         if family == "sensor_delay" and effect["name"] in effects:
             late.setdefault(effect["d"], []).extend(state.split("+"))
-    for by, states in late.items():
-        remark("note", OLD.format(states=listed(states), by=by))
+    for age, states in late.items():
+        remark("note", OLD.format(states=listed(states), by=age))
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.beside:
