@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -59,6 +60,12 @@ def lagged(x, tau):
     for k in range(1, len(x)):
         out[k] = a * out[k - 1] + (1 - a) * 0.5 * (x[k] + x[k - 1])
     return out
+
+
+def lowpass(x, samples=9):
+    """The same without its noise, nearly: a moving average."""
+    edge = np.pad(x, samples // 2, mode="edge")
+    return np.convolve(edge, np.full(samples, 1 / samples), mode="valid")
 
 
 def columns(q=lambda x: x, w=lambda x: x):
@@ -134,6 +141,28 @@ def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first
     looked = preflight(ARM, arm(fault))
     (found,) = [one for one in looked.findings if one.kind == "smoothed"]
     assert found.signal == "w" and found.corrected
+    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_sensor(seed):
+    """Moved back by 59 ms, it hid a ball's rolling friction and the delay of its camera."""
+    rng, half = np.random.default_rng(seed), DT / 2
+
+    def fault(y):
+        steps = np.arange(2 * len(y) - 1) / 2
+        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps)
+        q += 2e-3 * rng.standard_normal(len(q))
+        w, part = np.zeros(len(q)), half / (0.05 + half)
+        for k in range(1, len(q)):
+            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / half
+        return np.stack([q, w], axis=1)[::2]
+
+    looked = preflight(ARM, arm(fault, seed, trials=1, steps=700))
+    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
+    assert found.signal == "w" and "filtered derivative of q" in found.finding
+    (tau,) = [one.delay_s for one in looked.findings if one.kind == "lag"]
+    assert tau == pytest.approx(0.055, abs=0.003)  # and half a step
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
 
 

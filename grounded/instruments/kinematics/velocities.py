@@ -12,7 +12,8 @@ its age and the time it averages over, whatever the shape of the filter. Such a 
 carries the position's noise, exactly. If it is from a sensor of its own, however late or slow,
 weights that fit its motion add the position's noise to it, and leave at least that as a remainder.
 Two later differences get weights too. The next one may have some, as resampling interpolates
-between rows; a filter knows nothing of the one after it.
+between rows; a filter knows nothing of the one after it. If the log came faster than commands do,
+only part of the noise is seen, and many weights are too uncertain: fewer are fitted then.
 
 Biased by a constant (`constant_of`). Over a stretch of T seconds the mean velocity is the distance
 over the time, whatever the physics:
@@ -47,11 +48,12 @@ WINDOWS = 40  # windows of a piece over which displacements are compared
 SHAPE = 0.5  # correlation above which two displacements have the same shape
 LATE_S = 0.5  # [s] largest sensor delay considered
 # of a derived velocity
-PAST, LATER = 24, 2  # differences before and after the sample that get a weight
+PASTS, LATER = (24, 12, 6), 2  # differences before and after the sample that get a weight
 ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.5  # of the noise that the weights take from the position: a larger remainder is another
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
+SPREAD = 0.5  # standard deviation of the ages over their mean from which it is a filter
 # of a bias
 STRETCHES = 24  # least number of stretches over all trials
 SHORTEST = 4  # steps in the shortest stretch
@@ -202,6 +204,14 @@ class Derived:
     age: float
     over: float
 
+    @property
+    def filtered(self) -> bool:
+        """Whether the ages spread as those of a filter do, rather than of a difference sent late.
+
+        Those of a first-order filter have a standard deviation of their mean.
+        """
+        return self.over / np.sqrt(12) > SPREAD * self.age
+
 
 def derived(
     model: Model, relation: Integral, trials: Sequence[Trial], least: float
@@ -217,17 +227,25 @@ def derived(
     Returns:
         None if it has another scale, is not explained by the position's past, or averages less.
     """
+    tried = (_derived(model, relation, trials, least, past) for past in PASTS)
+    return next((found for found in tried if found is not None), None)
+
+
+def _derived(
+    model: Model, relation: Integral, trials: Sequence[Trial], least: float, past: int
+) -> Derived | None:
+    """Return the same from the weights of `past` differences before the sample."""
     dt, rows, said, seen = trials[0].dt, list[Array](), list[Array](), list[Array]()
     for piece in pieces(trials, (relation.i, relation.j)):
         moved = np.diff(piece[:, 0])[:, None]
         wrapped(moved, [model.angle_mask[relation.i]])
-        if len(moved) >= PAST + LATER:
-            windows = np.lib.stride_tricks.sliding_window_view(moved[:, 0] / dt, PAST + LATER)
+        if len(moved) >= past + LATER:
+            windows = np.lib.stride_tricks.sliding_window_view(moved[:, 0] / dt, past + LATER)
             rows.append(windows[:, ::-1])
-            said.append(relation.c * piece[PAST : PAST + len(windows), 1])
+            said.append(relation.c * piece[past : past + len(windows), 1])
             seen.append(np.concatenate([[0.0], np.cumsum(moved)]))
     count = sum(map(len, said))
-    if count < ENOUGH * (PAST + LATER):
+    if count < ENOUGH * (past + LATER):
         return None
     a, w = np.concatenate(rows), np.concatenate(said)
     weights, _, rank, _ = np.linalg.lstsq(a, w, rcond=None)
@@ -243,7 +261,7 @@ def derived(
     gain = float(weights.sum())
     if abs(gain - 1) > OFF or abs(float(weights[0])) > FORESEEN:
         return None
-    ages = (np.arange(PAST + LATER) - LATER + 0.5) * dt
+    ages = (np.arange(past + LATER) - LATER + 0.5) * dt
     age = float(weights @ ages) / gain
     apart = (ages - age) ** 2 + dt**2 / 12  # each difference is itself a mean over a step
     wide = 12 * float(weights @ apart)
