@@ -390,9 +390,9 @@ class _Bench:
     def derived(self, relation: Integral, lag: Lag) -> Derived | None:
         """Return how a late velocity, no plain mean, follows from its position, if it does."""
         mean = lag.mean >= SMOOTH * self.dt
-        if mean or not relation.exact or lag.sign < 0 or lag.delay < self.dt:
-            return None
-        return derived(self.model, relation, self.trials, SMOOTH * self.dt)
+        if mean or not relation.exact or lag.sign < 0 or lag.delay < 0.5 * self.dt:
+            return None  # a difference over one step is half a step late
+        return derived(self.model, relation, self.trials, self.dt)
 
     def filtered(self, relation: Integral, found: Derived) -> Finding:
         """Drop a velocity that a filter computes from its position: neither is a delay or scale."""

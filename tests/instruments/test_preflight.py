@@ -166,6 +166,27 @@ def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_senso
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
 
 
+@pytest.mark.parametrize("counts", [1024, 4096])
+def test_a_speed_that_a_motor_controller_filters_from_its_encoder_is_no_sensor(counts):
+    """A student's time constant was 0.065 +- 0.001 s, truly 0.070 s, with such a speed as a sensor.
+
+    The controller counts at 1 kHz, and sends every 20 ms.
+    """
+    rng, fine = np.random.default_rng(counts), 20
+    count, part = 2 * np.pi / counts, 1e-3 / (0.02 + 1e-3)
+
+    def fault(y):
+        steps = np.arange(fine * (len(y) - 1) + 1) / fine
+        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps) + 0.1 * rng.random()
+        q, w = np.round(q / count) * count, np.zeros(len(q))
+        for k in range(1, len(q)):
+            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / 1e-3
+        return np.stack([q, w], axis=1)[::fine]
+
+    looked = preflight(ARM, arm(fault, trials=1, steps=700))
+    assert [one.signal for one in looked.findings if one.kind == "smoothed"] == ["w"]
+
+
 @pytest.mark.parametrize("w", [lambda x: late(x, 1.5), lambda x: lagged(x, 0.08), lambda x: x])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
@@ -362,7 +383,8 @@ def test_a_velocity_that_is_0_while_its_encoder_stands_still_is_at_rest():
     """A bench helicopter's dry friction: "sticks to its last value, up to 0.25 s", and cut out."""
     found = preflight(ARM, of_joints())
     assert not {f.kind for f in found.findings} & {"stuck", "saturated"}
-    assert all(np.isfinite(t.states).all() for t in found.trials)
+    assert all(np.isfinite(t.states[:, 0]).all() for t in found.trials)
+    assert [f.signal for f in found.findings if f.kind == "smoothed"] == ["w"]  # not as a sensor
 
 
 @pytest.mark.parametrize(("gone", "told"), [([1], ["w"]), ([0, 1], ["q", "w"])])

@@ -36,7 +36,8 @@ import numpy as np
 from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.instruments.finding import unusable
 from grounded.instruments.kinematics.relations import OFF, pieces
-from grounded.instruments.lag import SURE
+from grounded.instruments.lag import SURE, SURELY
+from grounded.instruments.single import quantum
 from grounded.model import Model
 from grounded.places import Integral, heading, integrals, speed
 from grounded.trial import Trial
@@ -48,10 +49,10 @@ WINDOWS = 40  # windows of a piece over which displacements are compared
 SHAPE = 0.5  # correlation above which two displacements have the same shape
 LATE_S = 0.5  # [s] largest sensor delay considered
 # of a derived velocity
-PASTS, LATER = (24, 12, 6), 2  # differences before and after the sample that get a weight
+PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
 ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
-CARRIED = 0.5  # of the noise that the weights take from the position: a larger remainder is another
+CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 SPREAD = 0.5  # standard deviation of the ages over their mean from which it is a filter
 # of a bias
@@ -253,7 +254,9 @@ def _derived(
     size = float(w @ w)
     if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * size:
         return None
+    steps = quantum([piece[:, 0] for piece in pieces(trials, (relation.i, relation.j))])
     noise = float(median(np.concatenate([white_noise(q[:, None]) for q in seen])))
+    noise = max(noise, steps / np.sqrt(12))  # of an encoder, at rest on one count for most samples
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
     if not np.sqrt(rest @ rest / count) < CARRIED * passed:
         return None
@@ -266,7 +269,7 @@ def _derived(
     apart = (ages - age) ** 2 + dt**2 / 12  # each difference is itself a mean over a step
     wide = 12 * float(weights @ apart)
     std = 12 * float(np.sqrt(apart @ covariance @ apart))
-    if wide - SURE * std < least**2:
+    if wide - SURELY * std < least**2:
         return None
     return Derived(gain, float(np.sqrt(covariance.sum())), age, float(np.sqrt(wide)))
 
