@@ -26,6 +26,7 @@ from grounded_trials.report.calmed import averaged, window_of
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
+    ESTIMATED,
     Findings,
     compared,
     prediction_error,
@@ -33,7 +34,7 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.scene import reading_order, scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
-from grounded_trials.workspace.off_target import tracked, tracking_error
+from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
 
 FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
 CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
@@ -68,16 +69,18 @@ def state_figure(findings: Findings) -> Figure | None:
     task = findings.task
     if len(named_paths(findings)) < 2:
         return None
-    known, panels = tracked(task), []
+    wanted, panels = asked_for(task), []
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
         curves = [
             _over_time(states[:, i], task.dt, role, words)
             for role, words, states in named_paths(findings)
-            if role != "desired" or i in known
+            if role != "desired" or i in wanted
         ]
         marks = _crashes(findings, [run.trial.states[:, i] for _, run in compared(findings)])
-        panels.append(_timed(name, unit, curves, marks=marks))
+        panel = _timed(name, unit, curves, marks=marks)
+        notes = (panel.note, ESTIMATED * (name in findings.estimated))
+        panels.append(replace(panel, note="; ".join(filter(None, notes))))
     return Figure("states", "States over time", "", tuple(panels), legend(panels))
 
 
@@ -90,7 +93,7 @@ def error_figure(findings: Findings) -> Figure | None:
     scene = scene_of(task.model)
     if scene.spatial and set(scene.axes) <= set(tracked(task)):
         panels.append(_distance(findings, list(scene.axes)))
-    for i in (i for i in reading_order(task) if i in tracked(task)):
+    for i in (i for i in reading_order(task) if i in asked_for(task)):
         name, unit = list(task.model.states.items())[i]
         off = [tracking_error(task, run.trial)[:, i] for _, run in shown]
         curves = [

@@ -162,6 +162,9 @@ def forecast_table(findings: Findings) -> list[Block]:
         "These predictions start from measured states and are not held out. The diagnosis predicts "
         "from filtered states, in all of its trials, so its errors differ."
     )
+    if findings.estimated:
+        told = listed(findings.estimated)
+        note += f" Not measured: {told}. Starts and errors of these are told by an estimate."
     return [title, made, *[Block("soft", note)] * (findings.diagnosis is not None)]
 
 

@@ -197,8 +197,8 @@ def _records(
 def _sizes(samples: Sequence[Samples], task: Task) -> Array:
     """Estimate the size of states, (n,), from the changes of measured ones they cause in a step.
 
-    It is 1 for measured states, and for states that no measured one depends on, but of an angle that
-    does not wrap at most ANGLE / WIDE: a car's wheels hardly turn it at rest, where 6 rad was found.
+    It is 1 for measured states, and for states that no measured one depends on, but at most
+    ANGLE / WIDE for an angle that does not wrap: wheels hardly turn a car that stands, as here.
     """
     model, n = task.model, task.model.n
     own = [model.state_names.index(s.name) for s in samples]
