@@ -15,7 +15,7 @@ from grounded.errors import NextCommand
 from grounded_trials.report.diagnosis_notes import note_lines, pattern_line
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure
-from grounded_trials.report.findings import ESTIMATED, Log, improvements_in
+from grounded_trials.report.findings import AT_END, ESTIMATED, Log, improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.workspace.folder import Folder
@@ -63,7 +63,7 @@ def test_the_weighed_place_is_told_before_speeds_that_changed(cart):
         for r in findings.runs
     )
     found = improvements_in(replace(findings, runs=runs))
-    told = [one.what.split(",")[0] for one in found]
+    told = [one.what.split(",")[0].removeprefix(AT_END) for one in found]
     assert told[0] == "x" and told[-1] == "v" and found[0].is_same and not found[-1].is_same
 
 
