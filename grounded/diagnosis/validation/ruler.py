@@ -306,7 +306,7 @@ class Ruler:
                 if k == len(self.steps) and longest > AS_LONG * length:
                     continue
                 last = min(own - 1, length - steps)
-                if last < 0:  # runs that ended before this horizon
+                if last < 0:  # what is used of the runs is shorter than this horizon
                     continue
                 often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
                 begin = min(int(self.starts[0].min()), last)

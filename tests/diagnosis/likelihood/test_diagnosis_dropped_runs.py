@@ -89,7 +89,7 @@ def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(
 
 
 def test_repeats_that_ended_before_a_horizon_tell_no_noise_of_it(known):
-    """A ball fell off its beam after 0.4 s, twice: a traceback instead of a diagnosis."""
+    """Of both runs of a beam only the first 0.4 s was used: a traceback instead of a diagnosis."""
     predictor, _, trials = known
     short = [replace(t, states=t.states[:9], inputs=t.inputs[:8]) for t in trials[::2]]
     data = prepare(predictor.data.model, [*short, *trials[1::2]])
