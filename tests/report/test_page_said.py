@@ -49,6 +49,19 @@ def test_no_path_is_desired_of_a_state_without_a_weight(car):
     desired = {p.title for p in states.panels if any(c.role == "desired" for c in p.curves)}
     assert desired == {"x [m]", "y [m]"} and "v [m/s]" in {p.title for p in states.panels}
     assert not any(p.title.startswith(("v ", "psi ")) for p in errors.panels)
+    assert not any(dot.role == "desired" for p in states.panels for dot in p.dots)
+
+
+def test_of_a_state_that_only_counts_at_the_end_the_end_is_desired(cart):
+    findings = weighed(gather(Folder(cart)), x=10.0)
+    reward = replace(findings.task.reward, terminal=np.array([0.0, 5.0]))
+    states = state_figure(replace(findings, task=replace(findings.task, reward=reward)))
+    assert states is not None
+    (v,) = (p for p in states.panels if p.title == "v [m/s]")
+    assert not any(c.role == "desired" for c in v.curves)
+    (dot,) = (d for d in v.dots if d.role == "desired")
+    assert dot.y == findings.task.target[-1, 1] and v.y_range[0] < dot.y < v.y_range[1]
+    assert dot.note in {key.name for key in states.key}
 
 
 def test_the_weighed_place_is_told_before_speeds_that_changed(cart):

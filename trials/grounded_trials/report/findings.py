@@ -249,7 +249,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
 
     Errors of the last state are added if the reward weighs it, or if the target is to be reached.
     Rates come after the states whose rates they are, as in `off_target_of`, and only if they
-    changed the utility. Apart from that, errors that changed come first, by their worth in utility.
+    changed the utility. Apart from that, errors that changed come first: the position's, then those
+    that changed the utility most.
     """
     task, runs, found = findings.task, compared(findings), []
     if not runs:
@@ -259,7 +260,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
     note = f"; {', '.join(short)} ended early" if short else ""
     arrives = reaches(task)
     worse = "; here the best trial is worse than the first, but better in other terms of the reward"
-    groups = weighed_groups(task)
+    groups, role = weighed_groups(task), task.model.roles.get("position", ())
+    place = {role} if isinstance(role, str) else {*role}
     for (names, what), rate in zip(groups, rates_among(task, groups), strict=True):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
@@ -282,10 +284,10 @@ def improvements_in(findings: Findings) -> list[Improved]:
                 before, missed[-1] = max(before, noise), noise
                 paid = f"; the best is {WITHIN} {measured_alike([noise], unit)[0]}"
             one = Improved(words + note + paid, unit, before, missed[-1])
-            found.append((rate, one.is_same, -moved, one))
-    found.sort(key=lambda each: each[:3])
-    least = MOVED * sum(abs(moved) for _, _, moved, _ in found)
-    large = [one for rate, _, moved, one in found if not rate or -moved >= least]
+            found.append((rate, one.is_same, names[0] not in place, -moved, one))
+    found.sort(key=lambda each: each[:4])
+    least = MOVED * sum(abs(moved) for *_, moved, _ in found)
+    large = [one for rate, *_, moved, one in found if not rate or -moved >= least]
     firsts = (
         next((one for *_, one in found if one.what.startswith(words)), None)
         for words in (FAR, *(AT_END,) * arrives)

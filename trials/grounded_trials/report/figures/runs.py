@@ -13,6 +13,7 @@ from grounded.figures.figure import (
     Curve,
     Dot,
     Figure,
+    Key,
     Panel,
     Rule,
     fitted,
@@ -38,6 +39,7 @@ from grounded_trials.workspace.off_target import asked_for, tracked, tracking_er
 
 FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
 CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
+DESIRED_END = "desired at the end"  # of a state that only `terminal` weighs
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 
@@ -65,23 +67,32 @@ def _distance(findings: Findings, axes: list[int]) -> Panel:
 
 
 def state_figure(findings: Findings) -> Figure | None:
-    """Return the figure of each state over time, with its target and prediction."""
+    """Return the figure of each state over time, with its prediction.
+
+    Its target is drawn along the way or at the end, where [reward] weighs it.
+    """
     task = findings.task
     if len(named_paths(findings)) < 2:
         return None
-    wanted, panels = asked_for(task), []
+    wanted, panels, ends = asked_for(task), [], False
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
+        along = i in wanted and task.reward.state[i] > 0
         curves = [
             _over_time(states[:, i], task.dt, role, words)
             for role, words, states in named_paths(findings)
-            if role != "desired" or i in wanted
+            if role != "desired" or along
         ]
         marks = _crashes(findings, [run.trial.states[:, i] for _, run in compared(findings)])
+        if i in wanted and not along:
+            at, value = task.horizon * task.dt, float(task.target[-1, i])
+            marks.append(Dot(at, value, "desired", DESIRED_END, "ring"))
+            ends = True
         panel = _timed(name, unit, curves, marks=marks)
         notes = (panel.note, ESTIMATED * (name in findings.estimated))
         panels.append(replace(panel, note="; ".join(filter(None, notes))))
-    return Figure("states", "States over time", "", tuple(panels), legend(panels))
+    end = (Key("desired", DESIRED_END, "ring"),) * ends
+    return Figure("states", "States over time", "", tuple(panels), (*legend(panels), *end))
 
 
 def error_figure(findings: Findings) -> Figure | None:
@@ -205,7 +216,8 @@ def _timed(
 
     If that run is cut off, a note states the values that it reaches.
     """
-    calm = [c.y for c in curves if c.role != "model"] + [np.array(limits)]
+    asked = [dot.y for dot in marks if dot.role == "desired"]
+    calm = [c.y for c in curves if c.role != "model"] + [np.array([*limits, *asked])]
     wild = [c.y for c in curves if c.role == "model"]
     finite = [v[np.isfinite(v)] for v in calm]
     moves = any(len(v) and v.max() > v.min() for v in finite)  # else: a constant target
