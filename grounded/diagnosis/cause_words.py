@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
-from grounded.result import figure, listed, number, or_zero, percent, seen, spread, with_unit
+from grounded.result import (
+    figure,
+    listed,
+    measured_alike,
+    number,
+    or_zero,
+    percent,
+    seen,
+    spread,
+    with_unit,
+)
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.error_report import Credit
@@ -325,6 +335,8 @@ def disagreement(values: Sequence[TrialValue], unit: str) -> str:
     """Return a clause on a value that the trials disagree on, with the two that differ most."""
     low, high = furthest_apart(values)
     ends = [with_unit(number(one.value), unit) for one in (low, high)]
+    if low.value >= 0 and any("e-" in end for end in ends):
+        ends = measured_alike([low.value, high.value], unit)
     return f"{DISAGREE}: {low.quantity} = {' to '.join(ends)}"
 
 
