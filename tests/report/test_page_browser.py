@@ -305,7 +305,8 @@ def test_on_paper_a_short_table_is_whole_and_a_long_one_leaves_no_row_alone(wind
     said = window.run(
         "const style = (s, of) => getComputedStyle(document.querySelector(s))[of];"
         "return [style('#errors', 'breakInside'), style('#errors thead', 'breakAfter'),"
-        "style('#errors tbody tr', 'breakAfter'), style('#errors tr:last-child', 'breakBefore'),"
+        "style('#errors tbody tr', 'breakAfter'),"
+        "style('#errors tbody tr:last-child', 'breakBefore'),"
         "style('.figure .key', 'breakInside'), style('.wide', 'overflowX')]"
     )
     window.devtools("Emulation.setEmulatedMedia", {"media": ""})
