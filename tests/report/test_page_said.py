@@ -12,6 +12,7 @@ from facts import holds
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
+from grounded.instruments.finding import put_right
 from grounded_trials.report.diagnosis_notes import note_lines, pattern_line
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure
@@ -139,3 +140,14 @@ def test_why_a_fit_is_next_is_said(cart):
     then = outlook(now, NextCommand("fit"))
     assert then.startswith(now.sentence) and then.endswith("parameters only, so fit them first")
     assert outlook(now, NextCommand("propose")) == now.sentence
+
+
+def test_predictions_from_late_sensors_are_told_beside_the_diagnosis(cart):
+    """A double pendulum's speeds are 15 ms late: 0.96 rad in a table, 0.48 rad in the verdict."""
+    findings = gather(Folder(cart))
+    assert "It corrects how late" not in text_of(findings)
+    late = put_right("v", "15.20 +- 0.067 ms later", "delay", "delay_s = 0.0152", delay_s=0.0152)
+    found = replace(findings, diagnosis=replace(findings.diagnosis, preflight=(late,)))
+    assert "It corrects how late v is, and these predictions do not." in text_of(found)
+    told = replace(found, effects=("sensor_delay:v",))
+    assert "It corrects how late" not in text_of(told)
