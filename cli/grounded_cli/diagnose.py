@@ -124,7 +124,7 @@ def _show(
 ) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
     from grounded.diagnosis.tables import error_table
-    from grounded_trials.report.diagnosis_notes import caveats, held_out
+    from grounded_trials.report.diagnosis_notes import caveats, held_out, pattern_line
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
         correction_line,
@@ -149,6 +149,8 @@ def _show(
             show(field(title, text))
         for text in in_vain(found):
             show(field("dropped", text))
+        if text := pattern_line(found):
+            show(field("pattern", text))
     if found.correction is not None and (details or found.correction.adoptable):
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):

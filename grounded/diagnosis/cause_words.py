@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Changed, Estimate, TrialValue
 from grounded.model import Model
-from grounded.result import figure, listed, number, or_zero, percent, seen, spread, with_unit
+from grounded.result import (
+    figure,
+    listed,
+    measured_alike,
+    number,
+    or_zero,
+    percent,
+    seen,
+    spread,
+    with_unit,
+)
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.error_report import Credit
@@ -106,6 +116,7 @@ def _noun(model: Model, name: str) -> str:
 
 def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Fill names and values into the sentence of an effect's family; starts in lower case."""
+    from grounded import places
     from grounded.effects import ParamFamily
 
     model, targets = effect.site.model, effect.site.targets
@@ -113,6 +124,8 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     known = {**constants, **params}
     words = {name: quantity(e) for name, e in known.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
+    centre = [name for name in places.position(model) if f"{name}0" in known]  # of a patch
+    words["place"] = listed(f"{name} = {words[f'{name}0']}" for name in centre)
     clear = "L" in known and known["L"].value > 0
     words["least"] = f"at {words['L']}, its smallest" if clear else "near zero"
     driven, _, source = effect.site.target.partition("<-")
@@ -151,9 +164,10 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
     own = isinstance(effect.family, ParamFamily) and effect.site.target in model.params
     if own and "d" in params:
-        old = model.params[effect.site.target].value
-        new = give_or_take(params["d"].moved(old))
-        return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
+        own_param = model.params[effect.site.target]
+        new = give_or_take(params["d"].moved(own_param.value))
+        old = with_unit(number(own_param.value), own_param.unit)
+        return f"the parameter {effect.site.target} should be {new} instead of {old}"
 
     if effect.known and "d" in params:
         by, now = params["d"], params["d"].moved(effect.quantities[0].known)
@@ -321,6 +335,8 @@ def disagreement(values: Sequence[TrialValue], unit: str) -> str:
     """Return a clause on a value that the trials disagree on, with the two that differ most."""
     low, high = furthest_apart(values)
     ends = [with_unit(number(one.value), unit) for one in (low, high)]
+    if low.value >= 0 and any("e-" in end for end in ends):
+        ends = measured_alike([low.value, high.value], unit)
     return f"{DISAGREE}: {low.quantity} = {' to '.join(ends)}"
 
 

@@ -54,6 +54,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
 from grounded.policy import Policy
+from grounded.result import measured_alike
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -155,8 +156,13 @@ def probe(
     most, chosen, words = best
     expected = trust * most
     if most < NOTHING:
-        same = f"No probe can distinguish {group[0]} from {group[1]}: with the other values"
-        text = f"{same} refitted they are equivalent"
+        text = (
+            f"None of the runs that were tried would distinguish {group[0]} from {group[1]}: with "
+            "the other values refitted, both predict the same"
+        )
+        claimed = next((name for name in group[:2] if name in diagnosis.effects), "")
+        if claimed and not diagnosis.contested:
+            text += f", so adopt the claimed one, {claimed}"
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     if expected < TIE <= most and trust < HIDDEN:
         text = (
@@ -168,8 +174,8 @@ def probe(
     tells = f"expected to distinguish {group[0]} from {group[1]} by {gain}"
     if little := expected < TIE:
         tells = (
-            f"no candidate inside the limits is informative enough: the best, {words}, is {tells} "
-            f"({TIE:g} needed); record larger inputs or another manoeuvre"
+            "no candidate inside the limits is informative enough: the most informative, "
+            f"{words}, is {tells} ({TIE:g} needed); record larger inputs or another manoeuvre"
         )
     else:
         tells = f"{words}: {tells}"
@@ -231,23 +237,22 @@ def _teaching(
     shrunk = max(float(twice[k] if again else once[k]), MOST)
     name = list(spreads)[k]
     of = data.model.params[name].unit if name in sizes else spreads[name].unit
-    unit = f" {of}" * (of not in ("", "1"))
     now = float(spreads[name].std)
     then, little = now * shrunk, False
+    ends = [f"+- {text}" for text in measured_alike((then, now), of)]
     about = "perhaps to about" if shrunk == MOST else "to"
     made = diagnosis.made or Made()
     called = value_called(name, made.effects)
-    tells = f"would determine {called} {about} +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
+    tells = f"would determine {called} {about} {ends[0]} (now {ends[1]})"
     sentence = f"{words}{', run twice,' if again else ':'} {tells}"
     if diagnosis.motions == 1 < len(trials) and words != BASE:
         sentence = f"{words}: would show whether {called}, so far from one motion, holds in another"
     elif shrunk > 1 - TEACHES:
-        ends = f"+- {then:.2g}{unit}", f"+- {now:.2g}{unit}"
         same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
         way = f"{words}{', run twice' * again}"
         sentence = (
-            f"no candidate inside the limits teaches much: after the best, {way}, {called} would "
-            f"be known to {ends[0]} ({same})"
+            f"no candidate inside the limits teaches much: the one that would teach most is {way}, "
+            f"and with its log {called} would be known to {ends[0]} ({same})"
         )
         little = True
     elif well[k]:

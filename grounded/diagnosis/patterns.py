@@ -13,7 +13,8 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 
-BASE = "the base policy again"
+OWN = "the best candidate's policy"
+BASE = f"{OWN} again"
 SIZES = (0.15, 0.35)  # of the input's range
 
 
@@ -33,7 +34,7 @@ def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tupl
                 unit = model.inputs[name]
                 of = f"{size * room:.2g} {unit}" if unit != "1" else f"{size * room:.2g}{limits}"
                 made = replace(policy, feedforward=feedforward)
-                yield f"{words} of {of} added to {called(model, name)}", made
+                yield f"{OWN} with {words} of {of} added to {called(model, name)}", made
 
 
 def patterns(t: Any) -> list[tuple[str, Array]]:

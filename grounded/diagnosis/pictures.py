@@ -273,7 +273,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     """Return the shares of the gap by channel, time and region, and the evidence for effects."""
     where = diagnosis.where
     by_channel = [
-        (c.name, c.share, f", {measured(c.rms, c.unit)}")
+        (c.name, c.share, f", {measured(c.rms, c.unit)}" * math.isfinite(c.rms))
         for c in where.channels
         if math.isfinite(c.share)
     ]

@@ -257,7 +257,7 @@ patch = RateFamily(
     name="patch",
     loose=True,
     equation="s' = model + c exp(-|q - q0|^2 / (2 radius^2))",
-    sentence="the rate of {target} differs by {c} at one place",
+    sentence="the rate of {target} differs by {c} around {place}, within about {radius}",
     targets=_patch_targets,
     quantities=_patch,
     lookalikes=("slope", "periodic", "trend"),

@@ -85,6 +85,7 @@ from grounded.instruments.units.odd_trial import (
 from grounded.instruments.units.other_units import judge_stamps, judge_units
 from grounded.model import Model
 from grounded.places import Integral, integrals, partner, speed
+from grounded.result import SMALL, with_error
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -143,9 +144,12 @@ def preflight(
 
 
 def _size(delay: float, lag: Lag) -> str:
-    """Return a delay with its standard deviation, if that is known."""
-    known = np.isfinite(lag.std) and lag.std > 0
-    return f"{delay:.3g}{f' +- {lag.std:.2g}' * bool(known)} s"
+    """Return a delay with its standard deviation, if that is known; in ms if that is small."""
+    if not (np.isfinite(lag.std) and lag.std > 0):
+        return f"{delay:.3g} s"
+    if lag.std < SMALL:
+        return f"{with_error(1e3 * delay, 1e3 * lag.std)} ms"
+    return f"{delay:.3g} +- {lag.std:.2g} s"
 
 
 class _Bench:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.result import percent, with_error
+from grounded.result import figure, percent, with_error
 from grounded.search.candidate import PART, Candidate, Tried
 from grounded.search.scatter import (
     NoiseSoFar,
@@ -247,19 +247,20 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         )
     if freedom and error and _start_unknown(before, after, history):
         return (
-            f"the last gain is {with_error(gain, error)} by the scatter of repeats, but "
+            f"the last gain in utility is {with_error(gain, error)} by the scatter of repeats, but "
             f"{before.candidate.id} and {after.candidate.id} began from different start states, "
             "and how much of it is due to that is not known: run both from [task] start to be sure"
         )
     if not freedom:
         return (
-            f"the last gain is {gain:.3g}; candidates of similar utility were run only once, so "
-            f"the noise of a trial is unknown; another run of the best one would show it{again}"
+            f"the last gain in utility is {figure(gain, 3)}; candidates of similar utility were "
+            "run only once, so the noise of a trial is unknown; another run of the best one would "
+            f"show it{again}"
         )
     if error == 0:
-        return f"the last gain is {gain:.3g}; repeated trials agree exactly"
+        return f"the last gain in utility is {figure(gain, 3)}; repeated trials agree exactly"
     return (
-        f"the last gain is {with_error(gain, error)}: an improvement with probability "
+        f"the last gain in utility is {with_error(gain, error)}: an improvement with probability "
         f"{chance(before, after, history):.2f}{few(Repeats(history).near(after.utility).repeats)}"
     )
 

@@ -140,6 +140,11 @@ def test_a_clause_says_on_which_value_the_trials_disagree():
     assert list(told) == [BIAS] and told[BIAS] == disagreement(values, "rad")
     assert holds(told[BIAS], DISAGREE, "b = -0.0149 rad to -0.0038 rad")
     assert not _apart(values, [replace(tests[0], agrees=True)])
+    times = [
+        TrialValue("t1", "delay:u", "d", 9.6e-5, 1e-5),
+        TrialValue("t2", "delay:u", "d", 3e-4, 1e-5),
+    ]
+    assert disagreement(times, "s") == f"{DISAGREE}: d = 0.096 ms to 0.30 ms"
 
 
 def test_a_cause_on_which_trials_disagree_stands_alone():

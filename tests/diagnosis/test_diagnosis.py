@@ -233,7 +233,10 @@ def test_sentences_are_english():
     assert said("input_fade:throttle", k=0.05) == (
         "The gain of the throttle gets 5 % lower every second (for example a battery that sags)."
     )
-    assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
+    assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1 1/s."
+    assert said("patch:v", c=0.05, x0=0.112, radius=0.086) == (
+        "The rate of the speed v differs by 0.05 m/s^2 around x = 0.112 m, within about 0.086 m."
+    )
     bent = "40 % lower at 1, its largest command in the log, than near zero"
     curve = f"The gain of the throttle is {bent}."
     assert said("input_curve:throttle", a=0.0, b=-0.5) == curve  # 0.75 of 1.25

@@ -90,6 +90,8 @@ def test_a_velocity_is_held_against_its_position(fault, signal, kind, delay, sca
     assert [(one.signal, one.kind) for one in found.findings] == [(signal, kind)]
     one = found.findings[0]
     assert one.delay_s == pytest.approx(delay, rel=0.1, abs=2e-4)
+    if kind == "delay":  # it was "0.0152 +- 6.7e-05 s"
+        assert re.match(r"\d+\.\d+ \+- 0\.\d+ ms later than ", one.finding), one.finding
     assert one.scale == pytest.approx(scale, rel=0.01)
     assert one.corrected is (kind != "scale")
     if kind == "lag":  # its samples stay: the diagnosis' own filter knows

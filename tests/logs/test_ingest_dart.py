@@ -163,6 +163,7 @@ def test_the_log_is_stored_as_data_on_the_control_grid(dart):
     moved = np.hypot(*np.diff(trial.states[:, :2], axis=0).T) / 0.05
     assert np.corrcoef(moved, v[:-1])[0, 1] > 0.9  # the smoother's speed is the speed
     assert np.abs(np.diff(psi)).max() < 0.5  # unwrapped
+    assert np.abs(trial.states[:, 4]).max() < 1.0  # the wheels are not half a turn round
     again = grounded("-C", folder, "ingest", log, "--data", "--json").json["trials"][0]
     assert again["known"] and again["sha256"] == told["sha256"]
 

@@ -297,6 +297,22 @@ def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     assert window.errors() == []
 
 
+def test_on_paper_a_short_table_is_whole_and_a_long_one_leaves_no_row_alone(window, car_page):
+    """A table of errors began at the foot of a page with one row."""
+    window.resize(1400, 900)
+    window.open(car_page)
+    window.devtools("Emulation.setEmulatedMedia", {"media": "print"})
+    said = window.run(
+        "const style = (s, of) => getComputedStyle(document.querySelector(s))[of];"
+        "return [style('#errors', 'breakInside'), style('#errors thead', 'breakAfter'),"
+        "style('#errors tbody tr', 'breakAfter'),"
+        "style('#errors tbody tr:last-child', 'breakBefore'),"
+        "style('.figure .key', 'breakInside'), style('.wide', 'overflowX')]"
+    )
+    window.devtools("Emulation.setEmulatedMedia", {"media": ""})
+    assert said == ["avoid"] * 5 + ["visible"]
+
+
 def test_print_shows_every_panel_in_light_colours(window, car_page):
     window.dark(True)
     window.resize(1400, 900)
@@ -306,7 +322,11 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
         "addEventListener('afterprint', () => { document.documentElement.dataset.printed ="
         " [...document.querySelectorAll('.plot')].every(p => p.querySelector('.main-svg')); })"
     )
+    folded = "return document.querySelectorAll('details:not([open])').length"
+    before = window.run(folded)
+    assert before > 0
     made = window.devtools("Page.printToPDF", {"paperWidth": 8.27, "paperHeight": 11.69})
+    assert window.run(folded) == before  # they are printed open, and folded again
     assert base64.b64decode(made["data"]).count(b"/Type /Page\n") >= 3
     assert window.run("return document.documentElement.dataset.printed") == "true"
     assert window.run("return document.getElementById('states-0').layout.font.color") == "#e8e8e8"

@@ -141,7 +141,7 @@ def test_the_documents_have_the_commands_keys(search):
     assert now["best"] == best and now["trials"] == len(search.trials)
     assert len(now["history"]) == len(search.candidates)
     assert [row["verdict"] for row in now["history"]][:2] == ["first", "better"]
-    assert now["certainty"].startswith("the last gain is")
+    assert now["certainty"].startswith("the last gain in utility is")
     ended = search.proposal.to_json()
     assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended
     first = propose(TASK, [], [], OPTIONS).to_json()

@@ -106,7 +106,9 @@ def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
     assert identity == "" and "--probe" not in sentence
     assert sentence.startswith(found.next_trial) and "teaches much" in sentence
     identity, sentence = _probe(w, found, trials, Library(), write=True)
-    assert identity and re.search(r"teaches much: after the best, .*, .+ would be known", sentence)
+    assert identity and re.search(
+        r"teaches much: the one that would .* log .+ would be known", sentence
+    )
 
 
 def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkeypatch):
@@ -118,8 +120,23 @@ def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkey
     trials = [w.planner.lift(trial) for trial in w.task_trials()]
     monkeypatch.setattr(excitation, "TIE", 1e9)
     identity, sentence = _probe(w, found, trials, Library(), write=False)
-    assert identity == "" and re.search(r"informative enough: the best, .*, is expected", sentence)
+    assert identity == "" and re.search(
+        r"informative enough: the most informative, .*, is expected", sentence
+    )
     assert offered(w, found)[0]  # who asks for it
+
+
+def test_where_no_run_tells_a_tie_apart_the_claimed_effect_is_to_be_adopted(diagnosed, monkeypatch):
+    """ "No probe can distinguish ..." stood under "Next trial", and nothing followed."""
+    w, found = diagnosed
+    (w.folder / "grounded.toml").write_text(NOISY)
+    w.forget()
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    monkeypatch.setattr(excitation, "NOTHING", 1e9)
+    sentence = _probe(w, found, trials, Library(), write=False)[1]
+    own = next(name for name in found.indistinguishable[0] if name in found.effects)
+    assert sentence.startswith("None of the runs that were tried would distinguish")
+    assert sentence.endswith(f"so adopt the claimed one, {own}.")
 
 
 def test_numbers_that_one_motion_told_get_no_promise_in_another(diagnosed):

@@ -305,8 +305,10 @@ class Ruler:
             for k, steps in enumerate((*self.steps, length)):
                 if k == len(self.steps) and longest > AS_LONG * length:
                     continue
-                often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
                 last = min(own - 1, length - steps)
+                if last < 0:  # what is used of the runs is shorter than this horizon
+                    continue
+                often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
                 begin = min(int(self.starts[0].min()), last)
                 moments = np.unique(np.linspace(begin, last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]

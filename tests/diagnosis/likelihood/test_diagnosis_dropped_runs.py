@@ -88,6 +88,16 @@ def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(
         assert unsure[0] < unsure[len(ruler.steps) - 1] < unsure[-1]
 
 
+def test_repeats_that_ended_before_a_horizon_tell_no_noise_of_it(known):
+    """Of both runs of a beam only the first 0.4 s was used: a traceback instead of a diagnosis."""
+    predictor, _, trials = known
+    short = [replace(t, states=t.states[:9], inputs=t.inputs[:8]) for t in trials[::2]]
+    data = prepare(predictor.data.model, [*short, *trials[1::2]])
+    fit = SimpleNamespace(hypothesis=Hypothesis(), states=data.y)
+    ruler = Ruler(Predictor(data))
+    assert max(ruler.steps) > 8 and ruler.scatter(fit, [[0, 1]]) is None
+
+
 def test_noise_that_differs_from_moment_to_moment_is_less_sure():
     """A ball on a beam: 5.0, 3.3, 4.9 and 2.6 mm by four diagnoses, stated as sure to 8 %."""
     rng = np.random.default_rng(0)

@@ -5,14 +5,17 @@ Terminal and page show the same notes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.error_report import furthest
 from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.ruler_words import in_doubt, open_noise, rest
 from grounded.result import listed
 from grounded_trials.report.diagnosis_words import agreement_lines, correction_line, error_lines
 from grounded_trials.wording import percent
 
+WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
 LEAST_SHARE = 0.005  # of the gap: a channel below it is not listed
 CHANNELS, REGIONS = 2, 1  # named in a line
 ELSEWHERE = ("utility", "alike")  # error lines that the page has in sections of their own
@@ -74,6 +77,24 @@ def where_line(found: Diagnosis) -> str:
     return f"of the one-step errors beyond the noise, {'; '.join([listed(parts), *regions(found)])}"
 
 
+def left_patterns(found: Diagnosis) -> dict[str, float]:
+    """Return by state the p-value of white noise in what is left, without states left out."""
+    known = {one.name for one in found.where.channels if math.isfinite(one.rms)}
+    return {name: p for name, p in found.where.whiteness.items() if not known or name in known}
+
+
+def pattern_line(found: Diagnosis) -> str:
+    """Say that what is left is as small as noise, but not noise only; "" if that is not so."""
+    rows = found.prediction_error
+    names = [name for name, p in left_patterns(found).items() if p < WHITE]
+    if not names or found.leftover or rest(rows) or open_noise(rows) or in_doubt(rows):
+        return ""
+    return (
+        f"what is left in {listed(names)} is as small as the noise, but has a pattern: part of it "
+        "is not noise, too small a part to show in predictions"
+    )
+
+
 def note_lines(found: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
     """Return (title, text) of all notes to a diagnosis, with all terms of sums.
 
@@ -93,6 +114,8 @@ def note_lines(found: Diagnosis, before: Mapping[str, float]) -> list[tuple[str,
         lines.append(("values", deviations(found)))
     if text := where_line(found):
         lines.append(("where", text))
+    if text := pattern_line(found):
+        lines.append(("pattern", text))
     if found.correction is not None and found.correction.adoptable:
         lines.append(("correction", correction_line(found.correction)))
     return lines

@@ -45,6 +45,7 @@ One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
 FAR = "distance from the desired position"
 AT_END = "at the end: "  # label of errors of the last state
+ESTIMATED = "not measured: an estimate"  # note at a panel
 MOVED = 0.02  # share of the change in cost below which a row is left out
 WORSE = 1.05  # ratio to the first trial's error above which a row is reported as worse
 TERMS = {  # tables of [reward]
@@ -102,6 +103,7 @@ class Findings:
     since: Since = field(default_factory=Since)  # changes since the diagnosis
     settled: Settled | None = None  # what was adopted, and what it gained
     discarded: tuple[str, ...] = ()  # trials that were set aside
+    estimated: tuple[str, ...] = ()  # states that no sensor gives in some of these trials
     uncounted: tuple[str, ...] = ()  # trials of another task or a probe, used only as data
     left_runs: int = 0  # runs that were not read, since there are too many
     left_logs: int = 0  # logs that were not read
@@ -246,8 +248,9 @@ def improvements_in(findings: Findings) -> list[Improved]:
     """Return the rms errors from the target of the model's own policy and of the best trial.
 
     Errors of the last state are added if the reward weighs it, or if the target is to be reached.
-    Rates come after the states whose rates they are, as in `off_target_of`; apart from that, errors
-    that changed the utility most come first.
+    Rates come after the states whose rates they are, as in `off_target_of`, and only if they
+    changed the utility. Apart from that, errors that changed come first: the position's, then those
+    that changed the utility most.
     """
     task, runs, found = findings.task, compared(findings), []
     if not runs:
@@ -257,7 +260,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
     note = f"; {', '.join(short)} ended early" if short else ""
     arrives = reaches(task)
     worse = "; here the best trial is worse than the first, but better in other terms of the reward"
-    groups = weighed_groups(task)
+    groups, role = weighed_groups(task), task.model.roles.get("position", ())
+    place = {role} if isinstance(role, str) else {*role}
     for (names, what), rate in zip(groups, rates_among(task, groups), strict=True):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
@@ -280,10 +284,10 @@ def improvements_in(findings: Findings) -> list[Improved]:
                 before, missed[-1] = max(before, noise), noise
                 paid = f"; the best is {WITHIN} {measured_alike([noise], unit)[0]}"
             one = Improved(words + note + paid, unit, before, missed[-1])
-            found.append((one.is_same, rate, -moved, one))
-    found.sort(key=lambda each: each[:3])
-    least = MOVED * sum(abs(moved) for _, _, moved, _ in found)
-    large = [one for k, (*_, moved, one) in enumerate(found) if not k or -moved >= least]
+            found.append((rate, one.is_same, names[0] not in place, -moved, one))
+    found.sort(key=lambda each: each[:4])
+    least = MOVED * sum(abs(moved) for *_, moved, _ in found)
+    large = [one for rate, *_, moved, one in found if not rate or -moved >= least]
     firsts = (
         next((one for *_, one in found if one.what.startswith(words)), None)
         for words in (FAR, *(AT_END,) * arrives)

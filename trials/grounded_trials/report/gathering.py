@@ -7,6 +7,7 @@ A damaged or missing trial is left out and listed in `lost`; the rest is still s
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -80,11 +81,19 @@ def gather(workspace: Folder) -> Findings:
         since=since,
         settled=settled_in(workspace, diagnosis, since),
         discarded=tuple(workspace.discarded()),
+        estimated=_estimated(task, contents, {t.id for t in [*shown, *logs]}),
         uncounted=tuple(uncounted(workspace, contents.trials, now)),
         left_runs=len(own) - len(shown),
         left_logs=len(data) - len(logs),
         folder=workspace.address,
     )
+
+
+def _estimated(task: Task, contents: Contents, drawn: Collection[str]) -> tuple[str, ...]:
+    """Return the states that a smoother filled in, in one of the trials that are drawn or more."""
+    told = [t.meta.get("estimated", "").split(",") for t in contents.trials if t.trial.id in drawn]
+    found = {name for names in told for name in names}
+    return tuple(name for name in task.model.state_names if name in found)
 
 
 def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:

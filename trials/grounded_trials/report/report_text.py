@@ -158,8 +158,10 @@ def _biases(findings: Findings, table: Table) -> str:
 def _diagnosis(findings: Findings, table: Table) -> str:
     diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
-        command = rendered(DIAGNOSE, findings.folder)
-        return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
+        told = f"not diagnosed yet: {rendered(DIAGNOSE, findings.folder)}"
+        if not (findings.runs or findings.logs):
+            told = "nothing to diagnose yet: no trial and no log of data is stored"
+        return "\n".join(["gap to the model", *_wrapped(told, "  ")])
     lines = ["gap to the model"]
     shown = so_far(diagnosis, since, findings.settled)
     causes, others = verdict_lines(diagnosis)

@@ -18,7 +18,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
-from grounded_trials.workspace.off_target import position_axes, roles_of, tracked
+from grounded_trials.workspace.off_target import asked_for, position_axes, roles_of, tracked
 
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
 
@@ -64,9 +64,8 @@ class Scene:
 
 
 def reading_order(task: Task) -> list[int]:
-    """Return the states in the order of charts: position, other states with a target, the rest."""
-    wanted = tracked(task)
-    every = [*position_axes(task.model), *wanted, *range(task.model.n)]
+    """Return the states in the order of charts: position, other weighted states, the rest."""
+    every = [*position_axes(task.model), *asked_for(task), *tracked(task), *range(task.model.n)]
     return list(dict.fromkeys(every))
 
 

@@ -62,11 +62,15 @@ def next_command(
 def outlook(now: Standing, then: NextCommand) -> str:
     """Return the sentence on the search; of one that has ended, also that the model may change.
 
-    Else "c0007 is the result" stood above a command that adopts effects and goes on.
+    Else "c0007 is the result" stood above a command that adopts effects and goes on, and nothing
+    said why `fit` was next.
     """
+    of = " of the model as it is" * now.sentence.endswith("is the result")
+    if then.verb == "fit":
+        why = "the diagnosis blames the model's parameters only, so fit them first"
+        return f"{now.sentence}{of}; {why}"
     if then.verb != "adopt" or now.phase in ("propose", "await-trial"):
         return now.sentence
-    of = " of the model as it is" * now.sentence.endswith("is the result")
     return f"{now.sentence}{of}; adopt what it lacks to go on"
 
 

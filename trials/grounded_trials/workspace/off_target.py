@@ -216,6 +216,15 @@ def tracked(task: Task) -> list[int]:
     return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]
 
 
+def asked_for(task: Task) -> list[int]:
+    """Return the indices of the states that have a target and a weight, of the way or of the end.
+
+    A column of target.csv without a weight is where the path would take that state, not a wish.
+    """
+    weights = task.reward.state + task.reward.terminal
+    return [i for i in tracked(task) if weights[i] > 0]
+
+
 def tracking_error(task: Task, trial: Trial) -> Array:
     """Return s_t - target_t, (T + 1, n), with angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])

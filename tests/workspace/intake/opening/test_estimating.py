@@ -1,6 +1,7 @@
 """Speeds that no sensor gives, along a whole log: gaps, slow sensors, units, the noise."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from facts import holds
 from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.task import Task
+from grounded.utility import Reward
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.adopted import planner_of
@@ -307,3 +310,53 @@ def test_seconds_under_a_column_of_milliseconds_are_told(task):
     log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
     with pytest.raises(GroundedError, match=r"times 1000 they would be 0\.01 s"):
         with_estimates(log, TABLE, task)
+
+
+def turn(s, a, p):
+    """A car whose wheels follow the steering with a lag, and whose speed follows the throttle."""
+    return {
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": s.v * np.tan(s.delta) / 0.175,
+        "v": (8 * a.throttle - 1.2 - s.v) / 0.5,
+        "delta": (0.4 * a.steering - s.delta) / 0.1,
+    }
+
+
+def test_an_angle_that_acts_only_at_speed_is_not_estimated_half_a_turn_off():
+    """At rest wheels hardly turn a heading: their angle was taken for 6 rad, and came out pi off.
+
+    The real ones turn further than the model's.
+    """
+    units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s", "delta": "rad"}
+    inputs = {"steering": "1", "throttle": "1"}
+    model = Model(states=units, inputs=inputs, derivative=turn, angles=("psi",))
+    fine = 0.01
+    t = np.arange(0, 12.0, fine)
+    u = np.stack([np.where(t % 4 < 2, 0.7, -0.5), np.full(len(t), 0.25)], axis=1)
+    path, s = np.empty((len(t), 5)), np.zeros(5)
+    for k, a in enumerate(u):
+        path[k] = s
+        now = SimpleNamespace(**dict(zip(units, s, strict=True)))
+        sent = SimpleNamespace(steering=1.3 * a[0], throttle=a[1])
+        s = s + fine * np.array([*turn(now, sent, None).values()])
+    rng = np.random.default_rng(0)
+    std = {"x": 0.002, "y": 0.002, "psi": 0.005}
+    log = {
+        name: series(t, path[:, k] + std[name] * rng.standard_normal(len(t)))
+        for k, name in enumerate(std)
+    }
+    log |= {name: series(t[::10], u[::10, k], f"/csv.{name}") for k, name in enumerate(inputs)}
+    task = Task(
+        model=model,
+        dt=0.05,
+        target=np.zeros((161, 5)),
+        reward=Reward(np.ones(5), np.ones(5), np.ones(2), np.ones(2)),
+        start=np.zeros(5),
+        past=np.zeros(2),
+        low=np.full(2, -1.0),
+        high=np.ones(2),
+    )
+    found = with_estimates(log, EstimateTable(std, {}), task)["delta"]
+    error = found.values - np.interp((found.t - 1000 * 10**9) * 1e-9, t, path[:, 4])
+    assert np.abs(error[100:-100]).max() < 0.3

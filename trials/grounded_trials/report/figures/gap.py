@@ -15,9 +15,9 @@ from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, leg
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import SHORT, probe, samples, true_values
+from grounded.result import listed
 from grounded.trial import Trial
-from grounded_trials.report.diagnosis_words import made_from
-from grounded_trials.report.findings import Findings, Run
+from grounded_trials.report.findings import ESTIMATED, Findings, Run
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.scene import reading_order
 from grounded_trials.wording import labelled, per_second, percent, shown
@@ -44,7 +44,30 @@ def forecast_figures(findings: Findings) -> list[Figure]:
     for log in longest:
         title = f"Predictions restarted every {ahead}, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
-    return [figure for figure in found if figure is not None]
+    some = [figure for figure in found if figure is not None]
+    return [replace(one, caption=_caption(findings, k, one.caption)) for k, one in enumerate(some)]
+
+
+def _caption(findings: Findings, place: int, own: str) -> str:
+    """Return the caption of a figure of forecasts: the first one says what is drawn."""
+    better = findings.better
+    if place:
+        return own
+    start = "the measured state"
+    if findings.estimated:
+        start = f"the measured state, with {listed(findings.estimated)} as estimated from it,"
+    caption = (
+        f"Every {findings.ahead_s:.3g} s the model starts from {start} and gets the inputs that "
+        "were sent: where the lines differ by more than noise in the start makes of it, the model "
+        "is wrong."
+    )
+    names = better.planner.plan.model.state_names if better is not None else ()
+    if true_values(names, names[findings.task.model.n :]):
+        caption += (
+            " A sensor that the model knows to be late shows where the robot was: then it starts "
+            "from where it is, as far as the samples until then tell."
+        )
+    return f"{caption} {own}".rstrip()
 
 
 def _unseen(findings: Findings) -> Run | None:
@@ -80,27 +103,20 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         bounds = fitted(without_astray([curves[0].y], [c.y for c in curves[1:]]))
         label = labelled(state, unit)
         y_name = shown(unit)
-        panel = Panel(label, "time [s]", y_name, tuple(curves), y_range=bounds, kind="forecast")
-        panels.append(panel)
-    caption = (
-        f"Every {findings.ahead_s:.3g} s the model starts from the measured state and gets the "
-        "inputs that were sent: where the lines differ by more than noise in the start makes of "
-        "it, the model is wrong."
-    )
-    names = better.planner.plan.model.state_names if better is not None else ()
-    if true_values(names, names[findings.task.model.n :]):
-        caption += (
-            " A sensor that the model knows to be late shows where the robot was: then it starts "
-            "from where it is, as far as the samples until then tell."
+        note = ESTIMATED * (state in findings.estimated)
+        panels.append(
+            Panel(
+                label, "time [s]", y_name, tuple(curves), y_range=bounds, note=note, kind="forecast"
+            )
         )
-    diagnosis = findings.diagnosis
+    said, diagnosis = [], findings.diagnosis
     if diagnosis is not None and diagnosis.made is not None and better is not None:
-        saw = "used this trial" if trial.id in diagnosis.made.trials else "did not use this trial"
-        caption += f" The last diagnosis, {made_from(diagnosis)}, {saw}."
+        saw = "used" if trial.id in diagnosis.made.trials else "did not use"
+        said.append(f"The last diagnosis {saw} this trial.")
     if trial.steps < steps:
         end = begin + trial.steps * trial.dt
-        caption += f" Only its worst part, from {begin:.4g} to {end:.4g} s, is drawn."
-    return Figure(name, title, caption, tuple(panels), legend(panels))
+        said.append(f"Only its worst part, from {begin:.4g} to {end:.4g} s, is drawn.")
+    return Figure(name, title, " ".join(said), tuple(panels), legend(panels))
 
 
 def _worst_part(findings: Findings, trial: Trial) -> tuple[Trial, float]:
@@ -275,6 +291,8 @@ def _autocorrelation(
     if explained is not None:
         left = float(np.std(explained[:, state]) / (np.std(residual[:, state]) or 1.0))
         note = f"{percent(left)} of the residual is left"
+        if left > 1:
+            note = f"the residual grows by {percent(left - 1)}"
     note += "; " * bool(note) + "sensor noise alone: −0.5 at the first lag"
     for values, role, name in shown_:
         y = values[:, state] - values[:, state].mean()

@@ -13,6 +13,7 @@ from grounded.figures.figure import (
     Curve,
     Dot,
     Figure,
+    Key,
     Panel,
     Rule,
     fitted,
@@ -26,6 +27,7 @@ from grounded_trials.report.calmed import averaged, window_of
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
+    ESTIMATED,
     Findings,
     compared,
     prediction_error,
@@ -33,10 +35,11 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.scene import reading_order, scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
-from grounded_trials.workspace.off_target import tracked, tracking_error
+from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
 
 FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
 CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
+DESIRED_END = "desired at the end"  # of a state that only `terminal` weighs
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
 
 
@@ -64,21 +67,32 @@ def _distance(findings: Findings, axes: list[int]) -> Panel:
 
 
 def state_figure(findings: Findings) -> Figure | None:
-    """Return the figure of each state over time, with its target and prediction."""
+    """Return the figure of each state over time, with its prediction.
+
+    Its target is drawn along the way or at the end, where [reward] weighs it.
+    """
     task = findings.task
     if len(named_paths(findings)) < 2:
         return None
-    known, panels = tracked(task), []
+    wanted, panels, ends = asked_for(task), [], False
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
+        along = i in wanted and task.reward.state[i] > 0
         curves = [
             _over_time(states[:, i], task.dt, role, words)
             for role, words, states in named_paths(findings)
-            if role != "desired" or i in known
+            if role != "desired" or along
         ]
         marks = _crashes(findings, [run.trial.states[:, i] for _, run in compared(findings)])
-        panels.append(_timed(name, unit, curves, marks=marks))
-    return Figure("states", "States over time", "", tuple(panels), legend(panels))
+        if i in wanted and not along:
+            at, value = task.horizon * task.dt, float(task.target[-1, i])
+            marks.append(Dot(at, value, "desired", DESIRED_END, "ring"))
+            ends = True
+        panel = _timed(name, unit, curves, marks=marks)
+        notes = (panel.note, ESTIMATED * (name in findings.estimated))
+        panels.append(replace(panel, note="; ".join(filter(None, notes))))
+    end = (Key("desired", DESIRED_END, "ring"),) * ends
+    return Figure("states", "States over time", "", tuple(panels), (*legend(panels), *end))
 
 
 def error_figure(findings: Findings) -> Figure | None:
@@ -90,7 +104,7 @@ def error_figure(findings: Findings) -> Figure | None:
     scene = scene_of(task.model)
     if scene.spatial and set(scene.axes) <= set(tracked(task)):
         panels.append(_distance(findings, list(scene.axes)))
-    for i in (i for i in reading_order(task) if i in tracked(task)):
+    for i in (i for i in reading_order(task) if i in asked_for(task)):
         name, unit = list(task.model.states.items())[i]
         off = [tracking_error(task, run.trial)[:, i] for _, run in shown]
         curves = [
@@ -202,7 +216,8 @@ def _timed(
 
     If that run is cut off, a note states the values that it reaches.
     """
-    calm = [c.y for c in curves if c.role != "model"] + [np.array(limits)]
+    asked = [dot.y for dot in marks if dot.role == "desired"]
+    calm = [c.y for c in curves if c.role != "model"] + [np.array([*limits, *asked])]
     wild = [c.y for c in curves if c.role == "model"]
     finite = [v[np.isfinite(v)] for v in calm]
     moves = any(len(v) and v.max() > v.min() for v in finite)  # else: a constant target

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import give_or_take
@@ -11,6 +10,7 @@ from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_fi
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays
 from grounded.diagnosis.verdict import told_apart
+from grounded_trials.report.diagnosis_notes import WHITE, left_patterns, pattern_line
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     in_vain,
@@ -35,9 +35,9 @@ from grounded_trials.workspace.next_step import DIAGNOSE
 
 MOST = 6  # states whose error without each effect is drawn
 DIGITS = 3  # of a share, which is printed to 0.1 %
-WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
 ZERO = "0.0 %"
 NOTHING = {"-", ZERO}  # shares that say nothing
+NO_TRIAL = "Nothing to diagnose yet: no trial and no log of data is stored."
 HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
@@ -47,11 +47,15 @@ def gap_section(findings: Findings) -> list[Block]:
     ahead = [b for each in forecast_figures(findings) for b in drawn(each, title=True)]
     lacking = [b for each in residual_figures(findings) for b in drawn(each, title=True)]
     if diagnosis is None:
+        if not (findings.runs or findings.logs):
+            return [Block("text", NO_TRIAL)]
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
-    shown = so_far(diagnosis, findings.since, findings.settled)
+    shown = so_far(diagnosis, findings.since, findings.settled)[
+        -1:
+    ]  # the page begins with the rest
     items = frozenset(range(len(shown), len(shown) + len(causes)))
     verdict = Block("verdict", lines=[*shown, *causes, *others], strong=items)
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
@@ -222,9 +226,7 @@ def _doubts(splits: Mapping[str, Split]) -> str:
 
 def _rest(diagnosis: Diagnosis) -> list[Block]:
     """Whether what the effects leave is noise, by state, without those that were left out."""
-    where = diagnosis.where
-    known = {one.name for one in where.channels if math.isfinite(one.rms)}
-    whiteness = {name: p for name, p in where.whiteness.items() if not known or name in known}
+    whiteness = left_patterns(diagnosis)
     if not whiteness:
         return []
     rows = [
@@ -239,6 +241,7 @@ def _rest(diagnosis: Diagnosis) -> list[Block]:
             "what a filter that allows for the sensors' noise leaves of all trials.",
         ),
         table("whiteness", ("state", "p (white noise)", "what is left "), rows),
+        *[Block("text", f"{_begun(text)}.") for text in [pattern_line(diagnosis)] if text],
     ]
 
 

@@ -6,6 +6,7 @@
   const plots = all(".plot");
   const hidden = new Map(); // for each figure, the names switched off in its legend
   let light = false; // true while printing
+  let folded = []; // parts of the page that are opened for printing only
   const SHEET = 330; // width of a panel on paper [px]
   let time = 0;
 
@@ -328,7 +329,8 @@
   // Print: everything, in light colours, at the width of half a sheet.
   addEventListener("beforeprint", () => {
     light = true;
-    for (const part of all("details")) part.open = true;
+    folded = all("details").filter((part) => !part.open);
+    for (const part of folded) part.open = true;
     for (const plot of plots) {
       draw(plot);
       Plotly.relayout(plot, { autosize: false, width: SHEET, height: plot.clientHeight });
@@ -336,6 +338,7 @@
   });
   addEventListener("afterprint", () => {
     light = false;
+    for (const part of folded) part.open = false;
     for (const plot of plots) {
       plot.layout.width = plot.layout.height = undefined;
       draw(plot);

@@ -36,7 +36,7 @@ from grounded_trials.report.figures.runs import (
 )
 from grounded_trials.report.findings import Findings, compared, improvements_in, utility_terms
 from grounded_trials.report.page.causes import adopted, causes
-from grounded_trials.report.page.diagnosed import gap_section
+from grounded_trials.report.page.diagnosed import NO_TRIAL, gap_section
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -89,6 +89,7 @@ def page(findings: Findings, watched: int = 0) -> str:
         changed=_heading(findings),
         improved=_improved(findings),
         diagnose=rendered(DIAGNOSE, findings.folder),
+        no_trial=NO_TRIAL,
         why=_why(findings),
         sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
         style=_own("page.css") + _roles(),

@@ -162,7 +162,20 @@ def forecast_table(findings: Findings) -> list[Block]:
         "These predictions start from measured states and are not held out. The diagnosis predicts "
         "from filtered states, in all of its trials, so its errors differ."
     )
+    if late := late_in_vain(findings):
+        verb = "is" if len(late) == 1 else "are"
+        note += f" It corrects how late {listed(late)} {verb}, and these predictions do not."
+    if findings.estimated:
+        told = listed(findings.estimated)
+        note += f" Not measured: {told}. Starts and errors of these are told by an estimate."
     return [title, made, *[Block("soft", note)] * (findings.diagnosis is not None)]
+
+
+def late_in_vain(findings: Findings) -> list[str]:
+    """Return the states whose delay the diagnosis corrected, and the model does not know."""
+    diagnosis = findings.diagnosis
+    names = [] if diagnosis is None else [*diagnosis.late_sensors]
+    return [name.partition(":")[2] for name in names if name not in findings.effects]
 
 
 def _of_trials(

@@ -43,6 +43,7 @@ MARGIN_S = 0.5  # time after the last change of a command that still counts as m
 WIDE = 10.0  # std of an initial state, relative to the state's size
 STILL = 0.02  # std of the state of a robot that waits at a run's start, relative to the same
 EXACT = 1e-3  # relative tolerance for a step to be a multiple of a simulator's own
+ANGLE = 1.0  # largest std of an initial angle [rad]: an angle half a turn off may fit as well
 SIZED = 256  # instants at which the size of states is computed
 
 
@@ -196,7 +197,8 @@ def _records(
 def _sizes(samples: Sequence[Samples], task: Task) -> Array:
     """Estimate the size of states, (n,), from the changes of measured ones they cause in a step.
 
-    It is 1 for measured states, and for states that no measured one depends on.
+    It is 1 for measured states, and for states that no measured one depends on, but at most
+    ANGLE / WIDE for an angle that does not wrap: wheels hardly turn a car that stands, as here.
     """
     model, n = task.model, task.model.n
     own = [model.state_names.index(s.name) for s in samples]
@@ -212,7 +214,11 @@ def _sizes(samples: Sequence[Samples], task: Task) -> Array:
     tells = (by > np.finfo(float).eps) & (moved[:, None] > 0)
     sizes = np.where(tells, moved[:, None] / np.where(tells, by, 1.0), np.inf).min(axis=0)
     sizes[own] = 1.0
-    return np.where(np.isfinite(sizes), sizes, 1.0)
+    sizes = np.where(np.isfinite(sizes), sizes, 1.0)
+    for i, (name, unit) in enumerate(model.states.items()):
+        if unit == "rad" and i not in own and name not in model.angles:
+            sizes[i] = min(sizes[i], ANGLE / WIDE)
+    return sizes
 
 
 def _smoothed(
