@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.joint_model import joint_model
-from grounded.diagnosis.hypotheses.plainest import holding
+from grounded.diagnosis.hypotheses.plainest import plain_friction
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -254,7 +254,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     """
     size, done = len(best.hypothesis.effects), set[frozenset[str]]()
     while 1 <= size < most:
-        best = holding(search, best)
+        best = plain_friction(search, best)
         starts = _starts(search, size, best)
         done |= {frozenset(fit.hypothesis.names) for fit in starts}
         halves = _halves(search, starts) if size == 1 else []
@@ -283,7 +283,11 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         _nested(search, chosen)
         if search.chosen(most) is chosen:
             break
-    chosen = holding(search, search.chosen(most))
+    if (plain := plain_friction(search, chosen := search.chosen(most))) is not chosen:
+        _nested(search, plain)
+        chosen = search.chosen(most)
+        if len(chosen.hypothesis.effects) < most and frozenset(chosen.hypothesis.names) not in done:
+            return grown(search, chosen, most)
     size = len(chosen.hypothesis.effects)
     if size < most and (late := search.late_sensors(chosen)):
         search.settled(search.refined(late, TO_THE_TOP))

@@ -45,6 +45,16 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     return found
 
 
+def plain_friction(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """Return a fit with the plain friction of its joints in place of other laws, where likelier.
+
+    A law with more values may have won only because it holds the joint. Beside it, what its further
+    values leave is sought, and not what the joint's own friction leaves.
+    """
+    found = max((holding(search, fit), *plainer(search, fit)), key=search.score)
+    return plain_friction(search, found) if search.score(found) > search.score(fit) else fit
+
+
 def holding(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Return a fit with the joint's own friction in place of a Coulomb friction, if far likelier.
 
