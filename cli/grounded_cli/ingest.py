@@ -37,7 +37,7 @@ BEST = ("better", "maybe better")  # verdicts on what was the best when its run 
 VERDICTS = {
     "first": ": what the search improves on",
     "better": ": the best so far",
-    "maybe better": ": the best so far, by less than the scatter of repeats may explain",
+    "maybe better": ": the best so far, but by no more than runs may scatter",
     "no better": " than the best so far",
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",

@@ -212,6 +212,7 @@ class Tried(Result):
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     repeats: int = 0  # runs beyond the first of each candidate on which that rests
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
+    unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
     starts: Starts | None = None  # what the start states of its runs cost, by the model
@@ -289,7 +290,7 @@ class Tried(Result):
         That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
 
         It is "maybe better" if its runs were better, but by so little that the scatter of repeats
-        may explain it.
+        may explain it or, while none tells that, the scatter that runs may have (`clear`).
 
         Args:
             last: whether it is the latest candidate; an earlier one without a trial gets "no
@@ -305,7 +306,7 @@ class Tried(Result):
             return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
-        return "maybe better" if self.probability < SURE else "better"
+        return "maybe better" if self.probability < SURE or self.unsure else "better"
 
     def summary(self) -> str:
         """Return the id, the utility and the verdict."""

@@ -121,7 +121,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "3.21 by the model, 0.0456 by the diagnosed one",
         "coulomb_friction:v",
         "96.0 %",
-        "first or better",
+        "maybe better or better",
         "no better",
         "What the model lacks",
     ):

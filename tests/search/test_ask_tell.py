@@ -140,7 +140,7 @@ def test_the_documents_have_the_commands_keys(search):
     best = {"candidate": search.best.candidate.id, "utility": search.best.utility}
     assert now["best"] == best and now["trials"] == len(search.trials)
     assert len(now["history"]) == len(search.candidates)
-    assert [row["verdict"] for row in now["history"]][:2] == ["first", "better"]
+    assert [row["verdict"] for row in now["history"]][:2] == ["first", "maybe better"]
     assert now["certainty"].startswith("the last gain is")
     ended = search.proposal.to_json()
     assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended
