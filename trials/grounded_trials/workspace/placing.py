@@ -16,12 +16,15 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.search.candidate import Candidate
 from grounded.search.certainty import student
+from grounded.search.starts import worth_of_start
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of
 
 FEWEST = 2  # runs from which a scatter is estimated
 UNLIKE = 0.975  # Student's t of a discarded run's start among the others: beyond, it is left out
+TRIED = 20  # latest starts from which a candidate is predicted
 LATEST = 50  # runs that are looked at; the way of placing a robot may change
 
 
@@ -44,6 +47,36 @@ class Placing:
     def known(self) -> bool:
         """Whether enough runs began to tell their scatter."""
         return bool((self.runs >= FEWEST).any())
+
+
+@dataclass(frozen=True)
+class FromStarts:
+    """What a candidate is predicted to be worth from where the latest runs began.
+
+    Args:
+        change: mean change of its utility against one from [task] start exactly.
+        std: standard deviation of single runs due to the start alone.
+        runs: how many runs that rests on.
+    """
+
+    change: float
+    std: float
+    runs: int
+
+
+def from_starts(workspace: Folder, made: Candidate) -> FromStarts | None:
+    """Predict a candidate from where the latest runs of the robot began.
+
+    Returns:
+        None if too few runs are known, or if the model fails from one of those starts.
+    """
+    starts = placing(workspace).off[-TRIED:]
+    if len(starts) <= FEWEST:
+        return None
+    worth = [worth_of_start(workspace.planner, made.policy, off) for off in starts]
+    if not np.isfinite(worth).all():
+        return None
+    return FromStarts(float(np.mean(worth)), float(np.std(worth, ddof=1)), len(worth))
 
 
 def placing(workspace: Folder, but: str = "") -> Placing:

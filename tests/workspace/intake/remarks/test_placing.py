@@ -7,6 +7,8 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded.result import with_error
+from grounded.search.starts import worth_of_start
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -14,7 +16,7 @@ from grounded_trials.workspace.discarding import set_aside
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.remarks import initial_state
 from grounded_trials.workspace.placing import placing
-from workspaces import make
+from workspaces import CONFIG, make
 
 
 @pytest.fixture
@@ -82,3 +84,27 @@ def test_next_names_the_way_on_that_status_names(w, tmp_path):
     said = grounded("-C", w.folder, "status").out
     assert "discard t0001" in out.partition("next:")[2]
     assert all("or go on with it: `propose`" in " ".join(one.split()) for one in (out, said))
+
+
+def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
+    """-2.217 was promised; from where the rig places the boat, -2.56 was to be expected."""
+    ran, *_ = read_trial(run(w))
+    for off in (0.2, -0.2, 0.15):
+        placed(w, tmp_path, ran, off)
+    w.forget()
+    found = propose_in(w)
+    known = found.to_json()["from_usual_starts"]
+    assert known["runs"] == 3 and known["utility_change"] < 0 < known["std"]
+    worth = [worth_of_start(w.planner, found.candidate.policy, off) for off in placing(w).off]
+    assert known["utility_change"] == pytest.approx(np.mean(worth))
+    said = " ".join(grounded("-C", w.folder, "propose").out.split())
+    expected = found.candidate.predicted_utility - found.noise_cost + np.mean(worth)
+    assert with_error(expected, known["std"]) in said
+    assert "from where the last 3 runs began, instead of exactly at [task] start" in said
+
+
+def test_before_the_first_run_a_promise_says_that_it_lacks_the_placing(tmp_path):
+    w = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
+    said = " ".join(grounded("-C", w.folder, "propose").out.split())
+    assert "starts exactly at [task] start" in said
+    assert grounded("-C", w.folder, "propose", "--json").json["from_usual_starts"] is None
