@@ -257,6 +257,22 @@ def test_a_calibrated_model_is_not_called_crude(car):
     assert replace(other, effects=("dead_zone:u",)).plain.startswith("calibrated model without")
 
 
+def test_errors_at_the_end_are_told_with_their_noise(cart):
+    """65 mm -> 87 mm stood in large type, two samples of a boat at 99 and 104 mm."""
+    findings = gather(Folder(cart))
+    reward = replace(findings.task.reward, terminal=np.array([1e4, 0.0]))
+    rng, runs = np.random.default_rng(0), []
+    for one in findings.runs:
+        states = one.trial.states + rng.normal(0, 0.03, one.trial.states.shape)
+        runs.append(replace(one, trial=replace(one.trial, states=states)))
+    task = replace(findings.task, reward=reward)
+    found = improvements_in(replace(findings, task=task, runs=tuple(runs)))
+    (end,) = [one for one in found if one.what.startswith("at the end: x")]
+    assert re.search(r"; \+- \d+ mm( and \d+ mm)? by noise alone, from one run", end.what) or (
+        "within its noise" in end.what
+    )
+
+
 def test_a_gain_at_the_end_is_said_first_and_the_terms_add_up(cart):
     """A crane's utility went from -4.232 to -2.549 at the end alone: "6.9 cm -> 7.0 cm"."""
     findings = gather(Folder(cart))

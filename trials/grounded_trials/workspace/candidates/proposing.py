@@ -183,7 +183,7 @@ def propose_in(workspace: Folder) -> Proposed:
     whole = noise_cost(workspace.task, candidate.policy, noise)
     off_target = off_target_of(workspace.task, [candidate.predicted_run])
     if not candidate.grounded:  # a run that no sensor measured
-        off_target = tuple(replace(one, noise=0.0) for one in off_target)
+        off_target = tuple(replace(one, noise=0.0, end_std=0.0) for one in off_target)
     begun = from_starts(workspace, candidate)
     return Proposed(proposal, path, then, cost, off_target, lacks, whole, begun)
 
