@@ -158,7 +158,7 @@ def std_at_end(ends: Sequence[Array], trials: Sequence[Trial], states: Sequence[
     toward[far == 0] = len(states) ** -0.5
     noise = float(np.sqrt(np.mean(toward**2 @ _sample_noise(trials, states) ** 2)))
     scatter = float(far.std(ddof=1)) if len(far) > 1 else 0.0
-    return max(noise, scatter) / len(far) ** 0.5
+    return float(max(noise, scatter) / len(far) ** 0.5)
 
 
 def by_runs(runs: int) -> str:

@@ -25,6 +25,7 @@ from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import rendered, with_unit
+from grounded_trials.workspace.candidates.rest_at_end import drawn
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
     cost_of_inputs,
@@ -212,10 +213,10 @@ def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
     if bare:
         start = {name: float(task.start[names.index(name)]) for name in bare}
         more = " ".join(f"--to {name}={value:g}" for name, value in start.items())
-        drawn = _drawn(task)
+        line = drawn(task)
         how = "with a column for each of them"
-        if drawn is not None:
-            again = NextCommand(drawn.verb, (*drawn.arguments, *more.split()))
+        if line is not None:
+            again = NextCommand(line.verb, (*line.arguments, *more.split()))
             command = rendered(again, workspace.address)
             how = f"and add {more}: `{command}`, with your other options"
         found.append(
@@ -239,26 +240,6 @@ def _leaving(task: Task, plan: Candidate) -> NDArray[np.bool_]:
         (states < task.safety_low) | (states > task.safety_high), axis=0
     )
     return out
-
-
-def _drawn(task: Task) -> NextCommand | None:
-    """Return the `target` command for the line or step that a target appears to be; else None."""
-    from grounded_trials.logs.inspection.inspect_pairs import velocities
-
-    names, rates = task.model.state_names, set(velocities(task.model).values())
-    given = [i for i in tracked(task) if names[i] not in rates]
-    way = task.model.difference(task.target, task.start)[:, given]
-    if not way.any():
-        return None
-    k = int(np.argmax(np.abs(way[-1])))
-    if not way[-1, k]:
-        return None
-    share = way[:, k] / way[-1, k]
-    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
-        return None
-    shape = "step" if np.allclose(share[1:], 1.0) else "line"
-    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
-    return NextCommand("target", (shape, *(word for pair in to for word in pair)))
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:

@@ -176,6 +176,16 @@ def propose_in(workspace: Folder) -> Proposed:
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
+    if not held and proposal.is_new and not proposal.standing.trials:
+        from grounded_trials.workspace.candidates.rest_at_end import to_end_at_rest
+
+        if (rest := to_end_at_rest(workspace, candidate)) is not None:
+            note = (
+                "`next:` draws the same line so that the plan comes to rest. To run "
+                f"{candidate.id} as it is: `{rendered(then, workspace.address)}`"
+            )
+            then = rest
+            proposal = replace(proposal, notes=(*proposal.notes, note))
     noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
     same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
     noise = noises.before([candidate.id])
