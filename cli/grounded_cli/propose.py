@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed, measured_alike, with_error
-from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE
+from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE, run_or_stop
 from grounded.search.step.step_size import Step
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import LABEL, field, number, progress, remark, show, show_json
@@ -409,7 +409,7 @@ def _came_true(
     little = gain < LITTLE * abs(best.utility) and not best.is_unsteady
     if blind or candidate.doubtful or not little:  # a note may say it
         return doubt
-    return f"{doubt}: run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
+    return f"{doubt}. {run_or_stop(gain, best)}"
 
 
 def _measured(workspace: Workspace) -> str:

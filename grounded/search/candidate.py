@@ -11,7 +11,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import Result, document, figure
+from grounded.result import Result, document, figure, percent
 from grounded.trial import Trial
 
 Way = Literal[
@@ -152,9 +152,7 @@ class Candidate(Result):
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
         if best and not best.is_unsteady and self.predicted_gain < LITTLE * abs(best.utility):
-            stop = (
-                f". Run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
-            )
+            stop = f". {run_or_stop(gain, best)}"
         may = "may well lose"
         if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
             may = f"may lose, as was said of {best.candidate.id}, which won"
@@ -194,6 +192,21 @@ class Candidate(Result):
         from grounded.search.pictures import candidate_figure
 
         return (candidate_figure(self),)
+
+
+def run_or_stop(gain: float, best: Tried) -> str:
+    """Return what a doubtful candidate gains if it keeps its promise, and how to stop instead.
+
+    Args:
+        gain: the promised gain over the best so far.
+        best: the best so far.
+    """
+    own = best.candidate.id
+    return (
+        f"If it keeps its promise, it gains {percent(gain / abs(best.utility))} of what {own} "
+        f"costs: run it if that is worth a run, else stop with {own}, the best so far "
+        "(`export best`)"
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
