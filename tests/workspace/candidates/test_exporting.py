@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.store.trial_file import read_trial, write_trial

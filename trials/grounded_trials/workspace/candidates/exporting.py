@@ -53,7 +53,11 @@ class Exported(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `export --json`."""
-        document = {"file": str(self.file), "candidate": self.candidate, "format": self.format}
+        document: dict[str, Any] = {
+            "file": str(self.file),
+            "candidate": self.candidate,
+            "format": self.format,
+        }
         document |= {"search_ended": self.ended}
         return document | ({"runner": str(self.runner)} if self.runner else {})
 
