@@ -148,8 +148,8 @@ def _as_read(workspace: Workspace, state: str, bias: str, value: float) -> str:
         there, kept = ["in [task] start"] * (state in task.start) + there, ""
     if not there:
         return (
-            f"{state} begins where its sensor reads 0, as neither [task] start nor the target names "
-            f"it: if it truly begins at 0, write {state} = {value:.3g} in [task] start"
+            f"{state} begins where its sensor reads 0, as neither [task] start nor the target "
+            f"names it: if it truly begins at 0, write {state} = {value:.3g} in [task] start"
         )
     return f"{kept}add {bias} to {state} {listed(there)}, unless this sensor measured it"
 
