@@ -75,6 +75,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if undo:
         _undo(workspace, json_)
         return
+    from grounded_trials.workspace.user_files.task_file import limits_of_log
+
     before = workspace.base_model.params
     done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
@@ -119,6 +121,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         remark("note", done.stopped)
     if done.left:
         remark("note", REMEASURE)
+    if bound := limits_of_log(workspace.config):
+        remark("note", bound)
     if done.logged:
         remark("note", f"target.csv is still the logged drive, {done.logged}: {DRAW}")
     show(f"\n{next_line(done.then)}")

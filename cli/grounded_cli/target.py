@@ -108,7 +108,7 @@ def command(
     from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
-    from grounded_trials.workspace.user_files.task_file import without_range
+    from grounded_trials.workspace.user_files.task_file import limits_of_log, without_range
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
@@ -245,6 +245,8 @@ def command(
             "so it does not show what a small error is there: choose the weight in "
             "[reward] state",
         )
+    if limited := limits_of_log(workspace.config):
+        remark("note", limited)
     show(f"\n{next_line(NextCommand('propose'))}")
 
 

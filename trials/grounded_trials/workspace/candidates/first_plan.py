@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 MOSTLY = 0.9  # share of the cost due to inputs above which a note says so
 HELD = 0.8  # share of the steps at a limit above which an input counts as limited
+BOUND = 0.05  # share of the steps at limits that only a log gave from which it is told
 TIGHTER = 0.9  # of the plan's smallest turning radius: a target below it turns too tightly
 ROUND = 0.05  # of that radius by which a plan must be off
 TURNING = 0.1  # share of the steps at a limit above which that limit is the reason
@@ -96,6 +97,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         found.append(
             f"{_never_sent(workspace) or f'[limits] are only the range used in {log}'}: enter the "
             "robot's real limits, then delete seen_in there"
+            + _at_limits(task, first)
             + "; and draw the manoeuvre (`target`): target.csv is the run in that log"
             * still_logged(workspace)
         )
@@ -134,6 +136,19 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _at_limits(task: Task, first: Candidate | None) -> str:
+    """Return for how much of a plan its inputs are at their limits, as a clause; or ""."""
+    sent = None if first is None else first.predicted_inputs
+    told = []
+    for j, name in enumerate(task.model.input_names if sent is not None else ()):
+        assert sent is not None
+        ends = [end for end in (task.low[j], task.high[j]) if np.isfinite(end)]
+        at = [np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9) for end in ends]
+        share = float(np.any(at, axis=0).mean()) if at else 0.0
+        told += [f"{name} is at them for {percent(share)} of this plan"] * (share > BOUND)
+    return f" ({listed(told)})" if told else ""
 
 
 def _never_sent(workspace: Folder) -> str:
