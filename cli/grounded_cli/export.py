@@ -87,8 +87,9 @@ def command(
             then = NextCommand("next", ("LOG", *done.named))
             if done.ended:
                 again = typed(then)
+                show("")
                 sentence(
-                    f"\nthe search has ended: {done.candidate} is its result, and no further run "
+                    f"the search has ended: {done.candidate} is its result, and no further run "
                     "is needed. Copy both to the robot to use it; a log of another run can be "
                     f"added with `{again}`"
                 )

@@ -101,7 +101,8 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
     if done.proposed is None:
         _tell(log, done.taken, None, workspace.base_model)
         ran = done.taken.trial
-        sentence(f"\nnothing is proposed before {ran} is discarded; or go on with it: `propose`")
+        show("")
+        sentence(f"nothing is proposed before {ran} is discarded; or go on with it: `propose`")
         show(next_line(done.taken.then))
         return
     _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)

@@ -100,6 +100,7 @@ def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
     said = " ".join(grounded("-C", w.folder, "propose").out.split())
     expected = found.candidate.predicted_utility - found.noise_cost + np.mean(worth)
     assert with_error(expected, known["std"]) in said
+    assert all(one["end_std"] == 0 for one in found.to_json()["off_target"])
     assert "from where the last 3 runs began, instead of exactly at [task] start" in said
 
 

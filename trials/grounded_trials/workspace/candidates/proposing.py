@@ -191,9 +191,10 @@ def propose_in(workspace: Folder) -> Proposed:
     noise = noises.before([candidate.id])
     cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
     whole = noise_cost(workspace.task, candidate.policy, noise)
-    off_target = off_target_of(workspace.task, [candidate.predicted_run])
+    predicted = off_target_of(workspace.task, [candidate.predicted_run])
+    off_target = tuple(replace(one, end_std=0.0) for one in predicted)  # no log's last sample
     if not candidate.grounded:  # a run that no sensor measured
-        off_target = tuple(replace(one, noise=0.0, end_std=0.0) for one in off_target)
+        off_target = tuple(replace(one, noise=0.0) for one in off_target)
     begun = from_starts(workspace, candidate)
     return Proposed(proposal, path, then, cost, off_target, lacks, whole, begun)
 
