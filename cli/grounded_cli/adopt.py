@@ -31,9 +31,8 @@ BESIDE = (
 )
 
 BIASED = (
-    "the robot is steered by its sensor of {state}, which reads {by}: {given} off by that unless "
-    "this sensor measured {them}. Do one of two things: keep the effect and "
-    "add {bias:.3g} to {them}; or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
+    "the robot is steered by its sensor of {state}, which reads {by}. Do one of two things. Keep "
+    "the effect: then {do}. Or correct the readings ([log.state.{state}] offset {off:+.3g}, and "
     "the same in the robot's program), remove sensor_bias:{state} from [model] effects, `discard` "
     "the trials and ingest their logs again"
 )
@@ -76,7 +75,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if undo:
         _undo(workspace, json_)
         return
-    from grounded_trials.workspace.candidates.standstill import read_at_start
+    from grounded_trials.workspace.user_files.task_file import limits_of_log
 
     before = workspace.base_model.params
     done = workspace.adopt(*effects, parameters=not effect_only)
@@ -92,12 +91,8 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         if family == "sensor_bias" and effect["name"] in effects:
             b = effect["b"]
             by = misread(b, units[state])
-            given, them = "[task] start and the target are", "them"
-            if seen := read_at_start(workspace, state, b):
-                given = f"[task] start is what it read at a standstill in {seen}, but the target is"
-                them = "it"
-            told = BIASED.format(state=state, by=by, off=-b, bias=b, given=given, them=them)
-            remark("note", told)
+            do = _as_read(workspace, state, with_unit(f"{b:.3g}", units[state]), b)
+            remark("note", BIASED.format(state=state, by=by, off=-b, do=do))
         if family == "sensor_scale" and effect["name"] in effects:
             more, by = "more" if effect["k"] > 0 else "less", 100 * abs(effect["k"])
             remark("note", SCALED.format(state=state, by=by, more=more))
@@ -126,9 +121,41 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         remark("note", done.stopped)
     if done.left:
         remark("note", REMEASURE)
+    if bound := limits_of_log(workspace.config):
+        remark("note", bound)
     if done.logged:
         remark("note", f"target.csv is still the logged drive, {done.logged}: {DRAW}")
     show(f"\n{next_line(done.then)}")
+
+
+def _as_read(workspace: Workspace, state: str, bias: str, value: float) -> str:
+    """Return what to do about values of a state that are given as true ones, not as readings.
+
+    Args:
+        workspace: the workspace.
+        state: the state whose sensor has a bias.
+        bias: that bias, with its unit.
+        value: that bias.
+    """
+    from grounded_trials.workspace.candidates.standstill import read_at_start
+
+    task = workspace.config.task
+    file = workspace.folder / str(task.target)
+    drawn = bool(task.target) and file.is_file() and state in workspace.read_target(file)[0]
+    there = ["in the target"] * drawn
+    if seen := read_at_start(workspace, state, value):
+        kept = f"leave [task] start, which is what this sensor read at a standstill in {seen}"
+        if not there:
+            return f"{kept}; the target names no {state}"
+        kept = f"{kept}, and "
+    else:
+        there, kept = ["in [task] start"] * (state in task.start) + there, ""
+    if not there:
+        return (
+            f"{state} begins where its sensor reads 0, as neither [task] start nor the target "
+            f"names it: if it truly begins at 0, write {state} = {value:.3g} in [task] start"
+        )
+    return f"{kept}add {bias} to {state} {listed(there)}, unless this sensor measured it"
 
 
 def _rewritten(changes: Sequence[Rewritten]) -> None:

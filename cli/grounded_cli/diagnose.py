@@ -218,7 +218,7 @@ def _places(found: Diagnosis, *, details: bool) -> None:
 
 def _effects(found: Diagnosis, *, details: bool) -> None:
     """Print the claimed effects and what ties with them, or with `details` all rivals."""
-    from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays
+    from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays, of_rivals
     from grounded_trials.report.diagnosis_notes import deviations
 
     rows, header = effect_table(found, rivals=details)
@@ -228,7 +228,7 @@ def _effects(found: Diagnosis, *, details: bool) -> None:
         _note(
             f"{WITHOUT}; evidence: log-likelihood lost without it"
             + tied
-            + "; alone: log-likelihood gained by it alone" * ("alone [nats]" in header)
+            + f"; {of_rivals(found)}" * ("alone [nats]" in header)
             + f"; {deviations(found)}"
             + (f"; {rows_apart}" if (rows_apart := of_delays(found)) else "")
         )

@@ -9,8 +9,13 @@ import click
 from grounded.errors import NextCommand
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import anyway, as_json
-from grounded_cli.console.terminal import remark, show, show_json
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.terminal import remark, sentence, show, show_json
+from grounded_cli.console.workspace_option import (
+    in_workspace,
+    next_line,
+    open_workspace,
+    typed,
+)
 
 # each format and how to use it
 USES = {
@@ -79,5 +84,15 @@ def command(
             show(f"  {USES[done.format]}")
         else:
             show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")
-            then = next_line(NextCommand("next", ("LOG", *done.named)))
-            show(f"\ncopy both to the robot, run it, record a log, then\n{then}")
+            then = NextCommand("next", ("LOG", *done.named))
+            if done.ended:
+                again = typed(then)
+                show("")
+                sentence(
+                    f"the search has ended: {done.candidate} is its result, and no further run "
+                    "is needed. Copy both to the robot to use it; a log of another run can be "
+                    f"added with `{again}`"
+                )
+                show(next_line(NextCommand("report", ("--html",))))
+            else:
+                show(f"\ncopy both to the robot, run it, record a log, then\n{next_line(then)}")

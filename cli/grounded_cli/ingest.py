@@ -37,7 +37,7 @@ BEST = ("better", "maybe better")  # verdicts on what was the best when its run 
 VERDICTS = {
     "first": ": what the search improves on",
     "better": ": the best so far",
-    "maybe better": ": the best so far, by less than the scatter of repeats may explain",
+    "maybe better": ": the best so far, but by no more than runs may scatter",
     "no better": " than the best so far",
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",
@@ -100,7 +100,10 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
         return
     if done.proposed is None:
         _tell(log, done.taken, None, workspace.base_model)
-        show(f"\nnothing is proposed from this log\n{next_line(done.taken.then)}")
+        ran = done.taken.trial
+        show("")
+        sentence(f"nothing is proposed before {ran} is discarded; or go on with it: `propose`")
+        show(next_line(done.taken.then))
         return
     _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
     show("")
@@ -141,7 +144,10 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         meaning = VERDICTS.get(BEGUN if doubted else one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
             says = any("discard" in warning for warning in one.warnings)
-            meaning = f"; discard it, as the {'warning' if says else 'note'} says"
+            meaning = (
+                f"; discard it, as the {'warning' if says else 'note'} says, or go on with it: "
+            )
+            meaning += "`propose`"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         ended = one.utility == float("-inf")

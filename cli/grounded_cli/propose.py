@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.result import listed, measured_alike
-from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE
+from grounded.result import listed, measured_alike, with_error
+from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE, run_or_stop
 from grounded.search.step.step_size import Step
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import LABEL, field, number, progress, remark, show, show_json
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from grounded.task import Task
     from grounded_trials import Workspace
     from grounded_trials.workspace.candidates.proposing import Proposed
+    from grounded_trials.workspace.placing import FromStarts
 
 
 MOST = 3  # target states whose range is shown at most
@@ -33,6 +34,7 @@ MINOR = 0.1  # of the largest reason: a smaller one is not mentioned
 LUCKY = 2.0  # standard errors within which a difference counts as scatter
 MUCH = 0.2  # share of the best cost above which its part due to sensor noise is shown
 MISSED = 0.5  # share of a run's cost: a model off by more cannot say what is left to gain
+PLACED = 0.02  # share of a predicted utility: where runs began is told if it changes more
 ASTRAY = 3.0  # a model that predicts more than this times a run's cost does not replay it
 
 
@@ -89,9 +91,14 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         show(field("so far", text, "  "))
         for part in parts:
             show(field("", part, "    "))
-    lacks = "; this model lacks what the last diagnosis found" * bool(proposed.lacks)
     trust = _trust(candidate, standing, workspace, proposed.noise_cost)
-    show(field("trust", trust + lacks, "  "))
+    trust += "; this model lacks what the last diagnosis found" * bool(proposed.lacks)
+    if not standing.trials and not proposed.from_starts and not workspace.config.system.reachable:
+        trust += (
+            ". The prediction starts exactly at [task] start: what placing the robot less exactly "
+            "costs is not in it, and shows after a few runs"
+        )
+    show(field("trust", trust, "  "))
     show_extent(candidate, workspace.task)
     if last:
         show(f"\n{next_line(proposed.then)}")
@@ -110,8 +117,19 @@ def _predicted(proposed: Proposed) -> str:
     if cost > 0 and number(in_log) != number(promised):  # which `status` shows
         share = _of_it(proposed.noise_in_log, in_log) or ", including sensor noise"
         text += f", about {number(in_log)} in its log{share}"
+    text += _from_usual_starts(proposed.from_starts, in_log)
     errors = "; ".join(one.summary() for one in proposed.off_target)
     return f"{text}; off target: {errors}" if errors else text
+
+
+def _from_usual_starts(found: FromStarts | None, in_log: float) -> str:
+    """Return what is predicted from where earlier runs began, if that matters; else ""."""
+    if found is None or not max(abs(found.change), found.std) > PLACED * abs(in_log):
+        return ""
+    return (
+        f"; {with_error(in_log + found.change, found.std)} (one standard deviation of single runs) "
+        f"from where the last {found.runs} runs began, instead of exactly at [task] start"
+    )
 
 
 def _samples(candidate: Candidate, standing: Standing, task: Task) -> str:
@@ -391,7 +409,7 @@ def _came_true(
     little = gain < LITTLE * abs(best.utility) and not best.is_unsteady
     if blind or candidate.doubtful or not little:  # a note may say it
         return doubt
-    return f"{doubt}: run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
+    return f"{doubt}. {run_or_stop(gain, best)}"
 
 
 def _measured(workspace: Workspace) -> str:

@@ -114,8 +114,7 @@ def summary(status: Status) -> str:
 def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
     from grounded.result import percent
-    from grounded.search.candidate import SURE
-    from grounded.search.certainty import chance, owed_to_start, share_of_cost
+    from grounded.search.certainty import owed_to_start, share_of_cost
 
     best, own = standing.incumbent, standing.history[0]
     if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
@@ -124,8 +123,8 @@ def _gained(standing: Standing) -> str:
         return "; the model's own policy failed"
     if best.candidate.base == "" or not own.utility:
         return ""
-    if chance(own, best, standing.history) < SURE:
-        return "; the scatter of repeats may explain its lead on the model's own policy"
+    if why := standing.lead_doubt:
+        return f"; {why}"
     share = share_of_cost(own, best, standing.history)
     gain = f", {share} better than the model's own policy"
     if start := owed_to_start(own, best, standing.history):

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from grounded.frozen import Array
-    from grounded.model import Model
     from grounded_trials import Workspace
     from grounded_trials.workspace.user_files.config import TaskTable
 
@@ -54,6 +53,12 @@ TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 @click.option(
     "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
 )
+@click.option(
+    "--rest",
+    "at_rest",
+    is_flag=True,
+    help="Let the states that a line leaves free rest at its end, by weights in [reward] terminal.",
+)
 @in_workspace
 @as_json
 def command(
@@ -66,6 +71,7 @@ def command(
     hold: float,
     to: tuple[str, ...],
     seconds: float | None,
+    at_rest: bool,
     json_: bool,
 ) -> None:
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
@@ -78,7 +84,8 @@ def command(
     begins at the position in [task] start, along x, and a figure-8 at its crossing: its length lies
     45 degrees to the right of x. What --to names, such as the height of a drone, keeps its value,
     but a velocity that moves the robot along the path follows it. With --hold a path ends at rest
-    and stays there.
+    and stays there. With --rest the states that a line leaves free, such as the angle of a beam
+    under a ball, rest at its end, and may move on the way.
 
     The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
     [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
@@ -96,11 +103,12 @@ def command(
         step_target,
         swing_up,
     )
-    from grounded_trials.workspace.candidates.at_rest import rest_of_trials, rest_value
+    from grounded_trials.workspace.candidates.at_rest import rest_of_trials
+    from grounded_trials.workspace.candidates.rest_at_end import names_told, rest_at_end
     from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
-    from grounded_trials.workspace.user_files.task_file import without_range
+    from grounded_trials.workspace.user_files.task_file import limits_of_log, without_range
 
     workspace = open_workspace()
     model, dt = workspace.base_model, workspace.config.task.dt
@@ -129,7 +137,16 @@ def command(
     else:
         columns, rest = _recorded(workspace, shape), {}
     before, old = _reward(workspace), workspace.config.task
-    path, ran = workspace.target(columns), bool(workspace.candidate_ids())
+    if at_rest and shape != "line":
+        raise click.UsageError(
+            "--rest is for a line: a swing-up ends at rest as it is, a path with --hold"
+        )
+    resting = rest_at_end(workspace, columns, start) if shape == "line" else None
+    ended = resting if at_rest else None
+    if ended is not None:
+        columns = {**columns, **ended.columns}
+    extra = (ended.weights, [*ended.columns]) if ended is not None else ()
+    path, ran = workspace.target(columns, *extra), bool(workspace.candidate_ids())
     if rest:
         set_start(workspace.config.file, rest)
         workspace.forget()
@@ -164,14 +181,16 @@ def command(
         text = with_unit(span, model.states[name])
         show(field(name, text, "  "))
     if free:
-        resting = _rest_of(model, free) * (shape == "line")
         text = _free(free, reward, velocities(model)) if resting else _free(free, reward)
-        if resting:
-            begins, last = start.get(resting, 0.0), {n: float(c[-1]) for n, c in columns.items()}
-            last |= {n: 0.0 for n in velocities(model) if n in last}
-            reading = rest_value(workspace, last, resting)
-            text += _at_the_end(model, columns, resting, begins, reading)
+        if resting is not None and ended is None:
+            told = names_told([*resting.columns], resting.columns)
+            text += (
+                f". To ask for rest at the end, but not on the way ({told}, by weights in [reward] "
+                "terminal): draw it again with `--rest` as well"
+            )
         show(field("free", text, "  "))
+    elif at_rest and ended is None:
+        remark("note", "--rest has nothing to add: every state has a column already")
     if ran:
         _tell_undo(old, before, reward, rows - 1)
     if rest:
@@ -183,6 +202,7 @@ def command(
     slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))
     for kind, by in (
         ("state", f"1 / (range in the target)^2{slower}"),
+        ("terminal", "ten times such weights, for the end"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
@@ -225,6 +245,8 @@ def command(
             "so it does not show what a small error is there: choose the weight in "
             "[reward] state",
         )
+    if limited := limits_of_log(workspace.config):
+        remark("note", limited)
     show(f"\n{next_line(NextCommand('propose'))}")
 
 
@@ -245,48 +267,6 @@ def _tell_undo(
         f"before: {'; '.join([*was, f'the target in {old.target}.bak'])}. To go back to it and its "
         f"candidates, copy {old.target}.bak and grounded.toml.bak over {old.target} and "
         "grounded.toml"
-    )
-
-
-def _rest_of(model: Model, free: list[str]) -> str:
-    """Return the first free state that has a rate among the states, else the first free state."""
-    from grounded_trials.logs.inspection.inspect_pairs import velocities
-
-    return next((name for name in free if name in velocities(model)), free[0])
-
-
-def _at_the_end(
-    model: Model, columns: dict[str, Array], rest: str, begins: float, at: float
-) -> str:
-    """Say how to ask for rest of a free state, at the end only.
-
-    A column alone would get a weight at every step, and hold there what the run needs to move.
-
-    Args:
-        model: the model of the states.
-        columns: the target without that state.
-        rest: the state.
-        begins: its value in [task] start.
-        at: what its sensor shows at rest.
-    """
-    import numpy as np
-
-    from grounded_trials.logs.inspection.inspect_pairs import velocities
-    from grounded_trials.workspace.off_target import usual_weights
-    from grounded_trials.workspace.user_files.config import OFFERED
-    from grounded_trials.workspace.user_files.task_file import LEAST
-
-    rows = len(next(iter(columns.values())))
-    added = {rest: np.linspace(min(begins, at - LEAST), at, rows)}
-    if (rate := velocities(model).get(rest)) is not None and rate not in columns:
-        added[rate] = added[rest]  # only for its usual weight
-    usual = usual_weights(model, {**columns, **added})
-    named, it = listed(added), "them" if len(added) > 1 else "it"
-    told = ", ".join(f"{name} = {OFFERED * usual[name]:.4g}" for name in added)
-    return (
-        f". To ask for rest there, but at the end only: draw it again with `--to {rest}={at:.3g}` "
-        f"as well. The weights that [reward] state then gets for {named} would hold {it} all the "
-        f"way: remove them there, and give terminal in [reward] {told}"
     )
 
 

@@ -277,10 +277,8 @@ def rest(rows: Sequence[RulerRow]) -> str:
         return ""
     times, share, name, row = max(found, key=lambda one: one[:3])
     when = _when(row)
-    least = "at least " * row.floor_bound
-    text = (
-        f"the state {name} is still off by {least}{float(f'{times:.2g}'):,g} times the noise {when}"
-    )
+    noise = "the most that can be noise" if row.floor_bound else "the noise"
+    text = f"the state {name} is still off by {float(f'{times:.2g}'):,g} times {noise} {when}"
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
         return f"{text}, but that is only {of}: too little to look for a cause"

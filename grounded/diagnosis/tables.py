@@ -150,6 +150,17 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
     return rows, ("effect (*: claimed)", "without", *evidence, "value")
 
 
+def of_rivals(diagnosis: Diagnosis) -> str:
+    """Say what the evidence of an effect that was not claimed means; "" if there is none."""
+    beside = weighed_beside(diagnosis)
+    if all(row.effect in beside for row in diagnosis.ranking):
+        return ""
+    text = "alone: log-likelihood gained by it alone"
+    if not any(row.claimed for row in diagnosis.ranking):
+        return text
+    return f"{text}, in place of what is claimed; beside that, it gains too little to be claimed"
+
+
 def of_delays(diagnosis: Diagnosis) -> str:
     """Say where the +- of delays comes from if the log's rows don't tell when a command was sent.
 

@@ -259,11 +259,10 @@ def _causes(
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
-            text = f"{_moved(claims, adopted)}{OPEN * open_gap}"
-            text += _others(claims, identified, adopted)
             named = parameters_off(claims)[:NAMED]
             held = dict.fromkeys(other for n in named for other in given.get(n, ()))
-            text += GIVEN.format(listed(held)) * bool(held)
+            text = f"{_moved(claims, adopted)}{GIVEN.format(listed(held)) * bool(held)}"
+            text += OPEN * open_gap + _others(claims, identified, adopted)
             vague = [n for n in named if n in lost]
             text += f", but these trials do not determine {listed(vague)}" * bool(vague)
             joined = [n for n in named if n in joint]
@@ -405,11 +404,10 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
     for name in old:
         if name in off_with:
             ties.setdefault(off_with[name], []).append(value_called(name, adopted))
-    unless = " or ".join(
-        f"{tie}, with which {listed(some)} {'is' if len(some) == 1 else 'are'} off"
+    wrong = "but need not be wrong" + "".join(
+        f"; if {tie} is the cause instead, {listed(some)} {'is' if len(some) == 1 else 'are'} off"
         for tie, some in ties.items()
     )
-    wrong = f"but need not be wrong{f', unless the cause is {unless}' * bool(ties)}"
     if len(old) > NAMED:
         most = sorted(by, key=lambda name: -abs(by[name]))[:NAMED]
         told = [

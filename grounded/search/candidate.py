@@ -11,7 +11,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import Result, document, figure
+from grounded.result import Result, document, figure, percent
 from grounded.trial import Trial
 
 Way = Literal[
@@ -152,9 +152,7 @@ class Candidate(Result):
         off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
         stop = ""
         if best and not best.is_unsteady and self.predicted_gain < LITTLE * abs(best.utility):
-            stop = (
-                f". Run it if runs are cheap, else stop with {best.candidate.id}, the best so far"
-            )
+            stop = f". {run_or_stop(gain, best)}"
         may = "may well lose"
         if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
             may = f"may lose, as was said of {best.candidate.id}, which won"
@@ -196,6 +194,21 @@ class Candidate(Result):
         return (candidate_figure(self),)
 
 
+def run_or_stop(gain: float, best: Tried) -> str:
+    """Return what a doubtful candidate gains if it keeps its promise, and how to stop instead.
+
+    Args:
+        gain: the promised gain over the best so far.
+        best: the best so far.
+    """
+    own = best.candidate.id
+    return (
+        f"If it keeps its promise, it gains {percent(gain / abs(best.utility))} of what {own} "
+        f"costs: run it if that is worth a run, else stop with {own}, the best so far "
+        "(`export best`)"
+    )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Tried(Result):
     """A candidate with its trials: mean utility and, if repeats allow, its standard error."""
@@ -212,6 +225,7 @@ class Tried(Result):
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     repeats: int = 0  # runs beyond the first of each candidate on which that rests
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
+    unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
     starts: Starts | None = None  # what the start states of its runs cost, by the model
@@ -289,7 +303,7 @@ class Tried(Result):
         That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
 
         It is "maybe better" if its runs were better, but by so little that the scatter of repeats
-        may explain it.
+        may explain it or, while none tells that, the scatter that runs may have (`clear`).
 
         Args:
             last: whether it is the latest candidate; an earlier one without a trial gets "no
@@ -305,7 +319,7 @@ class Tried(Result):
             return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
-        return "maybe better" if self.probability < SURE else "better"
+        return "maybe better" if self.probability < SURE or self.unsure else "better"
 
     def summary(self) -> str:
         """Return the id, the utility and the verdict."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.result import figure, percent, with_error
-from grounded.search.candidate import PART, Candidate, Tried
+from grounded.search.candidate import PART, SURE, Candidate, Tried
 from grounded.search.scatter import (
     NoiseSoFar,
     Repeats,
@@ -33,6 +33,7 @@ ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
 MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
+CLEAR = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
 FEW = 8  # repeats below which a scatter may be off by half, so that their number is told
 
 
@@ -182,7 +183,9 @@ def with_chances(history: Sequence[Tried]) -> tuple[Tried, ...]:
     found, best = list(history), None
     for k, tried in enumerate(history):
         if tried.accepted and best is not None:
-            found[k] = replace(tried, probability=chance(best, tried, history))
+            sure = chance(best, tried, history)
+            unsure = math.isnan(sure) and not clear(best, tried, history)
+            found[k] = replace(tried, probability=sure, unsure=unsure)
         best = tried if tried.accepted else best
     return tuple(found)
 
@@ -203,6 +206,32 @@ def chance(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     if not freedom or (error and _start_unknown(before, after, history)):
         return math.nan
     return student(gain / error, freedom) if error else float(gain > 0)
+
+
+def clear(before: Tried, after: Tried, history: Sequence[Tried]) -> bool:
+    """Return whether a gain is one although no repeat tells how much runs scatter.
+
+    Their utilities are then taken to scatter as in `in_doubt`, as chi-squared with eight degrees of
+    freedom. The part of the gain that is due to different start states does not count.
+    """
+    if not math.isfinite(before.utility):  # it failed
+        return True
+    left = after.utility - owed_to_start(before, after, history)
+    return before.utility < CLEAR * left
+
+
+def explained(before: Tried, after: Tried, history: Sequence[Tried]) -> str:
+    """Return what may explain that a later candidate is ahead, to be followed by `its lead`; or "".
+
+    "" if it is better with probability SURE or, while nothing similar was repeated, if the gain is
+    `clear`.
+    """
+    sure = chance(before, after, history)
+    if sure < SURE:
+        return "the scatter of repeats may explain"
+    if math.isnan(sure) and not clear(before, after, history):
+        return "how much runs scatter is not known, and may explain"
+    return ""
 
 
 def share_of_cost(before: Tried, after: Tried, history: Sequence[Tried]) -> str:

@@ -30,7 +30,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, list_of, type_of
 from grounded.model import Model
-from grounded.result import figure
+from grounded.result import figure, percent
 from grounded.search.candidate import BY_STEP, Candidate, Tried
 from grounded.search.certainty import few, one_trial_error, runs_needed
 from grounded.search.making import About, Maker
@@ -51,7 +51,9 @@ from grounded.trial import Trial
 
 if TYPE_CHECKING:
     from grounded.search.first_policy import Tick
+    from grounded.solve.ddp import Solution
 
+LATEST = 100  # iterations of a plan whose progress is told if it is not optimal
 RISKY = 0.2  # of the best cost: likely loss of a step above which the own derivatives are asked
 
 
@@ -124,7 +126,10 @@ def propose(
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":
             return made
-        note = f"the plan is not optimal in the model: {plan.sentence}. It can be run all the same"
+        note = (
+            f"the plan is not optimal in the model: {plan.sentence}{_slowly(plan)}. It can be run "
+        )
+        note += "all the same: the steps from its run go on improving it"
         return replace(made, notes=(*made.notes, note))
     found = _improvement(make, now.incumbent, options)
     if found.candidate is None:
@@ -132,6 +137,14 @@ def propose(
     before = standing(task, candidates, trials[:-1], options, fingerprint, planner)
     note = _run_again(before, now, trials[-1], found.candidate)
     return replace(found, notes=(*found.notes, note)) if note else found
+
+
+def _slowly(plan: Solution) -> str:
+    """Return by how much the last iterations of a plan lowered its cost; "" if there were few."""
+    costs = [line.cost for line in plan.trace[-LATEST:]]
+    if len(costs) < LATEST or not costs[0] > 0:
+        return ""
+    return f" (the last {LATEST} by {percent(1 - costs[-1] / costs[0])})"
 
 
 def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> str:

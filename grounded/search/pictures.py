@@ -54,10 +54,12 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         key.append(Key("accepted", "optimum of the real system"))
     if whole.bands:
         key.append(Key("other", "±2 standard errors of the best", "band"))
+    stepped = any(t.candidate.grounded for t in shown)
     caption = (
         "Each candidate is run on the real system; it becomes the best so far if its utility, the "
-        "sum of its rewards, is higher. A dash is the utility predicted by the model, which "
-        "replays the trial before."
+        "sum of its rewards, is higher. A dash is the utility predicted by the model"
+        + "; for all but the first candidate, it replays an earlier trial" * stepped
+        + "."
     ) + f" {left} candidates in between are not drawn." * bool(left)
     return Figure("utility", "Utility", caption, panels, tuple(key))
 

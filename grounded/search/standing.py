@@ -26,7 +26,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
-from grounded.search.certainty import LUCK, error_between, few, judged, last_improvement
+from grounded.search.certainty import (
+    LUCK,
+    error_between,
+    explained,
+    few,
+    judged,
+    last_improvement,
+)
 from grounded.search.scatter import Repeats
 from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
@@ -114,6 +121,16 @@ class Standing(Result):
             return ""
         return made.less_in_log(self.incumbent, tried.noise_missed)
 
+    @property
+    def lead_doubt(self) -> str:
+        """A clause on what may explain the best one's lead on the model's own policy; or ""."""
+        best, own = self.incumbent, self.history[0] if self.history else None
+        if best is None or own is None or own.candidate.base or not own.utilities:
+            return ""
+        if best.candidate is own.candidate or not (why := explained(own, best, self.history)):
+            return ""
+        return f"{why} its lead on the model's own policy"
+
     def verdict(self, tried: Tried) -> str:
         """Return the verdict on a candidate, see `Tried.verdict`."""
         return tried.verdict(tried.candidate is (self.outstanding or self.history[-1].candidate))
@@ -130,7 +147,12 @@ class Standing(Result):
         return document(
             phase=self.phase,
             iteration=self.iteration,
-            best=best and {"candidate": best.candidate.id, "utility": best.utility},
+            best=best
+            and {
+                "candidate": best.candidate.id,
+                "utility": best.utility,
+                "lead_doubt": self.lead_doubt or None,
+            },
             utilities=self.utilities,
             trials=self.trials,
             outstanding=self.outstanding.id if self.outstanding else None,

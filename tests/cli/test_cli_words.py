@@ -210,10 +210,12 @@ def test_a_rerun_says_who_is_best_now_where_it_is_another(capsys):
 
 def test_a_log_that_was_stored_before_is_not_the_best_of_today(cart, tmp_path):
     """`ingest` of the second of eight runs again said "better: the best so far"."""
+    from grounded_cli.ingest import BEST
+
     folder = copied(cart, tmp_path / "w")
     now = grounded("-C", folder, "status", "--json").json
     best, tried = now["best"]["candidate"], now["history"]
-    older = [one for one in tried if one["verdict"] == "better" and one["candidate"] != best]
+    older = [one for one in tried if one["verdict"] in BEST and one["candidate"] != best]
     files = {one.trial.candidate: one.stored.path for one in Workspace(folder).trials()}
     assert older
     for name in (older[0]["candidate"], best):

@@ -58,11 +58,15 @@ def test_how_old_samples_are_is_one_short_sentence(monkeypatch):
 def test_the_noise_in_a_log_is_told_as_that_of_the_best_one():
     """0.0020 of it, what a prediction lacks, stood beside the 0.0060 of the best one."""
     made = SimpleNamespace(predicted_utility=-0.0056)
-    proposed = SimpleNamespace(candidate=made, noise_cost=0.002, noise_in_log=0.006, off_target=())
+    proposed = SimpleNamespace(
+        candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.006, off_target=()
+    )
     assert _predicted(proposed).endswith(
         "about -0.007600 in its log, about 0.006000 of it sensor noise"
     )
-    rest = SimpleNamespace(candidate=made, noise_cost=0.002, noise_in_log=0.001, off_target=())
+    rest = SimpleNamespace(
+        candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.001, off_target=()
+    )
     assert _predicted(rest).endswith("in its log, including sensor noise")
 
 

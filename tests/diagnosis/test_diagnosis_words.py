@@ -362,7 +362,7 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
     assert "noise is not known: repeat one run" in mended.sentence
     known, state = said(0.9, 0.89, bound=False)
     assert known.kind == "none" and "890 mm" in known.sentence and not state
-    assert "at least 9 times" in said(0.9, 0.1)[0].sentence
+    assert "9 times the most that can be noise" in said(0.9, 0.1)[0].sentence
     left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
     assert "at most 100 mm" in left.sentence()
 

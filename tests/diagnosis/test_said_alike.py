@@ -20,7 +20,7 @@ from grounded.diagnosis.report import (
     Verdict,
 )
 from grounded.diagnosis.ruler_words import improvement, rest
-from grounded.diagnosis.tables import EFFECTS, effect_table, error_table
+from grounded.diagnosis.tables import EFFECTS, effect_table, error_table, of_rivals
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import UNSURE, verdict
 from grounded.effects import Library
@@ -95,6 +95,8 @@ def test_evidence_that_a_rival_gains_alone_has_its_own_column():
     ]
     rows, header = effect_table(found, rivals=False)
     assert len(rows) == 2 and "alone [nats]" not in header
+    assert holds(of_rivals(found), "in place of what is claimed", "too little to be claimed")
+    assert of_rivals(Diagnosis(Verdict("effect"), ranking=ranking[:1])) == ""
     assert all(len(row) == len(header) for row in rows)
 
 
@@ -121,7 +123,7 @@ def test_noise_from_trials_that_are_merely_alike_is_a_bound_everywhere():
         found = Diagnosis(Verdict("none"), prediction_error=rows)
         assert ("noise, at most" in error_table(found)[1]) is bound
         assert ("at most" in improvement(rows)) is bound
-        assert ("at least" in rest(rows)) is bound
+        assert ("the most that can be noise" in rest(rows)) is bound
 
 
 def test_the_noise_of_the_sentence_is_the_noise_of_the_table():

@@ -512,6 +512,15 @@ def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
     assert not any("waiting" in key.name for key in search_figure(now).key)
 
 
+def test_the_first_candidate_is_not_said_to_replay_a_trial():
+    """A dash was "predicted by the model, which replays the trial before" before any trial."""
+    now = many_flights(3).standing
+    alone = search_figure(replace(now, history=now.history[:1], incumbent=now.history[0]))
+    assert alone is not None and "replays" not in alone.caption
+    several = search_figure(now)
+    assert several is not None and "for all but the first candidate, it replays" in several.caption
+
+
 def _linear(colour):
     value = np.array(rgb(colour)) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

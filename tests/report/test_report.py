@@ -301,7 +301,7 @@ def test_text_says_what_was_calibrated(cart, tmp_path):
     out = " ".join(grounded("-C", folder, "report").out.split())
     assert "mass 1.00 -> 1.40 kg" in out
     assert re.search(r"\brms error of the predicted utility\b.*\butilities\b.* 1\.50\b", out)
-    assert "scatter" not in out
+    assert "scatter of repeats" not in out
     one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
     document = DIAGNOSIS | {"utility_prediction": one}
     write_document(folder / "reports" / "diagnosis.json", document)

@@ -138,9 +138,11 @@ def test_results_are_one_line_a_table_and_a_document(search):
 def test_the_documents_have_the_commands_keys(search):
     now = search.standing.to_json()
     best = {"candidate": search.best.candidate.id, "utility": search.best.utility}
+    unknown = "how much runs scatter is not known, and may explain its lead"
+    best["lead_doubt"] = f"{unknown} on the model's own policy"
     assert now["best"] == best and now["trials"] == len(search.trials)
     assert len(now["history"]) == len(search.candidates)
-    assert [row["verdict"] for row in now["history"]][:2] == ["first", "better"]
+    assert [row["verdict"] for row in now["history"]][:2] == ["first", "maybe better"]
     assert now["certainty"].startswith("the last gain in utility is")
     ended = search.proposal.to_json()
     assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended

@@ -13,6 +13,7 @@ from grounded.search.certainty import (
     beyond_one_trial,
     chance,
     error_between,
+    explained,
     few,
     last_improvement,
     owed_to_start,
@@ -203,7 +204,8 @@ def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, wo
     [
         (-3.9, (-4.0, -4.2, -3.8), "maybe better"),  # within the scatter of later repeats
         (-2.0, (-4.0, -4.2, -3.8), "better"),
-        (-3.9, (-4.0,), "better"),  # nothing was repeated: the noise is unknown
+        (-3.9, (-4.0,), "maybe better"),  # nothing was repeated: the noise is unknown
+        (-1.1, (-4.0,), "better"),  # but no run scatters as much
         (-3.9, (-4.0, -4.0, -4.0), "better"),  # a system that repeats itself exactly
     ],
 )
@@ -211,8 +213,23 @@ def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repea
     history = with_chances([tried(-90.0, base=""), tried(*repeats), tried(utility)])
     assert [one.verdict() for one in history] == ["first", "better", word]
     said = last_improvement(history)
-    if word == "maybe better":
+    if word == "maybe better" and len(repeats) > 1:
         assert holds(said, f"probability {history[-1].probability:.2f}")
+
+
+@pytest.mark.parametrize(
+    ("runs", "clause"),
+    [
+        (((-4.0,), (-3.68,)), "how much runs scatter is not known, and may explain"),
+        (((-4.0, -4.3), (-3.9,)), "the scatter of repeats may explain"),
+        (((-4.0,), (-1.0,)), ""),
+        (((-np.inf,), (-1.0,)), ""),
+    ],
+)
+def test_a_lead_is_told_only_if_nothing_may_explain_it(runs, clause):
+    """Single runs were "8.2 % better"; ten of each differed by 4.0 %."""
+    history = with_chances([tried(*runs[0], base=""), tried(*runs[1])])
+    assert explained(*history, history) == clause
 
 
 def from_to_zero(off):

@@ -853,7 +853,7 @@ def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, m
     monkeypatch.setattr("grounded.search.candidate.LITTLE", 10.0)
     done = grounded("-C", folder, "propose")
     assert holds(
-        " ".join(done.err.split()), "c0002 may well lose", "if runs are cheap", "stop with c0001"
+        " ".join(done.err.split()), "c0002 may well lose", "% of what c0001 costs", "`export best`"
     )
     assert "stop with" not in done.out and last(done) == "grounded run"
 

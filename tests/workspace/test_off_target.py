@@ -108,6 +108,27 @@ def test_what_only_the_end_weighs_is_told_there():
     assert both.rms > 0.4 and both.end == pytest.approx(0.002)
 
 
+def test_an_error_at_the_end_has_its_standard_error():
+    """The same boat ended "65 mm", "131 mm" and "87 mm" off: single samples with 16 mm of noise."""
+    weights = {"terminal": np.array([1.0, 1.0, 0.0, 0.0])}
+    noise = np.random.default_rng(0).normal(0.0, 0.016, (3, H + 1, 2))
+    runs = []
+    for one in noise:
+        states = off(0.1)
+        states[:, :2] += one
+        runs.append(run(states))
+    (alone,) = off_target_of(task(**weights), runs[:1])
+    assert alone.end_std == pytest.approx(0.016, rel=0.4) and alone.runs == 1
+    assert holds(alone.summary(), "at the end (+- ", "mm by noise alone, from one run)")
+    (several,) = off_target_of(task(**weights), runs)
+    ends = [np.hypot(*one.states[-1, :2]) for one in runs]
+    least = float(np.std(ends, ddof=1)) / 3**0.5
+    assert several.end_std >= least * 0.999 and several.runs == 3
+    assert holds(several.summary(), "by 3 runs)")
+    (exact,) = off_target_of(task(**weights), [run(off(0.1))])
+    assert exact.end_std == pytest.approx(0.0, abs=1e-12) and "+-" not in exact.summary()
+
+
 ARM = Model(
     states={"shoulder": "rad", "elbow": "rad", "d_shoulder": "rad/s", "d_elbow": "rad/s"},
     inputs={"a": "1", "b": "1"},

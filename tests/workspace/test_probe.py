@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,6 +55,22 @@ def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     bounded(w, reached.min() - 0.01, reached.max() + 0.5)
     identity, sentence = offered(w, found)
     assert identity == "" and "[safety]" in sentence
+
+
+def test_before_the_first_run_the_command_for_later_is_named(tmp_path):
+    """A trial that "may tell sensor_bias:beam from offset:v" was named without a command."""
+    w = Workspace(make(tmp_path / "w", config=NOISY).folder)
+    tied = SimpleNamespace(
+        no_cause=False,
+        changed=(),
+        indistinguishable=(("sensor_bias:x", "offset:v"),),
+        equivalent=(),
+        next_trial="A trial designed for it may tell sensor_bias:x from offset:v.",
+    )
+    identity, said = _probe(w, tied, [], Library(), write=False)
+    assert identity == "" and "`grounded diagnose --probe` makes the candidate once" in said
+    none = SimpleNamespace(**{**vars(tied), "indistinguishable": ()})
+    assert _probe(w, none, [], Library(), write=False) == ("", "")
 
 
 def test_a_state_that_nothing_measured_bounds_no_probe(diagnosed):

@@ -13,7 +13,7 @@ result; its `to_json()` is the document that the command prints with --json.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -157,17 +157,24 @@ class Workspace(Folder):
 
         return next_in(self.forget(), path_of(log), candidate, runner=runner)
 
-    def target(self, columns: Mapping[str, Array]) -> Path:
+    def target(
+        self,
+        columns: Mapping[str, Array],
+        terminal: Mapping[str, float] | None = None,
+        only_at_end: Collection[str] = (),
+    ) -> Path:
         """Write target.csv and set the horizon in grounded.toml; the old target is kept as .bak.
 
         Args:
             columns: the desired values of each state, (H + 1,), one per control step. The functions
                 of `starting.shapes` return such columns. They are checked before a file is changed.
+            terminal: weights for [reward] terminal, for states without one.
+            only_at_end: columns that get no weight in [reward] state.
         """
         from grounded_trials.workspace.new_target import replace_target
 
         here = self.forget()
-        path = replace_target(here.config, columns, here.base_model)
+        path = replace_target(here.config, columns, here.base_model, terminal or {}, only_at_end)
         self.forget()
         return path
 

@@ -129,7 +129,7 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
     assert told.endswith("; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong")
     claims.off_with_rivals = lambda: {"p4": "drag:v"}
     (tied,) = _causes(claims, (), [Credit("calibration")], (), {})
-    assert tied == f"{told}, unless the cause is drag:v, with which p4 is off"
+    assert tied == f"{told}; if drag:v is the cause instead, p4 is off"
 
 
 def test_a_parameter_that_is_off_only_with_an_effect_that_ties_is_found(monkeypatch):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -127,6 +127,20 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     assert [float(u) for u in found.split()] == expected
     with pytest.raises(GroundedError, match=holding("npz", "json")):
         export_candidate(w, "c0001", "json", tmp_path / "c.json", runner=True)
+
+
+def test_after_the_search_an_export_asks_for_no_further_run(tmp_path):
+    """`next: export best`, then "run it, record a log, next: next LOG" of a search that ended."""
+    w = make(tmp_path / "w").folder
+    export = ("-C", w, "export", "best", "--runner", "-o", tmp_path / "c.npz")
+    assert grounded("-C", w, "learn", "--trials", "1").code == 0
+    assert "record a log" in grounded(*export).out
+    assert not grounded(*export, "--json").json["search_ended"]
+    assert grounded("-C", w, "learn").code == 0
+    said = " ".join(grounded(*export).out.replace("\\", "").split())
+    assert holds(said, "the search has ended", "no further run is needed")
+    assert said.endswith(f"next: grounded -C {w} report --html")
+    assert grounded(*export, "--json").json["search_ended"]
 
 
 def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):

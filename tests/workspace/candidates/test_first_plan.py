@@ -409,28 +409,57 @@ model = Model(states={"x": "m", "v": "m/s", "th": "rad", "w": "rad/s"}, inputs={
 
 
 def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
-    """`--to th=0` alone was advised, whose weight holds the beam under a ball all the way."""
+    """It took three steps: a column, its weight out of [reward] state, and into terminal."""
     (tmp_path / "ball.py").write_text(ROLLED)
     w = tmp_path / "w"
     assert grounded("init", w, "--blank", "--model", tmp_path / "ball.py", "--dt", "0.02").code == 0
     line = ("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "2", "--hold", "0.5")
     said = " ".join(grounded(*line).out.split())
-    assert holds(said, "at the end only", "--to th=0", "[reward] state", "th = 1000, w = 100")
-    assert "then remove" not in said  # they are not there yet
-    assert "weights that [reward] state then gets for th and w" in said
+    assert holds(said, "not on the way", "th = 0, w = 0", "terminal", "`--rest`")
     plain_line = Workspace(w).propose().candidate
     assert grounded(*line, "--to", "th=0").code == 0
     held = Workspace(w).propose().candidate
-    file = w / "grounded.toml"
-    state = "state = { x = 11.1, v = 3.7 }\nterminal = { th = 1000, w = 100 }"
-    without = re.sub(r"(?m)^terminal = .*$", "", file.read_text())
-    file.write_text(re.sub(r"(?m)^state = .*$", state, without))
+    assert grounded(*line).code == 0
+    said = " ".join(grounded(*line, "--rest").out.split())
+    assert holds(said, "[reward] terminal is new", "th = 1,000, w = 100")
+    reward = tomllib.loads((w / "grounded.toml").read_text())["reward"]
+    assert reward["terminal"].items() >= {"th": 1000, "w": 100}.items()
+    assert reward["state"].keys() == {"x", "v"} < reward["terminal"].keys()
+    assert reward["terminal"]["x"] == pytest.approx(10 * reward["state"]["x"], rel=1e-3)
     ended = Workspace(w).propose().candidate
     wanted = Workspace(w).task.target[:, 0]
     runs = [one.predicted_states for one in (plain_line, held, ended)]
     off = [np.abs(run[:, 0] - wanted).mean() for run in runs]
     assert off[2] < 1.5 * off[0] + 1e-3 and off[1] > 1.4 * off[2]
     assert abs(runs[2][-1, 2]) < 2e-3
+    assert grounded(*line).code == 0  # without it again, the weights at the end go with the columns
+    reward = tomllib.loads((w / "grounded.toml").read_text())["reward"]
+    assert reward["terminal"].keys() == {"x", "v"} == reward["state"].keys()
+    assert grounded("-C", w, "target", "step", "--to", "x=1", "--rest").code == 2
+
+
+def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(tmp_path):
+    """`next:` exported a plan that left [safety] 0.02 s after its end, as its note said."""
+    (tmp_path / "ball.py").write_text(ROLLED)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "ball.py", "--dt", "0.02").code == 0
+    assert grounded("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "1").code == 0
+    toml = w / "grounded.toml"
+    text = toml.read_text() + ("" if "[safety]" in toml.read_text() else "\n[safety]\n")
+    toml.write_text(text.replace("[safety]\n", "[safety]\nx = [-0.1, 0.33]\n"))
+    done = grounded("-C", w, "propose")
+    said = " ".join((done.err + done.out).replace("\\", "").split())
+    assert holds(said, "leaves [safety] x", "`next:` draws the same line", "as it is: `grounded")
+    then = Workspace(w).propose()  # asked again, it is handed out
+    assert then.then.verb == "run"
+    again = said.partition("next: ")[2].split()
+    line = ["target", "line", "--to", "x=0.3", "--seconds", "1", "--hold", "1", "--rest"]
+    assert again == ["grounded", "-C", str(w), *line]
+    old = (w / "target.csv").read_text().splitlines()
+    assert grounded(*again[1:]).code == 0
+    new = (w / "target.csv").read_text().splitlines()
+    assert len(new) == len(old) + 50 and new[0] == "t,x,v,th,w"
+    assert "leaves [safety]" not in grounded("-C", w, "propose").err
 
 
 def test_a_line_keeps_the_rest_of_a_position_where_it_starts(tmp_path):

@@ -116,3 +116,19 @@ def test_a_start_at_which_no_run_begins_is_told_with_the_one_to_write(ball, tmp_
     done = grounded("-C", ball.folder, "ingest", tmp_path / "run.mcap", "--candidate", "c0001")
     said = " ".join(done.err.split())
     assert ("write start = { x = -0.15, beam = " in said and "so did t0001" in said) == told, said
+
+
+def test_what_to_add_a_bias_to_is_named_by_what_the_task_gives(ball, tmp_path):
+    """`add -0.0173 to it`: to the target, which had no column of the beam."""
+    from grounded_cli.adopt import _as_read
+
+    def told() -> str:
+        return _as_read(Workspace(ball.folder), "beam", f"{B} rad", B)
+
+    assert holds(told(), "neither [task] start nor the target names it", f"write beam = {B}")
+    grounded("-C", ball.folder, "target", "line", *LINE, "--to", "beam=0")
+    assert told() == f"add {B} rad to beam in the target, unless this sensor measured it"
+    stored(ball, driven(0.6), tmp_path)
+    assert holds(told(), "leave [task] start", "in t0001, and add", "beam in the target")
+    grounded("-C", ball.folder, "target", "line", *LINE)
+    assert told().endswith("; the target names no beam")

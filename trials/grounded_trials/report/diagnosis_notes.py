@@ -35,8 +35,8 @@ def held_out(found: Diagnosis) -> str:
     }
     if row.floor_at_most:
         noise["short horizon"] = (
-            "not known, but at most that and perhaps far less: extrapolated from one-step errors, "
-            "which hold errors of the model too (repeat a run to know)"
+            "the most it can be, perhaps far less: extrapolated from one-step errors, "
+            "which hold errors of the model too (repeat a run to know it)"
         )
     text = f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
     last = furthest(found.prediction_error)

@@ -5,6 +5,7 @@ Text, page, pictures and recording show the same findings and read no files them
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,6 +20,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.certainty import LUCK
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -29,10 +31,13 @@ from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import EXPORT, left_open, nothing_to_do, outlook
 from grounded_trials.workspace.off_target import (
+    UNSURE,
     WITHIN,
+    by_runs,
     rates_among,
     reaches,
     single_sample_noise,
+    std_at_end,
     tracking_error,
     weighed_groups,
 )
@@ -283,6 +288,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
             if lost:  # a single sample can't show a smaller error
                 before, missed[-1] = max(before, noise), noise
                 paid = f"; the best is {WITHIN} {measured_alike([noise], unit)[0]}"
+            elif words.startswith(AT_END):
+                paid = _at_end_told(findings, parts, missed, states, unit) + paid
             one = Improved(words + note + paid, unit, before, missed[-1])
             found.append((rate, one.is_same, names[0] not in place, -moved, one))
     found.sort(key=lambda each: each[:4])
@@ -294,6 +301,38 @@ def improvements_in(findings: Findings) -> list[Improved]:
     )
     asked = [one for one in firsts if one is not None and one not in large[:SHOWN]]
     return [*large[: SHOWN - len(asked)], *asked]  # what was asked for, if it changed or not
+
+
+def _at_end_told(
+    findings: Findings,
+    parts: Sequence[Sequence[Array]],
+    missed: Sequence[float],
+    states: Sequence[int],
+    unit: str,
+) -> str:
+    """Return the standard errors of errors at the end, as a clause; "" if they are small.
+
+    Args:
+        findings: with the runs.
+        parts: of each compared candidate, the errors at the end of its runs (1, k).
+        missed: the rms of these.
+        states: indices of the k states.
+        unit: their unit.
+    """
+    runs = [findings.runs_of(run.candidate.id) for _, run in compared(findings)]
+    std = [
+        std_at_end([e[0] for e in own], [one.trial for one in some], states)
+        for own, some in zip(parts, runs, strict=True)
+    ]
+    if not any(error > UNSURE * value for error, value in zip(std, missed, strict=True)):
+        return ""
+    told = [
+        f"{error} {by_runs(len(own))}"
+        for error, own in zip(measured_alike(std, unit), parts, strict=True)
+    ]
+    same = len(std) > 1 and abs(missed[0] - missed[-1]) < LUCK * math.hypot(std[0], std[-1])
+    sizes = told[0] if len({*told}) == 1 else " and ".join(told)
+    return f"; +- {sizes}{', which may explain the change' * same}"
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 from grounded.diagnosis.tables import WITHOUT, effect_table, error_table, of_delays
 from grounded.errors import NextCommand
-from grounded.search.candidate import SURE, Tried
-from grounded.search.certainty import chance, share_of_cost
+from grounded.search.candidate import Tried
+from grounded.search.certainty import explained, share_of_cost
 from grounded.search.pictures import few
 from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
 from grounded_trials.report.findings import (
@@ -103,13 +103,11 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
         text += f"best {best.candidate.id} {figure(best.utility)}"
-        top = findings.standing.incumbent
-        if top is not None and top is not history[0] and chance(history[0], top, history) < SURE:
-            text += "; the scatter of repeats may explain its lead"
-        elif math.isfinite(first.utility) and first.utility < 0:
+        if math.isfinite(first.utility) and first.utility < 0:
             tried = {one.candidate.id: one for one in history}
             two = tried[first.candidate.id], tried[best.candidate.id]
-            text += f", {share_of_cost(*two, history)} better"
+            why = explained(*two, history)
+            text += f"; {why} its lead" if why else f", {share_of_cost(*two, history)} better"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")

@@ -299,14 +299,17 @@ def _probe(
 
     now = standing_in(workspace)
     best = now.incumbent
+    ties = {*found.indistinguishable} - {*found.equivalent}
     if best is None:
-        return "", f"{none}: a probe varies the best candidate, and no run was complete." * write
+        if write:
+            return "", f"{none}: a probe varies the best candidate, and no run was complete."
+        later = f"`{rendered(PROBE)}` makes the candidate once a run was complete"
+        return "", f"{found.next_trial.rstrip('.')} ({later}; or record such a log)." * bool(ties)
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
-    ties = {*found.indistinguishable} - {*found.equivalent}
     offer = write or bool(ties)
     why = "none of those tried stays inside [safety] and near the stored trials"
     plan = _near(planner, trials)

@@ -97,7 +97,11 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
         model = workspace.base_model
     except GroundedError as error:
         here = (workspace.folder / FILE).exists()
-        why = f": {error}" if here else " outside a workspace (-C DIR names one)"
+        why = f": {error}"
+        if not here:
+            why = (
+                ", as this folder is no workspace: make one from the log, or name yours with -C DIR"
+            )
         return Inspected(str(log), report, "", why, outside=not here)
     units = {**model.states, **model.inputs}
     states, inputs = guess_mapping(report, model.state_names, model.input_names, units)

@@ -6,9 +6,10 @@ A heading in degrees is found by the course of the target's positions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,13 @@ LEFT = 0.5  # of that change: difference from which on a heading in radians does
 FRAMES = ((1.0, 0.0), (-1.0, 0.0), (-1.0, math.pi / 2))  # from x; clockwise; a compass: from y
 
 
-def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -> Path:
+def replace_target(
+    config: Config,
+    columns: Mapping[str, Array],
+    model: Model,
+    terminal: Mapping[str, float] = MappingProxyType({}),
+    only_at_end: Collection[str] = (),
+) -> Path:
     """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`.
 
     Both files are kept as they were, with `.bak` behind their names.
@@ -49,12 +56,12 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
     columns = checked(columns, model)
     refuse_degrees(columns, model)
     check_tables(config, model, len(next(iter(columns.values()))))
-    each = usual_weights(model, columns)
-    weights = {name: float(f"{w:.6g}") for name, w in each.items()}  # a range may be 1800 mm
+    each = usual_weights(model, columns)  # of ranges such as 1800 mm
+    weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
     rows = len(next(iter(columns.values())))
     name = config.task.target or "target.csv"
     path = config.file.parent / name
-    before: dict[str, float] = {}
+    before, given = dict[str, float](), dict[str, Array]()
     old = None
     if path.is_file():
         try:
@@ -69,7 +76,16 @@ def replace_target(config: Config, columns: Mapping[str, Array], model: Model) -
         write_atomically(config.file.with_name(config.file.name + ".bak"), config.file.read_bytes())
     write_target(path, config.task.dt, columns)
     try:
-        set_target(config.file, name, rows - 1, weights, before, limited_changes(config, model))
+        set_target(
+            config.file,
+            name,
+            rows - 1,
+            weights,
+            before,
+            limited_changes(config, model),
+            terminal,
+            [one for one in given if one not in columns],
+        )
     except BaseException:
         if old is None:
             path.unlink(missing_ok=True)

@@ -36,6 +36,7 @@ FARTHER = 1.1  # of the error before: a better candidate's larger error is expla
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
+UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
@@ -54,6 +55,8 @@ class OffTarget(Document):
         end: rms of the errors at the last state; NaN if a run ended early, or if the end has no
             weight of its own and nothing is to be reached (see `reaches`).
         noise: std of the noise of a single sample, below which an error at the end says nothing.
+        end_std: standard error of `end`, see `std_at_end`.
+        runs: number of runs.
     """
 
     what: str
@@ -63,6 +66,8 @@ class OffTarget(Document):
     at_s: float = float("nan")
     end: float = float("nan")
     noise: float = 0.0
+    end_std: float = 0.0
+    runs: int = 1
 
     def summary(self) -> str:
         """Return a text such as `position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
@@ -74,6 +79,10 @@ class OffTarget(Document):
             told += [f"{rms} rms", f"{most} at most (at {self.at_s:.4g} s)"]
         if np.isfinite(self.end):
             told.append(f"{end} at the end" if at_end == least else f"at the end {WITHIN} {end}")
+            if at_end == least and self.end_std > UNSURE * at_end:
+                told[-1] += (
+                    f" (+- {measured_alike([self.end_std], self.unit)[0]} {by_runs(self.runs)})"
+                )
         return f"{self.what} {', '.join(told)}"
 
 
@@ -110,9 +119,10 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
         if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
+            values["end_std"] = std_at_end([e[-1] for e in each], whole, states)
         ranked.append((rates[k], -cost, k))
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
-        found[k] = OffTarget(what.removeprefix("the "), units[k], **values)
+        found[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
     told = sorted(k for *_, k in sorted(ranked)[:FEW])
     dear = MOST * sum(cost for _, cost, _ in ranked)
     told += [k for _, cost, k in ranked if cost < dear and k not in told]
@@ -121,10 +131,39 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
 
 def single_sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> float:
     """Return the noise (std) of one sample of the distance that some states have, by its runs."""
+    return float(np.linalg.norm(_sample_noise(trials, states)))
+
+
+def _sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
+    """Return the noise (std) of one sample of each of some states, rms over runs."""
     each = [
         resampled_noise(trial.states[: trial.finite_steps + 1])[list(states)] for trial in trials
     ]
-    return float(np.sqrt(np.mean([noise @ noise for noise in each])))
+    return np.asarray(np.sqrt(np.mean(np.square(each), axis=0)))
+
+
+def std_at_end(ends: Sequence[Array], trials: Sequence[Trial], states: Sequence[int]) -> float:
+    """Return the standard error of the distance to the target at the end.
+
+    An error at the end is one sample of each run. Of a single run its sensors' noise is known,
+    which leaves out how much runs differ; of several the scatter of their ends, if that is more.
+
+    Args:
+        ends: the error at the end of each run (k,).
+        trials: the runs.
+        states: indices of the k states.
+    """
+    far = np.linalg.norm(ends, axis=1)
+    toward = np.array(ends) / np.where(far > 0, far, 1.0)[:, None]
+    toward[far == 0] = len(states) ** -0.5
+    noise = float(np.sqrt(np.mean(toward**2 @ _sample_noise(trials, states) ** 2)))
+    scatter = float(far.std(ddof=1)) if len(far) > 1 else 0.0
+    return float(max(noise, scatter) / len(far) ** 0.5)
+
+
+def by_runs(runs: int) -> str:
+    """Return what the standard error of an error at the end rests on."""
+    return "by noise alone, from one run" if runs == 1 else f"by {runs} runs"
 
 
 def rates_among(task: Task, groups: Sequence[tuple[Sequence[str], str]]) -> list[bool]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cli import grounded
 from facts import holds
 from grounded.instruments.inputs import beyond_limits
 from grounded.instruments.preflight import preflight
@@ -100,6 +101,21 @@ def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path
     (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
     assert holds(note, "57.4 times", "(0.0204 N)", "unit") is far
     assert ("only the range used in a.csv" in note) is not far
+
+
+@pytest.mark.parametrize(("limit", "bound"), [(0.3, True), (50.0, False)])
+def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
+    tmp_path, limit, bound
+):
+    """Plans sent no more than a log had, and only `propose` said where [limits] were from."""
+    limits = f'force = [-{limit}, {limit}]\nseen_in = "a.csv"'
+    config = CONFIG.replace("force = [-5.0, 5.0]", limits)
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
+    assert ("force is at them for" in note and "of this plan" in note) is bound
+    done = grounded("-C", w.folder, "target", "line", "--to", "x=1")
+    said = " ".join(done.err.split())
+    assert holds(said, "only the range used in a.csv, and plans keep to it", "delete seen_in")
 
 
 def test_a_side_without_a_limit_has_no_beyond(w):

@@ -8,7 +8,7 @@ from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
-from grounded.diagnosis.tables import of_delays
+from grounded.diagnosis.tables import of_delays, of_rivals
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_notes import WHITE, left_patterns, pattern_line
 from grounded_trials.report.diagnosis_words import (
@@ -71,7 +71,8 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     if diagnosis.ranking:
         found += [Block("heading", "Effects that were compared"), effect_table(diagnosis, since)]
         found += [Block("text", f"{text}.") for text in in_vain(diagnosis)]
-        found += [Block("text", f"{text}.") for text in [of_delays(diagnosis)] if text]
+        notes = (of_rivals(diagnosis), of_delays(diagnosis))
+        found += [Block("text", f"{_begun(text)}.") for text in notes if text]
     found += _alike(diagnosis) + _by_trial(diagnosis)
     found += leftover_table(diagnosis)
     away = any(row.runs_away for row in diagnosis.prediction_error if row.whole_trial)

@@ -14,7 +14,7 @@ import math
 import re
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
-from grounded.search.candidate import SURE
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_notes import note_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -51,6 +50,9 @@ from grounded_trials.report.three_lines import gained_most
 from grounded_trials.wording import count, figure, glued, percent, placed, rendered
 from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
+
+if TYPE_CHECKING:
+    from grounded.search.candidate import Tried
 
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 
@@ -219,24 +221,27 @@ def _heading(findings: Findings) -> str:
     worse = any(one.after > one.before and not one.is_same for one in rows)
     if worse:
         return "What the runs changed"
-    sure = _probability(findings)
-    return f"What perhaps improved (probability {sure:.2f})" if sure < SURE else "What improved"
+    from grounded.search.certainty import chance, explained
+
+    if (two := _first_and_best(findings)) is None or not explained(*two, findings.history):
+        return "What improved"
+    sure = chance(*two, findings.history)
+    why = "not repeated" if math.isnan(sure) else f"probability {sure:.2f}"
+    return f"What perhaps improved ({why})"
 
 
-def _probability(findings: Findings) -> float:
-    """Return the probability that the best policy is better than the first; NaN if unknown."""
-    from grounded.search.certainty import chance
-
+def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:
+    """Return the first and the best candidate with their runs; None if they are the same."""
     first, best = findings.first, findings.best
     tried = {one.candidate.id: one for one in findings.history}
     if first is None or best is None or first.candidate.id == best.candidate.id:
-        return math.nan
-    return chance(tried[first.candidate.id], tried[best.candidate.id], findings.history)
+        return None
+    return tried[first.candidate.id], tried[best.candidate.id]
 
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    from grounded.search.certainty import owed_to_start, share_of_cost
+    from grounded.search.certainty import explained, owed_to_start, share_of_cost
 
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
@@ -248,8 +253,8 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
             two = tried[first.candidate.id], tried[best.candidate.id]
             did = "reduced" if best.utility > first.utility else "raised"
             gain = f": cost {did} by {share_of_cost(*two, findings.history)}"
-            if _probability(findings) < SURE:
-                gain = ": the scatter of repeats may explain the difference"
+            if best.utility > first.utility and (why := explained(*two, findings.history)):
+                gain = f": {why} the difference"
             if start := owed_to_start(*two, findings.history):
                 did = "reduced" if start > 0 else "raised"
                 by = f"{did} it by {percent(abs(start / first.utility))}"

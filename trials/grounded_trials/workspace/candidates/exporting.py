@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from grounded import onboard
 from grounded.errors import GroundedError, nearest
 from grounded.result import Result
+from grounded.search.standing import Standing
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.exported_files import (
     about_of,
@@ -22,7 +24,11 @@ from grounded_trials.workspace.candidates.handover import (
     checked_candidate,
     intact,
 )
-from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
+from grounded_trials.workspace.candidates.search_state import (
+    candidate_named,
+    known_end,
+    standing_in,
+)
 from grounded_trials.workspace.folder import Folder
 
 RUNNER = "grounded_runner.py"
@@ -39,6 +45,7 @@ class Exported(Result):
     notes: tuple[str, ...] = ()  # remarks on the candidate
     overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
     named: tuple[str, ...] = ()  # options of `ingest` for its log if another one is outstanding
+    ended: bool = False  # whether it is the best candidate of a search that has ended
 
     def summary(self) -> str:
         """Return the candidate and its file."""
@@ -46,7 +53,12 @@ class Exported(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `export --json`."""
-        document = {"file": str(self.file), "candidate": self.candidate, "format": self.format}
+        document: dict[str, Any] = {
+            "file": str(self.file),
+            "candidate": self.candidate,
+            "format": self.format,
+        }
+        document |= {"search_ended": self.ended}
         return document | ({"runner": str(self.runner)} if self.runner else {})
 
 
@@ -81,7 +93,18 @@ def export_candidate(
         write_atomically(program, Path(onboard.__file__).read_bytes())
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
-    return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
+    ended = _has_ended(workspace, identity, handed.check.standing)
+    return Exported(identity, path, form, program, handed.notes, handed.overridden, how, ended)
+
+
+def _has_ended(workspace: Folder, identity: str, now: Standing) -> bool:
+    """Return whether the search is known to have ended with this candidate; nothing is planned."""
+    if now.incumbent is None or now.incumbent.candidate.id != identity:
+        return False
+    if now.phase == "propose":
+        with suppress(GroundedError):  # another candidate's file is damaged
+            now = known_end(workspace, workspace.read(), now) or now
+    return now.phase in ("converged", "stopped")
 
 
 def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:

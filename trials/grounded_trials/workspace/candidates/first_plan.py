@@ -25,6 +25,7 @@ from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import rendered, with_unit
+from grounded_trials.workspace.candidates.rest_at_end import drawn
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
     cost_of_inputs,
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 
 MOSTLY = 0.9  # share of the cost due to inputs above which a note says so
 HELD = 0.8  # share of the steps at a limit above which an input counts as limited
+BOUND = 0.05  # share of the steps at limits that only a log gave from which it is told
 TIGHTER = 0.9  # of the plan's smallest turning radius: a target below it turns too tightly
 ROUND = 0.05  # of that radius by which a plan must be off
 TURNING = 0.1  # share of the steps at a limit above which that limit is the reason
@@ -95,6 +97,7 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         found.append(
             f"{_never_sent(workspace) or f'[limits] are only the range used in {log}'}: enter the "
             "robot's real limits, then delete seen_in there"
+            + _at_limits(task, first)
             + "; and draw the manoeuvre (`target`): target.csv is the run in that log"
             * still_logged(workspace)
         )
@@ -133,6 +136,19 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _at_limits(task: Task, first: Candidate | None) -> str:
+    """Return for how much of a plan its inputs are at their limits, as a clause; or ""."""
+    sent = None if first is None else first.predicted_inputs
+    told = []
+    for j, name in enumerate(task.model.input_names if sent is not None else ()):
+        assert sent is not None
+        ends = [end for end in (task.low[j], task.high[j]) if np.isfinite(end)]
+        at = [np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9) for end in ends]
+        share = float(np.any(at, axis=0).mean()) if at else 0.0
+        told += [f"{name} is at them for {percent(share)} of this plan"] * (share > BOUND)
+    return f" ({listed(told)})" if told else ""
 
 
 def _never_sent(workspace: Folder) -> str:
@@ -212,10 +228,10 @@ def _not_held(workspace: Folder, refused: Candidate) -> list[str]:
     if bare:
         start = {name: float(task.start[names.index(name)]) for name in bare}
         more = " ".join(f"--to {name}={value:g}" for name, value in start.items())
-        drawn = _drawn(task)
+        line = drawn(task)
         how = "with a column for each of them"
-        if drawn is not None:
-            again = NextCommand(drawn.verb, (*drawn.arguments, *more.split()))
+        if line is not None:
+            again = NextCommand(line.verb, (*line.arguments, *more.split()))
             command = rendered(again, workspace.address)
             how = f"and add {more}: `{command}`, with your other options"
         found.append(
@@ -239,26 +255,6 @@ def _leaving(task: Task, plan: Candidate) -> NDArray[np.bool_]:
         (states < task.safety_low) | (states > task.safety_high), axis=0
     )
     return out
-
-
-def _drawn(task: Task) -> NextCommand | None:
-    """Return the `target` command for the line or step that a target appears to be; else None."""
-    from grounded_trials.logs.inspection.inspect_pairs import velocities
-
-    names, rates = task.model.state_names, set(velocities(task.model).values())
-    given = [i for i in tracked(task) if names[i] not in rates]
-    way = task.model.difference(task.target, task.start)[:, given]
-    if not way.any():
-        return None
-    k = int(np.argmax(np.abs(way[-1])))
-    if not way[-1, k]:
-        return None
-    share = way[:, k] / way[-1, k]
-    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
-        return None
-    shape = "step" if np.allclose(share[1:], 1.0) else "line"
-    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
-    return NextCommand("target", (shape, *(word for pair in to for word in pair)))
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:

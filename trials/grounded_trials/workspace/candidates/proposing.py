@@ -29,6 +29,7 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.next_step import doubted, next_command, not_adopted, not_ingested
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
+from grounded_trials.workspace.placing import FromStarts, from_starts
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -53,6 +54,7 @@ class Proposed(Result):
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
     lacks: str = ""  # what the last diagnosis found and the model lacks
     noise_in_log: float = 0.0  # expected cost of all of the sensor noise in its log
+    from_starts: FromStarts | None = None  # from where runs began so far; None: too few are known
 
     @property
     def candidate(self) -> Candidate | None:
@@ -73,7 +75,13 @@ class Proposed(Result):
         found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
         age = self.candidate.sample_age if self.candidate else None
-        return found | {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
+        begun = self.from_starts and {
+            "utility_change": self.from_starts.change,
+            "std": self.from_starts.std,
+            "runs": self.from_starts.runs,
+        }
+        found |= {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
+        return found | {"from_usual_starts": begun}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -168,15 +176,27 @@ def propose_in(workspace: Folder) -> Proposed:
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
+    if not held and proposal.is_new and not proposal.standing.trials:
+        from grounded_trials.workspace.candidates.rest_at_end import to_end_at_rest
+
+        if (rest := to_end_at_rest(workspace, candidate)) is not None:
+            note = (
+                "`next:` draws the same line so that the plan comes to rest. To run "
+                f"{candidate.id} as it is: `{rendered(then, workspace.address)}`"
+            )
+            then = rest
+            proposal = replace(proposal, notes=(*proposal.notes, note))
     noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
     same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
     noise = noises.before([candidate.id])
     cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
     whole = noise_cost(workspace.task, candidate.policy, noise)
-    off_target = off_target_of(workspace.task, [candidate.predicted_run])
+    predicted = off_target_of(workspace.task, [candidate.predicted_run])
+    off_target = tuple(replace(one, end_std=0.0) for one in predicted)  # no log's last sample
     if not candidate.grounded:  # a run that no sensor measured
         off_target = tuple(replace(one, noise=0.0) for one in off_target)
-    return Proposed(proposal, path, then, cost, off_target, lacks, whole)
+    begun = from_starts(workspace, candidate)
+    return Proposed(proposal, path, then, cost, off_target, lacks, whole, begun)
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:

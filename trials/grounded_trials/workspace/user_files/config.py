@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from grounded.errors import GroundedError
@@ -244,6 +245,8 @@ def set_target(
     weights: Mapping[str, float],
     before: Mapping[str, float],
     changes: Mapping[str, tuple[float, float]],
+    terminal: Mapping[str, float] = MappingProxyType({}),
+    left: Sequence[str] = (),
 ) -> None:
     """Replace [task] target and horizon, and the weights of [reward] not chosen by the user.
 
@@ -258,6 +261,9 @@ def set_target(
         weights: the new weights of states.
         before: the weights that the previous target gave.
         changes: by input, its weight on changes without [limits], and with them.
+        terminal: weights for [reward] terminal of states that have none there.
+        left: states that had a column in the previous target and have none now. Weights that they
+            have at the end alone go with it, if weights are renewed.
     """
     import tomlkit
 
@@ -265,12 +271,18 @@ def set_target(
     document, made, blank = tomlkit.parse(old_text), made_changes(old_text), dict[str, float]()
     _put(document, "task", {"target": name, "horizon": steps})
     reward = document.get("reward", {})
-    own = dict(reward.get("state", {}))
+    own, ends = dict(reward.get("state", {})), dict(reward.get("terminal", {}))
+    before = {k: w for k, w in before.items() if k in own or k not in ends}
     same = own.keys() == before.keys() and any(
         all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in unchosen.items())
         for unchosen in (before, dict.fromkeys(before, 1.0))
     )
-    if same or (not own and not reward.get("terminal")):
+    if same or (not own and not ends):
+        ends = {
+            k: OFFERED * weights[k] if k in weights and _is_offered(w, before.get(k)) else w
+            for k, w in ends.items()
+            if k in own or k not in left
+        }
         renewed: dict[str, Any] = {"state": _inline(weights)}
         written = dict(reward.get("input_change", {}))
         blank = {
@@ -281,6 +293,9 @@ def set_target(
         if blank:
             renewed["input_change"] = _inline(written | blank)
         _put(document, "reward", renewed)
+    ends = {k: float(f"{w:.6g}") for k, w in (dict(terminal) | ends).items()}
+    if ends != dict(reward.get("terminal", {})):
+        _put(document, "reward", {"terminal": _inline(ends)})
     text = tomlkit.dumps(document)
     if same and own:
         text = re.sub(r"(?m)^# terminal = .*$", partial(_offered, before=own, now=weights), text)
@@ -306,12 +321,15 @@ def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str
     """Return the comment with terminal weights, renewed if it is still what `init` wrote."""
     with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
         told = tomllib.loads(found[0].removeprefix("# "))["terminal"]
-        if told.keys() == before.keys() and all(
-            abs(told[k] - OFFERED * w) <= 1e-3 * OFFERED * w for k, w in before.items()
-        ):
+        if told.keys() == before.keys() and all(_is_offered(told[k], w) for k, w in before.items()):
             ends = _inline({name: float(f"{OFFERED * w:.6g}") for name, w in now.items()})
             return f"# terminal = {ends.as_string()}"
     return found[0]
+
+
+def _is_offered(terminal: float, weight: float | None) -> bool:
+    """Return whether a weight at the end is what `init` or `target --rest` offer beside another."""
+    return weight is not None and abs(terminal - OFFERED * weight) <= 1e-3 * OFFERED * weight
 
 
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:

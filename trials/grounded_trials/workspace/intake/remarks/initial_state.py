@@ -22,6 +22,7 @@ from grounded_trials.workspace.candidates.standing_without import standing_witho
 from grounded_trials.workspace.candidates.standstill import SAME, standstills
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import began_elsewhere
+from grounded_trials.workspace.placing import FEWEST, placing
 from grounded_trials.workspace.user_files.config import FILE
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
@@ -32,7 +33,6 @@ MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much
 ALWAYS = 3  # runs that begin alike, from which on they always do
-FEWEST = 2  # smallest number of earlier runs from which the scatter of starts is estimated
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,19 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     A state that [reward] weighs along the way is judged by the cost of its offset relative to a
     mean step of the run (of one much worse than promised, WORSE times a promised step), the most
     costly first; another state relative to its range in the run.
-    Offsets within the scatter of earlier starts are unavoidable, and tolerated unless they spoil
-    the utility by the model: by much of it, or by more than the run lost to the best candidate. A
-    change below the scatter of single runs spoils nothing. Of a run that left [safety], only the
-    part before counts: a robot on the floor makes every start seem near.
+    It spoils the utility if by the model it changes much of it, or by more than the run lost to the
+    best candidate. A change below the scatter of single runs spoils nothing. Offsets within the
+    scatter of other starts (`placing`) are unavoidable: a repeat would begin no nearer. They spoil
+    a run only if they explain a loss that the search takes for one. Of a run that left [safety],
+    only the part before counts: a robot on the floor makes every start seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
         trial: the trial as stored.
     """
     task = workspace.task
-    before, trial = _starts_before(workspace, trial.id), interpolate_gaps(trial).trial
-    trial = trial.until(task.horizon)
+    placed = placing(workspace, but=trial.id)
+    trial = interpolate_gaps(trial).trial.until(task.horizon)
     if not trial.candidate or trial.finite_steps < 0:
         return None
     off = task.model.difference(trial.began, task.start)
@@ -85,31 +86,45 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    beyond = np.full(len(off), True)
-    if len(before) >= FEWEST:
-        beyond = (np.abs(off) > SURE * before.std(axis=0, ddof=1)) | (share > MUCH)
+    usual_off = np.abs(off) <= SURE * np.nan_to_num(placed.std)
     if not told.any():
         return None
     real = abs(task.utility(trial))
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
     lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
-    spoils, tolerated = list[int](), list[int]()
+    spoils, tolerated, usually_so = list[int](), list[int](), list[int]()
+    repeats = _to_repeat(workspace, trial)
     for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or 0 < lost < -changes):
-            spoils.append(i)
-        elif beyond[i]:
+        explains = 0 < lost < -changes
+        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
+            excused = usual_off[i] and (repeats or not explains)
+            (usually_so if excused else spoils).append(i)
+        elif not usual_off[i] or share[i] > MUCH:
             tolerated.append(i)
-    if not spoils and not tolerated:
+    if not (spoils or tolerated or usually_so):
         return None
-    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *tolerated))
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usually_so, *tolerated))
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
-    if _to_repeat(workspace, trial):
+    if repeats:
         does = (
             f"By the model that explains why it lost: {trial.candidate} is to be run again. Place "
             "the robot nearer to the start"
         )
-    elif len(before) < FEWEST:
+    elif usually_so:
+        changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), usually_so))
+        std = listed(
+            f"{with_unit(f'{placed.std[i]:.2g}', list(task.model.states.values())[i])} in "
+            f"{task.model.state_names[i]}"
+            for i in usually_so
+        )
+        does = (
+            f"That is within how the starts of {min(placed.runs[usually_so])} other runs scatter "
+            f"({std}, one standard deviation), so the run counts; by the model its start changes "
+            f"its utility by {changes:+.3g}. Place the robot more exactly, or average runs "
+            "([search] repeats), to see smaller gains"
+        )
+    elif max(placed.runs) < FEWEST:
         does += f" (after {FEWEST + 1} runs, offsets within their scatter are not told again)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
@@ -118,7 +133,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         does = (
             f"By the model {change} its utility by {changes:+.3g}: "
             f"`discard {trial.id}`, place the robot nearer to the start and run "
-            f"{trial.candidate} again. If it always starts there, set it in [task] start"
+            f"{trial.candidate} again; if it can't be placed nearer, `propose` goes on with this "
+            "run. If it always starts there, set it in [task] start"
         )
     return Begun(
         f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
@@ -206,14 +222,6 @@ def _scatter(workspace: Folder, trial: Trial, cost: float) -> float:
     """
     others = standing_without(workspace, {trial.id}).history
     return float(np.nan_to_num(np.sqrt(Repeats(others).near(-cost).variance)))
-
-
-def _starts_before(workspace: Folder, identity: str) -> Array:
-    """Return how far from s_0 the other runs of this task started, (N, n)."""
-    task = workspace.task
-    runs = [one for one in workspace.task_trials() if one.candidate and one.id != identity]
-    off = [task.model.difference(one.began, task.start) for one in runs]
-    return np.array(off).reshape(len(off), task.model.n)
 
 
 def _changes(workspace: Folder, trial: Trial, off: Array) -> float:

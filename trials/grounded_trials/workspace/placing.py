@@ -1,0 +1,146 @@
+"""Where the runs of a robot began, and how far these starts scatter about [task] start.
+
+People, or a rig, place the robot before each run. How exactly is a property of the placing, not of
+one manoeuvre: so a run counts whatever its task was, with its start relative to the [task] start it
+was planned for, and so does one that was discarded, since it too was placed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.search.candidate import Candidate
+from grounded.search.certainty import student
+from grounded.search.starts import worth_of_start
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import StoredTrial, candidate_of
+
+FEWEST = 2  # runs from which a scatter is estimated
+UNLIKE = 0.975  # Student's t of a discarded run's start among the others: beyond, it is left out
+TRIED = 20  # latest starts from which a candidate is predicted
+LATEST = 50  # runs that are looked at; the way of placing a robot may change
+
+
+@dataclass(frozen=True)
+class Placing:
+    """How far runs began off [task] start.
+
+    Args:
+        off: start states less the [task] start of each run (N, n).
+        std: their standard deviations (n,), without discarded runs that began far from all others;
+            NaN where too few runs are known.
+        runs: how many runs each of these rests on, (n,).
+    """
+
+    off: Array
+    std: Array
+    runs: Array
+
+    @property
+    def known(self) -> bool:
+        """Whether enough runs began to tell their scatter."""
+        return bool((self.runs >= FEWEST).any())
+
+
+@dataclass(frozen=True)
+class FromStarts:
+    """What a candidate is predicted to be worth from where the latest runs began.
+
+    Args:
+        change: mean change of its utility against one from [task] start exactly.
+        std: standard deviation of single runs due to the start alone.
+        runs: how many runs that rests on.
+    """
+
+    change: float
+    std: float
+    runs: int
+
+
+def from_starts(workspace: Folder, made: Candidate) -> FromStarts | None:
+    """Predict a candidate from where the latest runs of the robot began.
+
+    Returns:
+        None if too few runs are known, or if the model fails from one of those starts.
+    """
+    starts = placing(workspace).off[-TRIED:]
+    if len(starts) <= FEWEST:
+        return None
+    worth = [worth_of_start(workspace.planner, made.policy, off) for off in starts]
+    if not np.isfinite(worth).all():
+        return None
+    return FromStarts(float(np.mean(worth)), float(np.std(worth, ddof=1)), len(worth))
+
+
+def placing(workspace: Folder, but: str = "") -> Placing:
+    """Return how far the latest runs of a workspace's robot began off their [task] start.
+
+    Args:
+        workspace: the workspace with the trials, also those that are set aside.
+        but: id of a run that is left out, since it is judged by the others.
+    """
+    n = workspace.base_model.n
+    runs = chain(
+        ((one, False) for one in workspace.trials()),
+        ((one, True) for one in workspace.aside_trials()),
+    )
+    found = sorted(
+        (
+            (one.stored.number, aside, off)
+            for one, aside in runs
+            for off in _off(workspace, one, but)
+        ),
+        key=lambda run: run[0],
+    )[-LATEST:]
+    off = np.array([run[2] for run in found]).reshape(len(found), n)
+    aside = np.array([run[1] for run in found], bool)
+    used = np.ones(off.shape, bool)
+    for k in np.flatnonzero(aside):
+        used[k] = _like(off, int(k))
+    columns = [off[used[:, i], i] for i in range(n)]
+    std = [float(x.std(ddof=1)) if len(x) >= FEWEST else np.nan for x in columns]
+    return Placing(off[used.all(axis=1)], np.array(std), np.array([len(x) for x in columns]))
+
+
+def _like(off: Array, k: int) -> Array:
+    """Return in which states a discarded run began as the others did, (n,) bool.
+
+    One that began elsewhere, or whose log was misread, says nothing about how exactly the others
+    are placed; nor can a single other run tell.
+    """
+    others = np.delete(off, k, axis=0)
+    count = len(others)
+    if count < FEWEST:
+        return np.zeros(off.shape[1], bool)
+    far = np.abs(off[k] - others.mean(axis=0))
+    error = others.std(axis=0, ddof=1) * (1 + 1 / count) ** 0.5
+    pairs = zip(far, error, strict=True)
+    return np.array(
+        [d <= e or student(d / e, count - 1) < UNLIKE if e else d == 0 for d, e in pairs]
+    )
+
+
+def _off(workspace: Folder, one: StoredTrial, but: str) -> Iterator[Array]:
+    """Yield how far a run began off the start that its candidate was planned for; nothing of data.
+
+    Runs of a model with other states are left out.
+    """
+    trial, model = one.trial, workspace.base_model
+    same = trial.state_names == model.state_names
+    if not (trial.candidate and same and one.stored.id != but and np.isfinite(trial.began).all()):
+        return
+    if one.meta.get("task") == workspace.task.hash:
+        yield model.difference(trial.began, workspace.task.start)
+        return
+    with suppress(GroundedError):  # a candidate that is gone or damaged
+        name = trial.candidate.split("~")[0]
+        data = one.policy or workspace.candidate_bytes(name)
+        planned = candidate_of(data, name)[0].predicted_states[0]
+        yield model.difference(trial.began, planned)
