@@ -127,8 +127,8 @@ def _from_usual_starts(found: FromStarts | None, in_log: float) -> str:
     if found is None or not max(abs(found.change), found.std) > PLACED * abs(in_log):
         return ""
     return (
-        f"; {with_error(in_log + found.change, found.std)} (one standard deviation of single runs) "
-        f"from where the last {found.runs} runs began, instead of exactly at [task] start"
+        f"; {with_error(in_log + found.change, found.std)} from where the last {found.runs} runs "
+        "began (+-: by their starts alone), instead of exactly at [task] start"
     )
 
 

@@ -236,7 +236,8 @@ def command(
                 f"{misread(effect['b'], model.states[name])}: a true 0 is {effect['b']:.3g} there, "
                 f"but {listed(off)}. If a true 0 is meant, correct that",
             )
-    if still := without_range(columns, model.states):
+    at_end = ended.columns if ended is not None else {}  # which have weights for the end
+    if still := [name for name in without_range(columns, model.states) if name not in at_end]:
         at = {number(ranges[name][0]) for name in still}
         stay = f"{'stay' if len(still) > 1 else 'stays'} at {listed(at)}"
         remark(
