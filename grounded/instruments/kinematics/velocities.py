@@ -211,7 +211,7 @@ class Derived:
 
         Those of a first-order filter have a standard deviation of their mean.
         """
-        return self.over / np.sqrt(12) > SPREAD * self.age
+        return self.over > SPREAD * self.age * float(np.sqrt(12))
 
 
 def derived(
