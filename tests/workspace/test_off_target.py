@@ -129,6 +129,13 @@ def test_an_error_at_the_end_has_its_standard_error():
     assert exact.end_std == pytest.approx(0.0, abs=1e-12) and "+-" not in exact.summary()
 
 
+def test_an_encoder_that_rests_on_one_count_is_known_no_better_than_that():
+    count, states = 0.002, off(0.1)
+    states[:, 0] = count * np.round(np.minimum(np.linspace(0.0, 15.0, H + 1), 12.0))
+    (told,) = off_target_of(task(terminal=np.array([1.0, 0.0, 0.0, 0.0])), [run(states)])
+    assert told.noise >= 0.99 * count / 12**0.5
+
+
 ARM = Model(
     states={"shoulder": "rad", "elbow": "rad", "d_shoulder": "rad/s", "d_elbow": "rad/s"},
     inputs={"a": "1", "b": "1"},

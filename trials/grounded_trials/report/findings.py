@@ -326,13 +326,13 @@ def _at_end_told(
     ]
     if not any(error > UNSURE * value for error, value in zip(std, missed, strict=True)):
         return ""
-    told = [
-        f"{error} {by_runs(len(own))}"
-        for error, own in zip(measured_alike(std, unit), parts, strict=True)
-    ]
+    told, counts = measured_alike(std, unit), [len(own) for own in parts]
+    if len({*counts}) == 1:
+        told = [f"{' and '.join(dict.fromkeys(told))} {by_runs(counts[0], each=len(counts) > 1)}"]
+    else:
+        told = [f"{error} {by_runs(count)}" for error, count in zip(told, counts, strict=True)]
     same = len(std) > 1 and abs(missed[0] - missed[-1]) < LUCK * math.hypot(std[0], std[-1])
-    sizes = told[0] if len({*told}) == 1 else " and ".join(told)
-    return f"; +- {sizes}{', which may explain the change' * same}"
+    return f"; +- {' and '.join(told)}{', which may explain the change' * same}"
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:

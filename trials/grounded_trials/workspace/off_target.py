@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.frozen import Array, resampled_noise
+from grounded.instruments.single import quantum
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
 from grounded.search.certainty import began_apart
@@ -38,6 +39,7 @@ NARROW = 0.25  # of the median gap of repeated values: one beside an interpolate
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
+RESTS = 0.2  # of the samples that equal the one before, in a log of an encoder's counts: no noise
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 
@@ -136,9 +138,12 @@ def single_sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> float
 
 def _sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
     """Return the noise (std) of one sample of each of some states, rms over runs."""
-    each = [
-        resampled_noise(trial.states[: trial.finite_steps + 1])[list(states)] for trial in trials
-    ]
+    each, chosen = [], list(states)
+    for trial in trials:
+        known = trial.states[: trial.finite_steps + 1]
+        counts = np.array([quantum([known[:, i]]) for i in chosen]) / np.sqrt(12)
+        rests = np.mean(np.diff(known[:, chosen], axis=0) == 0, axis=0) > RESTS
+        each.append(np.maximum(resampled_noise(known)[chosen], np.where(rests, counts, 0.0)))
     return np.asarray(np.sqrt(np.mean(np.square(each), axis=0)))
 
 
@@ -161,9 +166,10 @@ def std_at_end(ends: Sequence[Array], trials: Sequence[Trial], states: Sequence[
     return float(max(noise, scatter) / len(far) ** 0.5)
 
 
-def by_runs(runs: int) -> str:
-    """Return what the standard error of an error at the end rests on."""
-    return "by noise alone, from one run" if runs == 1 else f"by {runs} runs"
+def by_runs(runs: int, *, each: bool = False) -> str:
+    """Return what the standard error of an error at the end rests on; `each` of several such."""
+    told = "by noise alone, from one run" if runs == 1 else f"by {runs} runs"
+    return told + " each" * each
 
 
 def rates_among(task: Task, groups: Sequence[tuple[Sequence[str], str]]) -> list[bool]:
