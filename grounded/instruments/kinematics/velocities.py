@@ -54,7 +54,7 @@ ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
-SPREAD = 0.5  # standard deviation of the ages over their mean from which it is a filter
+SPREAD = 0.65  # standard deviation of the ages over their mean: 0.58 of a plain mean, 1 of a filter
 # of a bias
 STRETCHES = 24  # least number of stretches over all trials
 SHORTEST = 4  # steps in the shortest stretch
