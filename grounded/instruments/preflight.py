@@ -271,8 +271,7 @@ class _Bench:
             lag = lag_of(self.model, relation, self.trials)
             clear = lag if lag is not None and lag.coherence > ALIKE else None
             if clear and (found := self.derived(relation, clear)):
-                filtered = clear.filtered or found.filtered
-                yield from self.late(relation, replace(clear, filtered=filtered))
+                yield from self.late(relation, clear)
                 yield self.filtered(relation, found)
                 continue
             copied = relation.exact and differenced(self.model, relation, self.trials)

@@ -54,7 +54,6 @@ ENOUGH = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
-SPREAD = 0.65  # standard deviation of the ages over their mean: 0.58 of a plain mean, 1 of a filter
 # of a bias
 STRETCHES = 24  # least number of stretches over all trials
 SHORTEST = 4  # steps in the shortest stretch
@@ -205,14 +204,6 @@ class Derived:
     age: float
     over: float
 
-    @property
-    def filtered(self) -> bool:
-        """Whether the ages spread as those of a filter do, rather than of a difference sent late.
-
-        Those of a first-order filter have a standard deviation of their mean.
-        """
-        return self.over > SPREAD * self.age * float(np.sqrt(12))
-
 
 def derived(
     model: Model, relation: Integral, trials: Sequence[Trial], least: float
@@ -254,9 +245,9 @@ def _derived(
     size = float(w @ w)
     if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * size:
         return None
-    steps = quantum([piece[:, 0] for piece in pieces(trials, (relation.i, relation.j))])
     noise = float(median(np.concatenate([white_noise(q[:, None]) for q in seen])))
-    noise = max(noise, steps / np.sqrt(12))  # of an encoder, at rest on one count for most samples
+    counts = quantum([piece[:, 0] for piece in pieces(trials, (relation.i, relation.j))])
+    noise = max(noise, counts / np.sqrt(12))  # of an encoder, at rest on one count mostly
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
     if not np.sqrt(rest @ rest / count) < CARRIED * passed:
         return None

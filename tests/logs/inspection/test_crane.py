@@ -105,7 +105,7 @@ def test_a_crane_from_its_log_to_its_target(tmp_path):
     grounded("-C", w, "discard", "t0001")  # to read it in another unit: the target is the old run
     assert logged_target(Workspace(w)) == "t0001" and to_plan(Workspace(w)).verb == "target"
     drawn = grounded("-C", w, "target", "line", "--to", "x=1", "--seconds", "3").out
-    assert "--to th=0" in drawn
+    assert "`--rest`" in drawn and "th = 0" in drawn
     assert logged_target(Workspace(w)) == ""
     rest = ("--to", "x=1", "--to", "th=0")
     assert "free" not in grounded("-C", w, "target", "line", *rest, "--seconds", "3").out

@@ -142,7 +142,7 @@ def _sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
     for trial in trials:
         known = trial.states[: trial.finite_steps + 1]
         counts = np.array([quantum([known[:, i]]) for i in chosen]) / np.sqrt(12)
-        rests = np.mean(np.diff(known[:, chosen], axis=0) == 0, axis=0) > RESTS
+        rests = np.sum(np.diff(known[:, chosen], axis=0) == 0, axis=0) > RESTS * len(known)
         each.append(np.maximum(resampled_noise(known)[chosen], np.where(rests, counts, 0.0)))
     return np.asarray(np.sqrt(np.mean(np.square(each), axis=0)))
 
