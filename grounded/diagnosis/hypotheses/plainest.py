@@ -58,11 +58,13 @@ def plain_friction(search: HypothesisSearch, fit: Fitted) -> Fitted:
 def holding(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Return a fit with the joint's own friction in place of a Coulomb friction, if far likelier.
 
-    The two are one friction while the joint moves; a fit that isn't clearly likelier is not kept.
+    The two are one friction while the joint moves; a fit that isn't clearly likelier is not kept,
+    nor is one with a viscous part, which is another cause: of a linear axis, far above its noise,
+    that was the likeliest set and predicted worst.
     """
     for effect, values in fit.hypothesis.pairs:
         joint = search.joints.get(motion_of(effect))
-        if effect.family.name == "coulomb_friction" and joint is not None:
+        if effect.family.name == "coulomb_friction" and joint is not None and len(joint.free) == 1:
             by = {"c": values["c"] / push(joint), "b": 0.0}
             h = fit.hypothesis.minus(effect.name).plus(joint, by)
             found = refine(search.predictor, [(h, fit.noise, fit.track)], iterations=TO_THE_TOP)
