@@ -219,23 +219,30 @@ def derived(
     Returns:
         None if it has another scale, is not explained by the position's past, or averages less.
     """
-    tried = (_derived(model, relation, trials, least, past) for past in PASTS)
+    dt, columns = trials[0].dt, (relation.i, relation.j)
+    counts = quantum([piece[:, 0] for piece in pieces(trials, columns)])
+    logs = list[tuple[Array, Array, Array]]()  # rates, velocities and the position's noise
+    for piece in pieces(trials, columns):
+        moved = np.diff(piece[:, 0])[:, None]
+        wrapped(moved, [model.angle_mask[relation.i]])
+        way = np.concatenate([[0.0], np.cumsum(moved)])
+        logs.append((moved[:, 0] / dt, relation.c * piece[:, 1], white_noise(way[:, None])))
+    floor = counts / np.sqrt(12)  # of an encoder, at rest on one count mostly
+    tried = (_weighed(logs, dt, least, past, floor) for past in PASTS)
     return next((found for found in tried if found is not None), None)
 
 
-def _derived(
-    model: Model, relation: Integral, trials: Sequence[Trial], least: float, past: int
+def _weighed(
+    logs: Sequence[tuple[Array, Array, Array]], dt: float, least: float, past: int, floor: float
 ) -> Derived | None:
-    """Return the same from the weights of `past` differences before the sample."""
-    dt, rows, said, seen = trials[0].dt, list[Array](), list[Array](), list[Array]()
-    for piece in pieces(trials, (relation.i, relation.j)):
-        moved = np.diff(piece[:, 0])[:, None]
-        wrapped(moved, [model.angle_mask[relation.i]])
-        if len(moved) >= past + LATER:
-            windows = np.lib.stride_tricks.sliding_window_view(moved[:, 0] / dt, past + LATER)
+    """Return the same from the weights of `past` differences; `floor`: least noise of a log."""
+    rows, said, seen = list[Array](), list[Array](), list[Array]()
+    for rate, velocity, own in logs:
+        if len(rate) >= past + LATER:
+            windows = np.lib.stride_tricks.sliding_window_view(rate, past + LATER)
             rows.append(windows[:, ::-1])
-            said.append(relation.c * piece[past : past + len(windows), 1])
-            seen.append(np.concatenate([[0.0], np.cumsum(moved)]))
+            said.append(velocity[past : past + len(windows)])
+            seen.append(own)
     count = sum(map(len, said))
     if count < ENOUGH * (past + LATER):
         return None
@@ -245,9 +252,7 @@ def _derived(
     size = float(w @ w)
     if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * size:
         return None
-    noise = float(median(np.concatenate([white_noise(q[:, None]) for q in seen])))
-    counts = quantum([piece[:, 0] for piece in pieces(trials, (relation.i, relation.j))])
-    noise = max(noise, counts / np.sqrt(12))  # of an encoder, at rest on one count mostly
+    noise = max(float(median(np.concatenate(seen))), floor)
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
     if not np.sqrt(rest @ rest / count) < CARRIED * passed:
         return None

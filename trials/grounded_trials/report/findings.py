@@ -36,7 +36,7 @@ from grounded_trials.workspace.off_target import (
     by_runs,
     rates_among,
     reaches,
-    single_sample_noise,
+    reading_noise,
     std_at_end,
     tracking_error,
     weighed_groups,
@@ -283,7 +283,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
             before = missed[0] if len(missed) > 1 else float("nan")
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
             paid = worse * (missed[-1] > WORSE * missed[0])
-            noise = single_sample_noise([run.trial for run in each], states)
+            noise = float(np.linalg.norm(reading_noise([run.trial for run in each], states)))
             lost = words.startswith(AT_END) and missed[-1] < noise
             if lost:  # a single sample can't show a smaller error
                 before, missed[-1] = max(before, noise), noise
@@ -321,7 +321,7 @@ def _at_end_told(
     """
     runs = [findings.runs_of(run.candidate.id) for _, run in compared(findings)]
     std = [
-        std_at_end([e[0] for e in own], [one.trial for one in some], states)
+        std_at_end([e[0] for e in own], reading_noise([one.trial for one in some], states))
         for own, some in zip(parts, runs, strict=True)
     ]
     if not any(error > UNSURE * value for error, value in zip(std, missed, strict=True)):

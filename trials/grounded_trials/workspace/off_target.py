@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.frozen import Array, resampled_noise
-from grounded.instruments.single import quantum
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
 from grounded.search.certainty import began_apart
@@ -39,7 +38,6 @@ NARROW = 0.25  # of the median gap of repeated values: one beside an interpolate
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
-RESTS = 0.2  # of the samples that equal the one before, in a log of an encoder's counts: no noise
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 
@@ -112,7 +110,8 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             continue
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
-        values = {"noise": single_sample_noise(whole, states)}
+        noise = reading_noise(whole, states)
+        values = {"noise": float(np.linalg.norm(noise))}
         size = np.abs(task.target[:, states]).max()  # that the errors are differences of
         if running.any() or ended:
             far = [np.linalg.norm(e, axis=1) for e in each]
@@ -121,7 +120,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
         if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
-            values["end_std"] = std_at_end([e[-1] for e in each], whole, states)
+            values["end_std"] = std_at_end([e[-1] for e in each], noise)
         ranked.append((rates[k], -cost, k))
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
         found[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
@@ -131,23 +130,17 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     return tuple(found[k] for k in told)
 
 
-def single_sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> float:
-    """Return the noise (std) of one sample of the distance that some states have, by its runs."""
-    return float(np.linalg.norm(_sample_noise(trials, states)))
+def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
+    """Return the noise (std) of one sample of each of some states, (k,), rms over runs.
+
+    That of an encoder, which may rest on one count, is at least that of its counts.
+    """
+    each = [resampled_noise(trial.states[: trial.finite_steps + 1]) for trial in trials]
+    noise = np.sqrt(np.mean(np.square(each), axis=0))
+    return np.asarray(np.maximum(noise, _resolution(trials) / np.sqrt(12))[list(states)])
 
 
-def _sample_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
-    """Return the noise (std) of one sample of each of some states, rms over runs."""
-    each, chosen = [], list(states)
-    for trial in trials:
-        known = trial.states[: trial.finite_steps + 1]
-        counts = np.array([quantum([known[:, i]]) for i in chosen]) / np.sqrt(12)
-        rests = np.sum(np.diff(known[:, chosen], axis=0) == 0, axis=0) > RESTS * len(known)
-        each.append(np.maximum(resampled_noise(known)[chosen], np.where(rests, counts, 0.0)))
-    return np.asarray(np.sqrt(np.mean(np.square(each), axis=0)))
-
-
-def std_at_end(ends: Sequence[Array], trials: Sequence[Trial], states: Sequence[int]) -> float:
+def std_at_end(ends: Sequence[Array], noise: Array) -> float:
     """Return the standard error of the distance to the target at the end.
 
     An error at the end is one sample of each run. Of a single run its sensors' noise is known,
@@ -155,15 +148,14 @@ def std_at_end(ends: Sequence[Array], trials: Sequence[Trial], states: Sequence[
 
     Args:
         ends: the error at the end of each run (k,).
-        trials: the runs.
-        states: indices of the k states.
+        noise: that of one sample of each of the k states, see `reading_noise`.
     """
     far = np.linalg.norm(ends, axis=1)
     toward = np.array(ends) / np.where(far > 0, far, 1.0)[:, None]
-    toward[far == 0] = len(states) ** -0.5
-    noise = float(np.sqrt(np.mean(toward**2 @ _sample_noise(trials, states) ** 2)))
+    toward[far == 0] = len(noise) ** -0.5
+    single = float(np.sqrt(np.mean(toward**2 @ noise**2)))
     scatter = float(far.std(ddof=1)) if len(far) > 1 else 0.0
-    return float(max(noise, scatter) / len(far) ** 0.5)
+    return float(max(single, scatter) / len(far) ** 0.5)
 
 
 def by_runs(runs: int, *, each: bool = False) -> str:

@@ -53,9 +53,7 @@ def gap_section(findings: Findings) -> list[Block]:
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
-    shown = so_far(diagnosis, findings.since, findings.settled)[
-        -1:
-    ]  # the page begins with the rest
+    shown = so_far(diagnosis, findings.since, findings.settled)[-1:]  # the page begins with more
     items = frozenset(range(len(shown), len(shown) + len(causes)))
     verdict = Block("verdict", lines=[*shown, *causes, *others], strong=items)
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding

@@ -248,9 +248,8 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
     same = first is None or best is None or figure(first.utility) == figure(best.utility)
     if first is not None and best is not None and not same:
         gain = ""
-        if -math.inf < first.utility < 0 and best.utility <= 0:
-            tried = {one.candidate.id: one for one in findings.history}
-            two = tried[first.candidate.id], tried[best.candidate.id]
+        rated = -math.inf < first.utility < 0 and best.utility <= 0
+        if rated and (two := _first_and_best(findings)):
             did = "reduced" if best.utility > first.utility else "raised"
             gain = f": cost {did} by {share_of_cost(*two, findings.history)}"
             if best.utility > first.utility and (why := explained(*two, findings.history)):
