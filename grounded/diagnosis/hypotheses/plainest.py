@@ -65,8 +65,7 @@ def holding(search: HypothesisSearch, fit: Fitted) -> Fitted:
     for effect, values in fit.hypothesis.pairs:
         joint = search.joints.get(motion_of(effect))
         if effect.family.name == "coulomb_friction" and joint is not None and len(joint.free) == 1:
-            by = {"c": values["c"] / push(joint), "b": 0.0}
-            h = fit.hypothesis.minus(effect.name).plus(joint, by)
+            h = fit.hypothesis.minus(effect.name).plus(joint, _of_rate(joint, values))
             found = refine(search.predictor, [(h, fit.noise, fit.track)], iterations=TO_THE_TOP)
             if found and search.score(found[0]) > search.score(fit) + CLEARLY:
                 search.keep(found)
@@ -95,11 +94,16 @@ def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]
         stiction = by_family.get(("stiction", motion))
         if family == "coulomb_friction" and stiction is not None and joint is not None:
             rest = h.minus(effect.name).minus(stiction[0].name)
-            yield rest.plus(joint, {"c": values["c"] / push(joint), "b": 0.0})
+            yield rest.plus(joint, _of_rate(joint, values))
         if family == joint_friction.name and values["b"] == 0 and "b" not in effect.fixed:
             some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
             dry = replace(effect, quantities=tuple(some))
             yield h.minus(effect.name).plus(dry, values)
+
+
+def _of_rate(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the values of a joint's friction that brakes it as much as a Coulomb friction."""
+    return {"c": values["c"] / push(joint), "b": 0.0}
 
 
 def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
