@@ -3,8 +3,9 @@
 The jobs of a study run through joblib: as processes on this machine (extra `studies`), or as tasks
 of an existing Dask cluster through Dask's joblib backend (extra `cluster`). The pieces of one
 computation (`each`: records of a fit, hypotheses of a diagnosis) are short, numerous and share
-their data. On this machine they run in threads, which need no extra, because compiled code releases
-the GIL. On a cluster, data that all of them read is sent once (`SentOnce`).
+their data. On Linux they run in copies of this process (`forked`). Elsewhere, and where they step a
+simulator, which may have threads or connections that a copy lacks, they run in threads. On a
+cluster, data that all of them read is sent once (`SentOnce`).
 
 Both use one BLAS thread and keep freed memory (`steady`). The matrices are small, so OpenBLAS's own
 threads wait for each other (three times the CPU of a diagnosis on two busy cores) and change the
@@ -15,10 +16,11 @@ which then clears every page of the next one: 40 % of the time of a diagnosis.
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial
@@ -27,6 +29,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError, needs
+from grounded.forked import Forks, possible
 
 STACK = 16 * 2**20  # [bytes] stack size of a thread: kernels keep their matrices there
 CONNECT_S = 10.0  # [s] timeout for a cluster's scheduler to answer
@@ -54,6 +57,15 @@ def _keep_pages() -> None:
         return
     mallopt(MAP, LARGE)
     mallopt(TRIM, LARGE)
+
+
+def idle() -> int:
+    """Return the number of processors that were idle in the last minute, at least 1."""
+    try:
+        here, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    except (AttributeError, OSError):  # not Linux: there may be no such figures
+        return os.cpu_count() or 1
+    return max(1, here - round(load))
 
 
 @dataclass(frozen=True)
@@ -121,12 +133,17 @@ class Engine:
             client.close()
 
 
-_pool: ContextVar[Any] = ContextVar("pool", default=None)
+Results = Generator[tuple[int, Any], None, None]  # index of a piece, its result
+_pool: ContextVar[Callable[[Any, Sequence[Any]], Results] | None] = ContextVar("pool", default=None)
 
 
 @contextmanager
-def running(engine: Engine | None) -> Iterator[None]:
+def running(engine: Engine | None, *, copied: bool = True) -> Iterator[None]:
     """Make `each` use this engine inside the block; None: run in this process.
+
+    Args:
+        engine: the workers.
+        copied: whether pieces may run in copies of this process; False if they step a simulator.
 
     Raises:
         GroundedError: as `Engine.pool`.
@@ -135,10 +152,13 @@ def running(engine: Engine | None) -> Iterator[None]:
         yield
         return
     with ExitStack() as stack:
-        if engine.name == "local":
+        call: Callable[[Any, Sequence[Any]], Results]
+        if engine.name == "local" and copied and possible():
+            call = Forks(engine.jobs, (SentOnce,))
+        elif engine.name == "local":
             stack.callback(threading.stack_size, threading.stack_size(STACK))
             threads = stack.enter_context(ThreadPoolExecutor(engine.jobs))
-            call: Callable[..., Iterable[Any]] = partial(threads.map, _quietly)
+            call = partial(_threaded, threads)
         else:
             pool = stack.enter_context(engine.pool(batch_size=1, return_as="generator"))
             call = partial(_sent, pool)
@@ -149,9 +169,16 @@ def running(engine: Engine | None) -> Iterator[None]:
             _pool.reset(before)
 
 
-def _sent(pool: Any, functions: Iterable[Any], *columns: Iterable[Any]) -> Iterable[Any]:
-    """Run the functions on the cluster; yield the result of each row."""
-    return pool((_steadily, row, {}) for row in zip(functions, *columns, strict=True))  # type: ignore[no-any-return]
+def _alone(function: Any, rows: Sequence[Any]) -> Results:
+    yield from ((k, function(*row)) for k, row in enumerate(rows))
+
+
+def _threaded(threads: Executor, function: Any, rows: Sequence[Any]) -> Results:
+    yield from enumerate(threads.map(partial(_quietly, function), rows))
+
+
+def _sent(pool: Any, function: Any, rows: Sequence[Any]) -> Results:
+    yield from enumerate(pool((_steadily, (function, row), {}) for row in rows))
 
 
 def each(
@@ -163,28 +190,26 @@ def each(
         function: a module-level function, so that it can be pickled; it must not modify shared
             data.
         columns: sequences of arguments, all of the same length.
-        done: called after each piece, in order.
+        done: called after each piece.
     """
-    results, many, call = list[T](), len(columns[0]), _pool.get()
-    if call is None or many < 2:
-        found: Iterable[T] = map(function, *columns)
-    else:
-        found = call([function] * many, *columns)
-    for result in found:
-        results.append(result)
-        if done is not None:
-            done()
-    return results
+    rows, results = list(zip(*columns, strict=True)), dict[int, T]()
+    call = (_pool.get() if len(rows) > 1 else None) or _alone
+    with closing(call(function, rows)) as found:  # ends what was begun, if one piece raises
+        for k, result in found:
+            results[k] = result
+            if done is not None:
+                done()
+    return [results[k] for k in range(len(rows))]
 
 
-def _quietly(function: Callable[..., T], *row: Any) -> T:
+def _quietly(function: Callable[..., T], row: Sequence[Any]) -> T:
     with np.errstate(all="ignore"):  # workers do not inherit this setting
         return function(*row)
 
 
 @steady()
-def _steadily(function: Callable[..., T], *row: Any) -> T:
-    return _quietly(function, *row)
+def _steadily(function: Callable[..., T], row: Sequence[Any]) -> T:
+    return _quietly(function, row)
 
 
 class SentOnce:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -50,7 +51,7 @@ REGIONS = 3  # named in the details
 @click.option(
     "--probe", is_flag=True, help="Write the most informative next trial, even without a tie."
 )
-@parallel
+@partial(parallel, by_itself=True)
 @click.option("--instruments", is_flag=True, help="Check the sensors only; takes some seconds.")
 @click.option(
     "--details", is_flag=True, help="Also rival effects, whole trials, look-alikes, utilities."

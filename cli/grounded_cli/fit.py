@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -46,7 +47,7 @@ HELD_OUT = (  # `fit.parameters.split_in_time`
 @click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
 @click.option("--latency", is_flag=True, help="Fit one transport delay of all inputs too.")
 @click.option("--apply", "apply_", is_flag=True, help="Write the values to grounded.toml.")
-@parallel
+@partial(parallel, by_itself=True)
 @in_workspace
 @as_json
 def command(

@@ -194,7 +194,8 @@ def diagnose(
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
     limit = options.max_effects or MOST_EFFECTS
-    with running(engine):
+    copied = data.model.system.how != "differenced"
+    with running(engine, copied=copied):
         search, best = attribute(
             data,
             candidates,
@@ -233,7 +234,7 @@ def diagnose(
         )
 
     here = interruptible(found_so_far)
-    with np.errstate(all="ignore"), here, running(engine):
+    with np.errstate(all="ignore"), here, running(engine, copied=copied):
         try:
             while True:
                 tick("predict")

@@ -101,7 +101,8 @@ def fit(
     asked, tick = unknowns, Stages(progress, _done)
     tied: dict[str, list[str]] = {}  # of what is held, those that are identified since
     before: list[str] = []
-    with interruptible(lambda: tick.so_far), running(engine):
+    copied = model.system.how != "differenced"
+    with interruptible(lambda: tick.so_far), running(engine, copied=copied):
         while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
             if tied:

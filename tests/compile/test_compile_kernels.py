@@ -171,7 +171,7 @@ def test_many_models_in_threads():
     def cost(p):
         return solve(replace(task, p=p), np.full((50, 2), 0.3)).cost
 
-    with running(Engine(4)):
+    with running(Engine(4), copied=False):
         assert each(cost, values) == [cost(p) for p in values]
         with pytest.raises(ZeroDivisionError):
             each(lambda i: 1 / i, [1, 0, 2])
@@ -263,7 +263,7 @@ def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
     forty = wide(40, 4, True)
     assert forty.system.how == "compiled"
     u = np.zeros((12, 4))
-    with running(Engine(2)):
+    with running(Engine(2), copied=False):
         costs = each(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2)
     assert costs[0] == costs[1] == solve(forty, u).cost
 

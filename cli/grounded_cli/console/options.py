@@ -26,14 +26,20 @@ def anyway(function: F) -> F:
     return click.option("--anyway", is_flag=True, help=text)(function)
 
 
-def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a command that can run in parallel, passed as `engine`."""
+def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[..., Any]:
+    """Add the options of a command that can run in parallel, passed as `engine`.
+
+    by_itself: it runs on all idle processors unless --jobs says otherwise.
+    """
 
     @functools.wraps(function)
-    def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
-        from grounded.engine import Engine
+    def call(*args: Any, jobs: int | None, engine: str, address: str | None, **others: Any) -> Any:
+        from grounded.engine import Engine, idle
 
+        jobs = jobs or (idle() if by_itself and engine == "local" else 1)
         return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
+
+    default = "processors that are idle" if by_itself else "1"
 
     for option in (
         click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
@@ -47,8 +53,7 @@ def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
             "--jobs",
             type=click.IntRange(1),
             metavar="N",
-            default=1,
-            help="Workers on this machine (default: 1).",
+            help=f"Workers on this machine (default: {default}).",
         ),
     ):
         call = option(call)

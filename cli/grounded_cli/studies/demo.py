@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,7 +45,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
-    from grounded.engine import Engine
+    from grounded.engine import Engine, idle
     from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
     from grounded_trials.report.three_lines import three_lines
@@ -66,7 +65,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     save_optimum(workspace, best)
     with stages() as tell:
         tell("diagnosing the gap")
-        some, engine = _few(workspace, status), Engine(os.cpu_count() or 1)
+        some, engine = _few(workspace, status), Engine(idle())
         diagnosed = workspace.diagnose(
             some, max_effects=MOST if some else None, engine=engine, progress=tell
         )

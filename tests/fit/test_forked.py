@@ -1,0 +1,132 @@
+"""Pieces in copies of the process: the same results as alone, also if a copy fails in some way."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from grounded import forked
+from grounded.engine import Engine, each, running
+
+pytestmark = pytest.mark.skipif(not forked.possible(), reason="copies are made on Linux only")
+HERE = os.getpid()
+
+
+@pytest.fixture(autouse=True)
+def always(monkeypatch):
+    monkeypatch.setattr(forked, "WORTH_S", 1e-9)
+
+
+@dataclass(frozen=True)
+class Given:
+    """Can't be pickled: it holds a function that has no name."""
+
+    function: object
+    values: np.ndarray
+
+
+def no_copies_left():
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+    return True
+
+
+def slowly(i):
+    time.sleep(0.02)
+    return i, os.getpid()
+
+
+@pytest.mark.parametrize("copied", [True, False])
+def test_pieces_are_shared_and_come_back_in_order(copied):
+    with running(Engine(3), copied=copied):
+        found = each(slowly, list(range(12)))
+    assert [i for i, _ in found] == list(range(12))
+    assert len({process for _, process in found}) == (3 if copied else 1)
+    assert no_copies_left()
+
+
+def test_what_a_piece_was_given_comes_back_as_the_same_object():
+    given = [Given(lambda x: x + 1, np.arange(5.0)) for _ in range(8)]
+
+    def made(one, k):
+        slowly(k)
+        return {
+            "one": one,
+            "values": one.values,
+            "new": one.function(one.values),
+            "by": os.getpid(),
+        }
+
+    with running(Engine(2)):
+        found = each(made, given, list(range(8)))
+    assert {result["by"] for result in found} > {HERE}
+    for one, result in zip(given, found, strict=True):
+        assert result["one"] is one and result["values"] is one.values
+        assert (result["new"] == one.values + 1).all()
+
+
+def killed(i):
+    if os.getpid() != HERE:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slowly(i)
+
+
+def unsendable(i):
+    return (lambda: i) if os.getpid() != HERE else slowly(i)
+
+
+def fails_there(i):
+    if os.getpid() != HERE:
+        raise ValueError(i)
+    return slowly(i)
+
+
+def hangs(i):
+    if os.getpid() != HERE:
+        time.sleep(60)
+    return slowly(i)
+
+
+@pytest.mark.parametrize("piece", [killed, unsendable, fails_there, hangs])
+def test_what_a_copy_does_not_return_is_computed_here(piece, monkeypatch):
+    monkeypatch.setattr(forked, "PATIENCE_S", 0.1)
+    began, counted = time.monotonic(), []
+    with running(Engine(2)):
+        found = each(piece, list(range(6)), done=lambda: counted.append(1))
+    assert found == [(i, HERE) for i in range(6)]
+    assert len(counted) == 6
+    assert time.monotonic() - began < 10
+    assert no_copies_left()
+
+
+def test_an_exception_is_raised_as_without_copies():
+    with running(Engine(2)), pytest.raises(ZeroDivisionError):
+        each(lambda i: 1 / i, [2, 1, 0, 3])
+    assert no_copies_left()
+
+
+def test_ctrl_c_ends_the_copies():
+    def stop():
+        raise KeyboardInterrupt
+
+    with running(Engine(2)), pytest.raises(KeyboardInterrupt):
+        each(slowly, list(range(50)), done=stop)
+    assert no_copies_left()
+
+
+def test_without_processes_left_all_is_computed_here(monkeypatch):
+    def refused():
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", refused)
+    with running(Engine(3)):
+        assert each(slowly, list(range(5))) == [(i, HERE) for i in range(5)]
+
+
+def test_short_pieces_are_computed_here(monkeypatch):
+    monkeypatch.setattr(forked, "WORTH_S", 0.03)
+    with running(Engine(3)):
+        assert each(lambda i: (i, os.getpid()), list(range(5))) == [(i, HERE) for i in range(5)]
