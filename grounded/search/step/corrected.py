@@ -189,21 +189,30 @@ class Corrected(System):
             return sweep(problem, u, linearised(self, problem, z, u), damping)
 
 
-def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
+def runs(
+    problem: Problem, policies: Sequence[Policy], biases: Sequence[Array] | None = None
+) -> tuple[Array, Array]:
     """Return the states (P, H + 1, n) and costs (P,) of predicted runs, see `predicted`.
 
     Args:
         problem: the problem that predicts the runs.
-        policies: of one horizon, with feedback, over the problem's z or fewer states.
+        policies: of one horizon, over the problem's z or fewer states.
+        biases: one (H, n) for each run; None for the problem's own.
     """
     system = problem.system
-    if not isinstance(system, Corrected):
-        each = [predicted(problem, policy) for policy in policies]
+    if biases is None:
+        models, biases = [problem] * len(policies), [problem.bias] * len(policies)
+    else:
+        models = [replace(problem, bias=bias) for bias in biases]
+    if not isinstance(system, Corrected) or any(policy.gain is None for policy in policies):
+        each = [predicted(model, policy) for model, policy in zip(models, policies, strict=True)]
         return np.array([one.states for one in each]), np.array([-one.utility for one in each])
     room = max(1, MOST // (problem.horizon * problem.nz * system.m))
     if len(policies) > room:  # long horizons
-        parts = [runs(problem, policies[i : i + room]) for i in range(0, len(policies), room)]
-        states, costs = zip(*parts, strict=True)
+        some = [slice(i, i + room) for i in range(0, len(policies), room)]
+        states, costs = zip(
+            *(runs(problem, policies[part], biases[part]) for part in some), strict=True
+        )
         return np.concatenate(states), np.concatenate(costs)
     for policy in policies:  # z holds all past inputs that any of them feeds back
         problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
@@ -211,7 +220,8 @@ def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
     laid = [p.laid_out(system.states, angles, problem.depths) for p in policies]
     sent = np.array([p.feedforward for p in laid])
     K, aim = np.array([p.gain for p in laid]), np.array([p.reference for p in laid])
-    z, found = _run(problem, system, sent, K, aim)
+    bias = np.array(biases)
+    z, found = _run(problem, system, sent, K, aim, bias)
     left, n = np.arange(len(laid) if problem.age else 0), system.n
     for _ in range(problem.horizon):  # as in `simulate`, each until it agrees with what was seen
         if not len(left):
@@ -219,7 +229,7 @@ def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
         late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in z[left]]
         seen = aim[left].copy()
         seen[:, :, :n] -= late
-        again, found[left] = _run(problem, system, sent[left], K[left], seen)
+        again, found[left] = _run(problem, system, sent[left], K[left], seen, bias[left])
         scale = 1.0 + np.abs(again).max(axis=1, keepdims=True)
         moved = (np.abs(again - z[left]) > SETTLED * scale).any(axis=(1, 2))
         z[left] = again
@@ -228,7 +238,7 @@ def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
 
 
 def _run(
-    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array
+    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array, bias: Array
 ) -> tuple[Array, Array]:
     """Return z (P, H + 1, nz) and the costs (P,) of closed loops.
 
@@ -238,6 +248,7 @@ def _run(
         sent: feedforward inputs (P, H, m).
         K: gains (P, H, m, nz).
         aim: reference of z (P, H, nz).
+        bias: what is added to the states in each step (P, H, n).
     """
     queue, n, H = problem.queue, system.n, problem.horizon
     z, u = np.empty((len(sent), H + 1, problem.nz)), np.empty((len(sent), H, system.m))
@@ -248,6 +259,6 @@ def _run(
             fed_back = (K[:, t] @ off[:, :, None])[:, :, 0]
             u[:, t] = np.clip(sent[:, t] + fed_back, problem.low, problem.high)
             received = problem.received(z[:, t], u[:, t], t)
-            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + problem.bias[t]
+            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + bias[:, t]
             z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
         return z, trajectory_cost(problem, z, u)

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -48,7 +49,7 @@ from grounded.policy import Policy
 from grounded.rollout import Run, apart, augmented
 from grounded.search.candidate import Tried
 from grounded.search.planner import Planner, predicted
-from grounded.search.step.corrected import Corrected
+from grounded.search.step.corrected import Corrected, runs
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
@@ -85,17 +86,24 @@ class Alternative:
     problem: Problem
     off: tuple[Array, ...]  # y_j (H, n)
 
-    def cost(self, policy: Policy) -> float:
-        """Return the mean cost of a policy over the disturbances, times the weight."""
+    def costs(self, policies: Sequence[Policy]) -> Array:
+        """Return the mean cost of policies over the disturbances, times the weight, (P,)."""
         if self.weight == 0:
-            return 0.0
-        return self.weight * float(np.mean([self._disturbed(y, policy) for y in self.off]))
+            return np.zeros(len(policies))
+        each = [policy for policy in policies for _ in self.off]
+        _, found = runs(self.problem, each, self._disturbed * len(policies))
+        found = np.where(found < WORST, found, WORST).reshape(len(policies), len(self.off))
+        return np.asarray(self.weight * found.mean(axis=1))
 
-    def _disturbed(self, y: Array, policy: Policy) -> float:
-        bias = self.problem.bias.copy()
-        bias[:, : y.shape[1]] += y
-        cost = -predicted(replace(self.problem, bias=bias), policy).utility
-        return cost if cost < WORST else WORST
+    @cached_property
+    def _disturbed(self) -> list[Array]:
+        """Biases (H, nx) of the problem with each of the mispredictions added."""
+        found = []
+        for y in self.off:
+            bias = self.problem.bias.copy()
+            bias[:, : y.shape[1]] += y
+            found.append(bias)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
