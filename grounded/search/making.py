@@ -424,7 +424,7 @@ class Maker:
             follows = base is not None and base.candidate.base and way != "own plan"
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
-            policy = self._gently(policy, problem, caution)
+            policy = self._gently(policy, problem, predicted(problem, policy), caution)
         made = Candidate(
             id=self.identity,
             policy=policy,
@@ -477,16 +477,24 @@ class Maker:
         if not between_limits(incumbent, self.planner.task):
             less = own.caution + np.arange(1, FINE) / FINE
             most = HALF * _gain(own.policy)
-            few = (c for c in less if _gain(self._gently(own.policy, problem, c)) < most)
+            run = predicted(problem, own.policy)
+            few = (c for c in less if _gain(self._gently(own.policy, problem, run, c)) < most)
             caution = float(next(few, caution))
         made = self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
         return self.quietened(made, problem)
 
-    def _gently(self, policy: Policy, problem: Problem, caution: float) -> Policy:
-        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight."""
+    def _gently(self, policy: Policy, problem: Problem, run: Rollout, caution: float) -> Policy:
+        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight.
+
+        Args:
+            policy: a policy.
+            problem: predicts its run.
+            run: that run.
+            caution: see above.
+        """
         if policy.gain is None:
             return policy
-        run, gentle = predicted(problem, policy), self.planner.dearer(problem, GENTLER**caution)
+        gentle = self.planner.dearer(problem, GENTLER**caution)
         found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
@@ -504,8 +512,8 @@ class Maker:
         own = made.policy
         if own.gain is None or not self.planner.needs_margin:
             return made
-        gently, loose = partial(self._gently, own, problem), self.planner.loosened(problem)
-        new = steadied(problem, own, gently, loose)
+        run, loose = predicted(problem, own), self.planner.loosened(problem)
+        new = steadied(problem, own, run, partial(self._gently, own, problem, run), loose)
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     @cached_property
@@ -523,9 +531,10 @@ class Maker:
         quiet = self.quiet
         if quiet is None or quiet.needed or quiet.allows(made.policy):
             return made
-        policy, caution = made.policy, made.caution
+        policy, caution, run = made.policy, made.caution, predicted(problem, made.policy)
         for more in np.arange(1, MOST * FINE + 1) / FINE:
-            policy, caution = self._gently(made.policy, problem, made.caution + more), float(more)
+            policy = self._gently(made.policy, problem, run, made.caution + more)
+            caution = float(more)
             if quiet.allows(policy):
                 break
         made = replace(made, caution=made.caution + caution)
