@@ -79,14 +79,15 @@ def all_worse_costs(models: Sequence[Problem], policies: Sequence[Policy]) -> Ar
     fed_back = [one for one, policy in enumerate(policies) if policy.gain is not None]
     if not fed_back:
         return np.asarray(found.mean(axis=3), np.float64)
-    states, _ = runs(models[0], [policies[one] for one in fed_back])
-    noisy = [_noisy(policies[one], x) for one, x in zip(fed_back, states, strict=True)]
+    own = runs(models[:1] * len(fed_back), [policies[one] for one in fed_back])
+    noisy = [_noisy(policies[one], run.states) for one, run in zip(fed_back, own, strict=True)]
     known = [one for one, some in zip(fed_back, noisy, strict=True) if some]
     for i, model in enumerate(models if known else ()):
         for j, age in enumerate(AGES):
             late = replace(model, delay=model.delay + age)
-            _, costs = runs(late, [run for some in noisy for run in some])
-            found[known, i, j] = costs.reshape(len(known), SEEDS)
+            tried = [run for some in noisy for run in some]
+            costs = [-run.utility for run in runs([late] * len(tried), tried)]
+            found[known, i, j] = np.reshape(costs, (len(known), SEEDS))
     return np.asarray(found.mean(axis=3), np.float64)
 
 

@@ -91,18 +91,18 @@ class Alternative:
         if self.weight == 0:
             return np.zeros(len(policies))
         each = [policy for policy in policies for _ in self.off]
-        _, found = runs(self.problem, each, self._disturbed * len(policies))
-        found = np.where(found < WORST, found, WORST).reshape(len(policies), len(self.off))
-        return np.asarray(self.weight * found.mean(axis=1))
+        found = runs(self._disturbed * len(policies), each)
+        costs = np.minimum([-run.utility for run in found], WORST)
+        return np.asarray(self.weight * costs.reshape(-1, len(self.off)).mean(axis=1))
 
     @cached_property
-    def _disturbed(self) -> list[Array]:
-        """Biases (H, nx) of the problem with each of the mispredictions added."""
+    def _disturbed(self) -> list[Problem]:
+        """The problem with each of the mispredictions added to its bias."""
         found = []
         for y in self.off:
             bias = self.problem.bias.copy()
             bias[:, : y.shape[1]] += y
-            found.append(bias)
+            found.append(replace(self.problem, bias=bias))
         return found
 
 
@@ -152,13 +152,17 @@ def believed(
     others = [o for o, _ in nearest]
     refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
 
-    crude, corrected = [], []
-    for other in others[:ASKED] + refuting[:ASKED]:
-        rest = [o for o in others if o is not other]
-        law, left = laws(own, rest or others, grounded)
-        crude.append(unforetold(grounded, own, other))
-        share = 1.0 if law is None else unforetold(with_law(law, own, grounded).problem, own, other)
-        corrected.append(share if rest else max(share, left))
+    asked = others[:ASKED] + refuting[:ASKED]
+    rests = [[o for o in others if o is not other] for other in asked]
+    fits = [laws(own, rest or others, grounded) for rest in rests]
+    crude = unforetold([grounded] * len(asked), own, asked)
+    fitted = [k for k, (law, _) in enumerate(fits) if law is not None]
+    models = [with_law(fits[k][0], own, grounded).problem for k in fitted]
+    shares = dict(zip(fitted, unforetold(models, own, [asked[k] for k in fitted]), strict=True))
+    corrected = [
+        shares.get(k, 1.0) if rests[k] else max(shares.get(k, 1.0), left)
+        for k, (_, left) in enumerate(fits)
+    ]
     law, _ = laws(own, others, grounded)
     made, near = with_law(law, own, grounded), others[:ASKED]
     off = unexplained = tuple(o.y for o in near)
@@ -218,11 +222,22 @@ def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
     return Believed(made.on(grounded), made)
 
 
-def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
-    """Return the share of a trial's difference from the incumbent's that a model mispredicts."""
-    found = predicted(problem, other.policy)
-    run = (found.states, found.inputs)
-    return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
+def unforetold(models: Sequence[Problem], own: Seen, others: Sequence[Seen]) -> list[float]:
+    """Return the share of each trial's difference from the incumbent's that its model mispredicts.
+
+    Args:
+        models: one for each of the other trials, alike except for their laws.
+        own: the incumbent's trial.
+        others: other trials.
+    """
+    found = runs(models, [other.policy for other in others])
+    return [
+        min(
+            1.0,
+            apart(model, (run.states, run.inputs), other.run) / apart(model, own.run, other.run),
+        )
+        for model, run, other in zip(models, found, others, strict=True)
+    ]
 
 
 def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
@@ -333,15 +348,17 @@ def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
     size = np.einsum("j,jtk->k", near, y**2) * y.shape[2] + 1e-300
     parts, best = np.array_split(np.arange(d.shape[1]), PARTS), 1.0
     law = np.zeros((d.shape[2], y.shape[2]))
+    ridges = np.multiply.outer(PRICES, np.eye(len(law)))
     for fading in FADING:
         weight = (far / far[0]) ** -fading
         M = np.array([np.einsum("j,jtp,jtq->pq", weight, d[:, t], d[:, t]) for t in parts])
         N = np.array([np.einsum("j,jtp,jtk->pk", weight, d[:, t], y[:, t]) for t in parts])
-        for price in PRICES:
-            ridge = price * np.eye(len(law))
-            each = np.linalg.solve(M.sum(axis=0) - M + ridge, N.sum(axis=0) - N)
-            off = [y[:, t] - d[:, t] @ C for t, C in zip(parts, each, strict=True)]
-            left = float(sum(np.einsum("j,jtk,k->", near, e**2, 1 / size) for e in off))
+        each = np.linalg.solve(M.sum(axis=0) - M + ridges[:, None], (N.sum(axis=0) - N)[None])
+        off = [
+            y[:, t] - d[:, t] @ C[:, None] for t, C in zip(parts, each.swapaxes(0, 1), strict=True)
+        ]
+        lefts = sum(np.einsum("j,pjtk,k->p", near, e**2, 1 / size) for e in off)
+        for left, ridge in zip(lefts.tolist(), ridges, strict=True):
             if left < best:
                 best, law = left, np.linalg.solve(M.sum(axis=0) + ridge, N.sum(axis=0))
     return (law / scale[:, None]).T, best

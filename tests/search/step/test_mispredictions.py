@@ -238,8 +238,8 @@ def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
     planner, history = Planner(task, task), found.search.standing.history
     moved = replace(found.problem, start=found.problem.start + 0.01)  # noise of the first sample
 
-    def flattered(problem, own, other):
-        return 1.0 if problem is moved else 0.0
+    def flattered(problems, own, others):
+        return [1.0 if problem is moved else 0.0 for problem in problems]
 
     def unstable(own, others, grounded):
         law = np.zeros((len(own.x), 2, 6))
