@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import Problem
-from grounded.compile.run.interpreted import Quadratic, linearised
+from grounded.compile.run.interpreted import Quadratic, diagonals, linearised
 from grounded.frozen import Array, wrapped
 
 PASSES = 4
@@ -116,15 +116,16 @@ def _estimates(
 def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -> Array:
     """F, back in time, with the value of the loop that it makes."""
     gains = np.zeros_like(K)
-    weights, R, frees = _diagonal(q.l_zz), np.diag(q.l_uu), K.any(axis=2)
+    weights, R, frees = diagonals(q.l_zz), np.diag(q.l_uu), K.any(axis=2)
     V = weights[-1]
     for t in range(len(K) - 1, -1, -1):
         free, A, B = frees[t], q.A[t], q.B[t]
         VB = V @ B
         Q_uu, Q_uz = R + B.T @ VB, q.l_uz + VB.T @ A
         if free.any() and np.isfinite(Q_uu).all() and np.isfinite(Q_uz).all():
-            full = -_least_squares(Q_uu[np.ix_(free, free)], Q_uz[free])
-            gains[t][free] = np.where(known, full @ estimates[t], 0.0)
+            if not free.all():
+                Q_uu, Q_uz = Q_uu[np.ix_(free, free)], Q_uz[free]
+            gains[t, free] = np.where(known, -_least_squares(Q_uu, Q_uz) @ estimates[t], 0.0)
         V = _before(A + B @ gains[t], (*_by_inputs(q, gains[t]), weights[t]), V)
     return gains
 
@@ -138,7 +139,7 @@ def _least_squares(Q_uu: Array, Q_uz: Array) -> Array:
 
 def _costs(q: Quadratic, K: Array, noise: Array) -> Array:
     """What the disturbances cost in the loops of gains K (P, H, m, nz), (P,)."""
-    loops, by_inputs, weights = q.A + q.B @ K, _by_inputs(q, K), _diagonal(q.l_zz)
+    loops, by_inputs, weights = q.A + q.B @ K, _by_inputs(q, K), diagonals(q.l_zz)
     V = np.broadcast_to(weights[-1], loops[:, 0].shape)
     total = V.diagonal(axis1=1, axis2=2) @ noise
     for t in range(K.shape[1] - 1, -1, -1):
@@ -148,7 +149,7 @@ def _costs(q: Quadratic, K: Array, noise: Array) -> Array:
 
 
 def _by_inputs(q: Quadratic, K: Array) -> tuple[Array, Array, Array]:
-    """The parts (..., nz, nz) of the cost of steps that are due to inputs by gains K (..., m, nz)."""
+    """The parts (..., nz, nz) of the cost of steps that inputs by gains K (..., m, nz) cause."""
     back = K.swapaxes(-1, -2)
     cross = back @ q.l_uz
     return back @ (q.l_uu[:, None] * K), cross, cross.swapaxes(-1, -2)
@@ -169,11 +170,3 @@ def _before(loop: Array, own: Sequence[Array], V: Array) -> Array:
     for part in own:
         value = value + part
     return np.asarray(0.5 * (value + value.swapaxes(-1, -2)))
-
-
-def _diagonal(rows: Array) -> Array:
-    """Diagonal matrices (N, k, k) of rows (N, k)."""
-    found = np.zeros((*rows.shape, rows.shape[1]))
-    each = np.arange(rows.shape[1])
-    found[:, each, each] = rows
-    return found
