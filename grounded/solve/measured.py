@@ -116,7 +116,8 @@ def _estimates(
 def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -> Array:
     """F, back in time, with the value of the loop that it makes."""
     gains = np.zeros_like(K)
-    weights, R, frees = diagonals(q.l_zz), np.diag(q.l_uu), K.any(axis=2)
+    weights, R = diagonals(q.l_zz), np.diag(q.l_uu)
+    frees: NDArray[np.bool_] = np.any(K, axis=2)
     V = weights[-1]
     for t in range(len(K) - 1, -1, -1):
         free, A, B = frees[t], q.A[t], q.B[t]

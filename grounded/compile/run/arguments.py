@@ -100,7 +100,8 @@ def word(value: Any) -> int:
 def address(array: Array) -> int:
     """Where an array's first element is."""
     if array.flags.writeable and array.size:  # a third of the time of the line below
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        memory: Any = array
+        return ctypes.addressof(ctypes.c_char.from_buffer(memory))
     return int(array.__array_interface__["data"][0])
 
 

@@ -79,7 +79,7 @@ def all_worse_costs(models: Sequence[Problem], policies: Sequence[Policy]) -> Ar
     fed_back = [one for one, policy in enumerate(policies) if policy.gain is not None]
     if not fed_back:
         return np.asarray(found.mean(axis=3), np.float64)
-    own = runs(models[:1] * len(fed_back), [policies[one] for one in fed_back])
+    own = runs([models[0]] * len(fed_back), [policies[one] for one in fed_back])
     noisy = [_noisy(policies[one], run.states) for one, run in zip(fed_back, own, strict=True)]
     known = [one for one, some in zip(fed_back, noisy, strict=True) if some]
     for i, model in enumerate(models if known else ()):
