@@ -122,5 +122,6 @@ def wrapped(d: Array, angles: ArrayLike) -> Array:
         angles: (n,) bool, which entries are angles.
     """
     for i in np.asarray(angles).nonzero()[0].tolist():  # np.flatnonzero takes ten times as long
-        d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
+        column = d[..., i]
+        column -= 2 * np.pi * np.rint(column / (2 * np.pi))
     return d

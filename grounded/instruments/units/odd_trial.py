@@ -265,9 +265,11 @@ def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd
         logged, mended = (Ahead(model, t, shown, FEW) for t in (trial, odd.mended(trial)))
         if not (logged.enough and mended.enough):
             return False
-        own, rms = logged.best([usual], free=False), mended.best([usual], free=False).rms
+        rms = mended.best([usual], free=False).rms
         rms[list(odd.states)] *= odd.factor  # as large as in the log
-        gained = np.log(own.rms / rms)
+        if not np.log(logged.plain(usual).rms / rms).sum() > CLEAR:
+            return False  # calibrated, the errors of the log are smaller still
+        gained = np.log(logged.best([usual], free=False).rms / rms)
         most = int(gained.argmax())
         if not rms[most] < SEEN * logged.moved[most]:  # no unit makes the log predictable
             return False
