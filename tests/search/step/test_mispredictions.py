@@ -231,6 +231,24 @@ def test_a_run_with_a_motor_wired_wrongly_corrects_no_derivatives():
     assert told.corrected is None and not told.alternatives
 
 
+def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
+    planner, history = Planner(found.task, found.task), found.search.standing.history
+    made = believed(planner, found.best, history, found.problem).alternatives
+    own = found.best.candidate.policy
+    policies = [own, replace(own, gain=0.8 * own.gain), history[0].candidate.policy]
+    assert made and any(one.weight for one in made)
+    for one in made:
+        alone = []
+        for policy in policies:
+            costs = []
+            for y in one.off:
+                bias = one.problem.bias.copy()
+                bias[:, : y.shape[1]] += y
+                costs.append(-predicted(replace(one.problem, bias=bias), policy).utility)
+            alone.append(one.weight * np.mean(costs))
+        np.testing.assert_allclose(one.costs(policies), alone, rtol=1e-9)
+
+
 def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
     """With the wild run of a motor they gave -2,014 for a best run of -1.553."""
     task = cart_task()

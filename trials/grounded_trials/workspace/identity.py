@@ -180,8 +180,8 @@ class _Recent(Generic[T]):
         self._size = 0  # of those files, in bytes
 
     def get(self, data: bytes) -> T | None:
-        """Return what is known about a file, or None."""
-        return next((found for own, found in tuple(self._kept) if own == data), None)
+        """Return what was found out last about a file, or None."""
+        return next((found for own, found in tuple(self._kept)[::-1] if own == data), None)
 
     def add(self, data: bytes, found: T) -> T:
         """Keep what is known about a file, and return it."""
