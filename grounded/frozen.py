@@ -95,10 +95,14 @@ def resampled_noise(states: Array) -> Array:
 def _by_orders(states: Array, stride: int) -> Array:
     """Return the noise by differences of each order of every `stride`-th sample, (orders, n)."""
     found = np.full((len(ORDERS), states.shape[1]), np.inf)
-    parts = [np.asarray(states[k::stride]) for k in range(stride)]
+    parts, done = [np.asarray(states[k::stride]) for k in range(stride)], 0
     for row, order in zip(found, ORDERS, strict=True):
-        each = np.abs(np.concatenate([np.diff(part, n=order, axis=0) for part in parts]))
+        parts, done = [np.diff(part, n=order - done, axis=0) for part in parts], order
+        each = np.abs(np.concatenate(parts))
         white = MEDIAN * math.sqrt(math.comb(2 * order, order))
+        if each.size and np.isfinite(each).all():
+            row[:] = median(each) / white
+            continue
         for j, column in enumerate(each.T):
             known = column[np.isfinite(column)]
             row[j] = median(known) / white if len(known) else np.inf
@@ -118,5 +122,6 @@ def wrapped(d: Array, angles: ArrayLike) -> Array:
         angles: (n,) bool, which entries are angles.
     """
     for i in np.asarray(angles).nonzero()[0].tolist():  # np.flatnonzero takes ten times as long
-        d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
+        column = d[..., i]
+        column -= 2 * np.pi * np.rint(column / (2 * np.pi))
     return d

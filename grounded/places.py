@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -259,13 +260,18 @@ def integrals(model: Model) -> list[Integral]:
 
     A heading rate that the model only carries along is included, with `exact` false.
     """
+    return list(_integrals(model))
+
+
+@lru_cache(maxsize=8)  # each log is read with the same model, which is asked twenty times
+def _integrals(model: Model) -> tuple[Integral, ...]:
     names = model.state_names
     found = [
         Integral(names.index(name), names.index(other), c)
         for name, (other, c) in integrated(model).items()
     ]
     carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
-    return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
+    return (*found, *(Integral(i, names.index(k), 1.0, exact=False) for i, k in carried))
 
 
 def told_by(model: Model, pair: Sequence[str]) -> set[str]:

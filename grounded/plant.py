@@ -8,6 +8,7 @@ a Trial of MEASURED states and COMMANDED inputs, as a robot does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -108,14 +109,14 @@ class Plant:
             order: index of each of the policy's inputs among the plant's.
         """
         h = policy.dt / self.substeps
-        u = np.zeros((len(x), self.model.m))
-        for i in range(self.substeps):
-            for j, name in enumerate(policy.input_names):
-                age = self.latency.get(name, 0.0) - (i + 0.5) * h
-                row = t - int(np.ceil(age / policy.dt - 1e-9)) if age > 0 else t
-                u[:, order[j]] = commands[:, row, j] if row >= 0 else policy.past[j]
-            with np.errstate(all="ignore"):
-                x = self.model.system.step(x, u, self.model.values, h)
+        u, values = np.zeros((len(x), self.model.m)), self.model.values
+        with np.errstate(all="ignore"):
+            for i in range(self.substeps):
+                for j, name in enumerate(policy.input_names):
+                    age = self.latency.get(name, 0.0) - (i + 0.5) * h
+                    row = t - math.ceil(age / policy.dt - 1e-9) if age > 0 else t
+                    u[:, order[j]] = commands[:, row, j] if row >= 0 else policy.past[j]
+                x = self.model.system.step(x, u, values, h)
         return x
 
     @property

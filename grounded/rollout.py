@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,18 +115,36 @@ def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array
     Returns:
         The next states (N, n).
     """
+    return stepper(model, p, dt)(x, u)
+
+
+def stepper(model: Model, p: Array, dt: float) -> Callable[[Array, Array], Array]:
+    """Return the function (x, u) -> next states of `each_stepped`, to call it many times.
+
+    Args:
+        model: of n states, m inputs and k parameters.
+        p: parameters (N, k).
+        dt: the control interval [s].
+    """
     together = getattr(model.step, "rows", None)  # simulators step all rows at once
     if together is not None:
-        return np.asarray(together(x, u, p, dt))
+        return lambda x, u: np.asarray(together(x, u, p, dt))
     alike: dict[bytes, list[slice]] = {}
     edges = np.flatnonzero((p[1:] != p[:-1]).any(axis=1)) + 1
     for first, end in itertools.pairwise([0, *edges.tolist(), len(p)]):
         alike.setdefault(p[first].tobytes(), []).append(slice(first, end))
-    after = np.empty_like(x)
-    for parts in alike.values():
-        own = parts[0] if len(parts) == 1 else np.r_[tuple(parts)]
-        after[own] = model.system.step(x[own], u[own], p[parts[0].start], dt)
-    return after
+    groups = [
+        (parts[0] if len(parts) == 1 else np.r_[tuple(parts)], p[parts[0].start])
+        for parts in alike.values()
+    ]
+
+    def stepped(x: Array, u: Array) -> Array:
+        after = np.empty_like(x)
+        for own, values in groups:
+            after[own] = model.system.step(x[own], u[own], values, dt)
+        return after
+
+    return stepped
 
 
 def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:

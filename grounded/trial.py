@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
-from grounded.frozen import Array, numbers, positive, wrapped
+from grounded.frozen import Array, numbers, positive, readonly, resampled_noise, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
 LAST = 2  # steps at the end of a run that may be missing and are extrapolated,
@@ -129,6 +129,18 @@ class Trial:
         last = int(known[-1]) if len(known) else 0
         last = min(last, int(np.argmax(wild)) - 1) if wild.any() else last
         return max(0, min(last, int(np.argmax(bad))) if bad.any() else last)
+
+    def noise(self, rows: int | None = None) -> Array:
+        """Return the noise (std) of the sensors, (n,), see `resampled_noise`; found once.
+
+        Args:
+            rows: use the first ones only; None for all.
+        """
+        known: dict[int, Array] = vars(self).setdefault("_noise", {})
+        length = len(self.states) if rows is None else min(rows, len(self.states))
+        if length not in known:
+            known[length] = readonly(resampled_noise(self.states[:length]))
+        return known[length]
 
     def worth(self, task: str, compute: Callable[[], float]) -> float:
         """Return the utility in a task; subclasses may cache it.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, percent
 from grounded.trial import Trial
@@ -74,6 +74,11 @@ class Candidate(Result):
         return Trial(
             self.predicted_states, self.predicted_inputs, made.dt, *names, start_inputs=made.past
         )
+
+    @cached_property
+    def shown_noise(self) -> Array:
+        """The white noise (std) of the states in the predicted run, (n,), see `white_noise`."""
+        return white_noise(self.predicted_states)
 
     @property
     def grounded(self) -> bool:

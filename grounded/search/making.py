@@ -97,6 +97,7 @@ class About:
         self.corrected: Corrected | None = None
         self.missed = 0.0  # likely error of the model's movements, as a share of them
         self.alternatives: tuple[Alternative, ...] = ()
+        self._known_costs: dict[Policy, float] = {}  # in the alternatives
         if way == BY_STEP:
             from grounded.search.step.by_step import believed_by_step
 
@@ -164,7 +165,8 @@ class About:
         own = made.way == "own plan" or new.gain is None or run.gain is None
         if self.alternatives and not own:
             old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
-            if sum(a.cost(new) - a.cost(old) for a in self.alternatives) > self.least:
+            costs = self._disturbed([new, old])
+            if costs[0] - costs[1] > self.least:
                 made = self.make.foretold(made, old, self.real, self.already)
         if not self.missed:
             return made
@@ -233,7 +235,8 @@ class About:
 
     def _ruinous(self, made: Candidate) -> bool:
         """Return whether it is predicted to lose more than the incumbent's whole cost."""
-        return made.expected_gain < -max(self._disturbed, -self.incumbent.utility)
+        (cost,) = self._disturbed([self.incumbent.candidate.policy])
+        return made.expected_gain < -max(cost, -self.incumbent.utility)
 
     def ruined_by(self, made: Candidate) -> bool:
         """Return whether this model gives a step of another one far more than the best cost.
@@ -254,10 +257,16 @@ class About:
         little = made.predicted_gain < LITTLE * -self.incumbent.utility
         return little and made.expected_gain <= 0.0
 
-    @cached_property
-    def _disturbed(self) -> float:
-        """Cost of the incumbent's policy in the alternatives."""
-        return sum(a.cost(self.incumbent.candidate.policy) for a in self.alternatives)
+    def _disturbed(self, policies: Sequence[Policy]) -> list[float]:
+        """Return the costs of policies in the alternatives; 0 without alternatives.
+
+        Each is found once, and all that are asked for together are run together.
+        """
+        own = self.incumbent.candidate.policy  # it is asked for sooner or later
+        new = [one for one in dict.fromkeys([own, *policies]) if one not in self._known_costs]
+        found = [a.costs(new) for a in self.alternatives if new]
+        self._known_costs.update(zip(new, sum(found, np.zeros(len(new))).tolist(), strict=True))
+        return [self._known_costs[one] for one in policies]
 
     def _near(self, made: Candidate, lost: Rollout) -> bool:
         """Return whether a candidate's run is nearly that of one that lost, in this model."""
@@ -272,8 +281,8 @@ class About:
         """
         gains = [made.predicted_gain - max(made.likely_off, self._missed_before(made))]
         if self.alternatives:
-            cost = sum(a.cost(made.policy) for a in self.alternatives)
-            gains.append(self._disturbed - cost)
+            own, cost = self._disturbed([self.incumbent.candidate.policy, made.policy])
+            gains.append(own - cost)
         plainly = self._plain_gain(made)
         if plainly is not None and plainly + self._plain_off < 0 and not self._plain_refuted:
             gains.append(plainly + self._plain_off)
@@ -415,7 +424,7 @@ class Maker:
             follows = base is not None and base.candidate.base and way != "own plan"
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
-            policy = self._gently(policy, problem, caution)
+            policy = self._gently(policy, problem, predicted(problem, policy), caution)
         made = Candidate(
             id=self.identity,
             policy=policy,
@@ -468,16 +477,24 @@ class Maker:
         if not between_limits(incumbent, self.planner.task):
             less = own.caution + np.arange(1, FINE) / FINE
             most = HALF * _gain(own.policy)
-            few = (c for c in less if _gain(self._gently(own.policy, problem, c)) < most)
+            run = predicted(problem, own.policy)
+            few = (c for c in less if _gain(self._gently(own.policy, problem, run, c)) < most)
             caution = float(next(few, caution))
         made = self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
         return self.quietened(made, problem)
 
-    def _gently(self, policy: Policy, problem: Problem, caution: float) -> Policy:
-        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight."""
+    def _gently(self, policy: Policy, problem: Problem, run: Rollout, caution: float) -> Policy:
+        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight.
+
+        Args:
+            policy: a policy.
+            problem: predicts its run.
+            run: that run.
+            caution: see above.
+        """
         if policy.gain is None:
             return policy
-        run, gentle = predicted(problem, policy), self.planner.dearer(problem, GENTLER**caution)
+        gentle = self.planner.dearer(problem, GENTLER**caution)
         found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
@@ -495,8 +512,8 @@ class Maker:
         own = made.policy
         if own.gain is None or not self.planner.needs_margin:
             return made
-        gently, loose = partial(self._gently, own, problem), self.planner.loosened(problem)
-        new = steadied(problem, own, gently, loose)
+        run, loose = predicted(problem, own), self.planner.loosened(problem)
+        new = steadied(problem, own, run, partial(self._gently, own, problem, run), loose)
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     @cached_property
@@ -514,9 +531,10 @@ class Maker:
         quiet = self.quiet
         if quiet is None or quiet.needed or quiet.allows(made.policy):
             return made
-        policy, caution = made.policy, made.caution
+        policy, caution, run = made.policy, made.caution, predicted(problem, made.policy)
         for more in np.arange(1, MOST * FINE + 1) / FINE:
-            policy, caution = self._gently(made.policy, problem, made.caution + more), float(more)
+            policy = self._gently(made.policy, problem, run, made.caution + more)
+            caution = float(more)
             if quiet.allows(policy):
                 break
         made = replace(made, caution=made.caution + caution)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.frozen import MEDIAN, Array, median, resampled_noise, white_noise
+from grounded.frozen import MEDIAN, Array, median
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
@@ -108,7 +108,7 @@ def sample_noise(trial: Trial, predicted: Array) -> Array:
         trial: a run of a candidate.
         predicted: its predicted states (H+1, n).
     """
-    white, lag = resampled_noise(trial.states), max(1, round(SLOW_S / trial.dt))
+    white, lag = trial.noise(), max(1, round(SLOW_S / trial.dt))
     T = min(len(predicted), trial.finite_steps + 1)
     if 2 * lag + FEWEST > T:
         return white
@@ -123,7 +123,7 @@ def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
     It is the median over the latest trials. The estimate of a single short run is off by a third
     either way. Of a long log its first rows are enough.
     """
-    each = [resampled_noise(trial.states[:ROWS]) for trial in trials[-LATEST:]]
+    each = [trial.noise(ROWS) for trial in trials[-LATEST:]]
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 
@@ -188,7 +188,7 @@ def noise_missed(task: Task, made: Candidate, noise: Array) -> float:
         made: the candidate.
         noise: standard deviations of the sensors' white noise, (n,), in the states' units.
     """
-    shown = white_noise(made.predicted_states) if made.grounded else np.zeros_like(noise)
+    shown = made.shown_noise if made.grounded else np.zeros_like(noise)
     least = noise_cost(task, made.policy, noise) + made.predicted_utility
     missed = noise_cost(task, made.policy, np.sqrt(np.maximum(noise**2 - shown**2, 0.0)))
     return max(missed, least)

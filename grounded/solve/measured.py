@@ -20,14 +20,14 @@ large, state by state, as what the run itself does in a step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import Problem
-from grounded.compile.run.interpreted import Quadratic, linearised
+from grounded.compile.run.interpreted import Quadratic, diagonals, linearised
 from grounded.frozen import Array, wrapped
 
 PASSES = 4
@@ -65,17 +65,11 @@ def measured_gains(
     with np.errstate(all="ignore"):
         q = linearised(problem.system, problem, z, u)
         noise, still = _disturbances(problem, z, units), STILL * np.ptp(z, axis=0)
-        best, least, gains = dropped, _cost(q, dropped, noise), K
-        for less in (share * dropped for share in SHARES):
-            cost = _cost(q, less, noise)
-            if cost < least:
-                best, least = less, cost
+        tried, gains = [dropped, *(share * dropped for share in SHARES)], K
         for _ in range(PASSES):
             gains = _swept(q, K, _estimates(q, gains, noise, known, still), known)
-            cost = _cost(q, gains, noise)
-            if cost < least:
-                best, least = gains, cost
-    return best
+            tried.append(gains)
+        return tried[int(np.argmin(_costs(q, np.array(tried), noise)))]
 
 
 def _disturbances(problem: Problem, z: Array, units: Mapping[str, str]) -> Array:
@@ -100,33 +94,40 @@ def _estimates(
     """
     found = np.zeros_like(q.A)
     found[:] = np.diag(known.astype(float))
-    S = np.diag(noise)
-    for t in range(len(K)):
-        size = np.sqrt(np.diag(S))
-        telling = known & (size > still)
-        size = size[telling]
-        scaled = S[np.ix_(telling, telling)] / np.outer(size, size)
-        if np.isfinite(scaled).all():
-            solved = np.linalg.solve(scaled + RIDGE * np.eye(len(size)), np.diag(1.0 / size))
-            rows = (S[np.ix_(~known, telling)] / size) @ solved
-            found[t][np.ix_(~known, telling)] = rows
-        loop = q.A[t] + q.B[t] @ K[t]
-        S = loop @ S @ loop.T + np.diag(noise)
+    loops, more = q.A + q.B @ K, np.diag(noise)
+    S = np.empty_like(q.A)
+    S[0] = more
+    for t, loop in enumerate(loops[:-1]):
+        S[t + 1] = loop @ S[t] @ loop.T + more
+    sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+    telling = known & (sizes > still)
+    for tells in np.unique(telling, axis=0):
+        at = np.flatnonzero((telling == tells).all(axis=1))
+        size = sizes[np.ix_(at, tells)][:, None]
+        scaled = S[np.ix_(at, tells, tells)] / (size.transpose(0, 2, 1) * size)
+        finite = np.isfinite(scaled).all(axis=(1, 2))
+        at, size, scaled = at[finite], size[finite], scaled[finite]
+        one = np.eye(size.shape[2])
+        solved = np.linalg.solve(scaled + RIDGE * one, one / size)
+        found[np.ix_(at, ~known, tells)] = (S[np.ix_(at, ~known, tells)] / size) @ solved
     return found
 
 
 def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -> Array:
     """F, back in time, with the value of the loop that it makes."""
     gains = np.zeros_like(K)
-    V = np.diag(q.l_zz[-1])
+    weights, R = diagonals(q.l_zz), np.diag(q.l_uu)
+    frees: NDArray[np.bool_] = np.any(K, axis=2)
+    V = weights[-1]
     for t in range(len(K) - 1, -1, -1):
-        free = K[t].any(axis=1)
-        VB = V @ q.B[t]
-        Q_uu, Q_uz = np.diag(q.l_uu) + q.B[t].T @ VB, q.l_uz + VB.T @ q.A[t]
+        free, A, B = frees[t], q.A[t], q.B[t]
+        VB = V @ B
+        Q_uu, Q_uz = R + B.T @ VB, q.l_uz + VB.T @ A
         if free.any() and np.isfinite(Q_uu).all() and np.isfinite(Q_uz).all():
-            full = -_least_squares(Q_uu[np.ix_(free, free)], Q_uz[free])
-            gains[t][free] = np.where(known, full @ estimates[t], 0.0)
-        V = _before(q, t, V, gains[t])
+            if not free.all():
+                Q_uu, Q_uz = Q_uu[np.ix_(free, free)], Q_uz[free]
+            gains[t, free] = np.where(known, -_least_squares(Q_uu, Q_uz) @ estimates[t], 0.0)
+        V = _before(A + B @ gains[t], (*_by_inputs(q, gains[t]), weights[t]), V)
     return gains
 
 
@@ -137,22 +138,36 @@ def _least_squares(Q_uu: Array, Q_uz: Array) -> Array:
     return np.asarray(shared / size[:, None], np.float64)
 
 
-def _cost(q: Quadratic, K: Array, noise: Array) -> float:
-    """What the disturbances cost in the loop of these gains."""
-    V = np.diag(q.l_zz[-1])
-    total = float(noise @ np.diag(V))
-    for t in range(len(K) - 1, -1, -1):
-        V = _before(q, t, V, K[t])
-        total += float(noise @ np.diag(V))
-    return total if np.isfinite(total) else np.inf
+def _costs(q: Quadratic, K: Array, noise: Array) -> Array:
+    """What the disturbances cost in the loops of gains K (P, H, m, nz), (P,)."""
+    loops, by_inputs, weights = q.A + q.B @ K, _by_inputs(q, K), diagonals(q.l_zz)
+    V = np.broadcast_to(weights[-1], loops[:, 0].shape)
+    total = V.diagonal(axis1=1, axis2=2) @ noise
+    for t in range(K.shape[1] - 1, -1, -1):
+        V = _before(loops[:, t], (*(part[:, t] for part in by_inputs), weights[t]), V)
+        total = total + V.diagonal(axis1=1, axis2=2) @ noise
+    return np.where(np.isfinite(total), total, np.inf)
 
 
-def _before(q: Quadratic, t: int, V: Array, K: Array) -> Array:
-    """The value of a step with gains K, with V after it.
+def _by_inputs(q: Quadratic, K: Array) -> tuple[Array, Array, Array]:
+    """The parts (..., nz, nz) of the cost of steps that inputs by gains K (..., m, nz) cause."""
+    back = K.swapaxes(-1, -2)
+    cross = back @ q.l_uz
+    return back @ (q.l_uu[:, None] * K), cross, cross.swapaxes(-1, -2)
+
+
+def _before(loop: Array, own: Sequence[Array], V: Array) -> Array:
+    """The value (..., nz, nz) of steps, with V after them.
 
     A sum of squares (Joseph's form) and symmetric to the last bit: in the shorter Q_zz + K'Q_uz +
     ..., what rounding leaves of asymmetry grows by K'B' each step, up to a negative cost.
+
+    Args:
+        loop: A + B K.
+        own: the parts of the steps' own cost.
+        V: the value after them.
     """
-    loop, cross = q.A[t] + q.B[t] @ K, K.T @ q.l_uz
-    value = loop.T @ V @ loop + K.T @ (q.l_uu[:, None] * K) + cross + cross.T + np.diag(q.l_zz[t])
-    return np.asarray(0.5 * (value + value.T))
+    value = loop.swapaxes(-1, -2) @ V @ loop
+    for part in own:
+        value = value + part
+    return np.asarray(0.5 * (value + value.swapaxes(-1, -2)))

@@ -217,3 +217,24 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
     gaps = np.where(np.arange(400)[:, None] % 9, log, np.nan)
     np.testing.assert_allclose(np.median(resampled_noise(gaps)), true, rtol=0.2)
     assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_the_noise_of_all_columns_is_that_of_each_alone(gaps):
+    log = np.random.default_rng(5).standard_normal((60, 4)).cumsum(axis=0)
+    if gaps:
+        log[20, 1] = np.nan
+        log[30:, 3] = np.inf
+    with np.errstate(invalid="ignore"):
+        alone = [resampled_noise(log[:, [j]])[0] for j in range(4)]
+        np.testing.assert_array_equal(resampled_noise(log), alone)
+
+
+def test_the_noise_of_a_trial_is_found_once():
+    log = np.random.default_rng(5).standard_normal((60, 2))
+    trial = Trial(log, np.zeros((59, 1)), 0.1, ("x", "v"), ("force",))
+    np.testing.assert_array_equal(trial.noise(), resampled_noise(log))
+    np.testing.assert_array_equal(trial.noise(20), resampled_noise(log[:20]))
+    assert trial.noise() is trial.noise(1000) is not trial.noise(20) is trial.noise(20)
+    other = replace(trial, states=2 * log)
+    np.testing.assert_array_equal(other.noise(), resampled_noise(2 * log))

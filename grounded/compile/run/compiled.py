@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import struct
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -56,6 +57,8 @@ from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
 Words = ctypes.c_int64 * len(BATCH)
+RESULTS = BATCH[6:]
+POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
@@ -200,9 +203,10 @@ class CompiledSystem(TracedSystem):
         if len(x) == 0:
             return
         x, u, p = plain(x), plain(u), plain(p)
-        first = address(x), address(u), address(p), word(float(dt)), word(float(eps)), len(x)
-        results = (address(out[name]) if name in out else 0 for name in BATCH[len(first) :])
-        run(kernel, Words(*first, *results))
+        results = [address(out[name]) if name in out else 0 for name in RESULTS]
+        words = Words()
+        POINT.pack_into(words, 0, address(x), address(u), address(p), dt, eps, len(x), *results)
+        run(kernel, words)
 
     def rollout(
         self,

@@ -235,25 +235,34 @@ def sweep(problem: Problem, u: Array, q: Quadratic, damping: Array) -> Backward:
     """Gains along u (H, m), with the problem about it; damping (m,)."""
     H, m, nz = q.B.shape[0], q.B.shape[2], q.B.shape[1]
     k, K, d1, d2 = np.zeros((H, m)), np.zeros((H, m, nz)), 0.0, 0.0
-    V_z, V = q.l_z[H], np.diag(q.l_zz[H])
+    low, high = problem.low - u, problem.high - u
+    weights, l_uu, extra = diagonals(q.l_zz), np.diag(q.l_uu), np.diag(damping)
+    V_z, V = q.l_z[H], weights[H]
     for t in range(H - 1, -1, -1):
         A, B = q.A[t], q.B[t]
         VA, VB = V @ A, V @ B
         Q_z, Q_u = q.l_z[t] + A.T @ V_z, q.l_u[t] + B.T @ V_z
-        Q_zz = np.diag(q.l_zz[t]) + A.T @ VA
-        Q_uu = np.diag(q.l_uu) + B.T @ VB
+        Q_zz = weights[t] + A.T @ VA
+        Q_uu = l_uu + B.T @ VB
         Q_uz = q.l_uz + B.T @ VA
-        if not (_positive_definite(Q_uu + np.diag(damping)) and np.isfinite(Q_u).all()):
+        damped = Q_uu + extra
+        if not (_positive_definite(damped) and np.isfinite(Q_u).all()):
             return Backward(k, K, d1, d2, t)
-        k[t], K[t] = _gains(
-            Q_uu + np.diag(damping), Q_u, Q_uz, problem.low - u[t], problem.high - u[t]
-        )
+        k[t], K[t] = _gains(damped, Q_u, Q_uz, low[t], high[t])
         d1 += float(k[t] @ Q_u)
         d2 += 0.5 * float(k[t] @ Q_uu @ k[t])
         V_z = Q_z + K[t].T @ (Q_uu @ k[t] + Q_u) + Q_uz.T @ k[t]
         V = Q_zz + K[t].T @ (Q_uu @ K[t] + Q_uz) + Q_uz.T @ K[t]
         V = 0.5 * (V + V.T)
     return Backward(k, K, d1, d2, -1 if np.isfinite(K[0]).all() else 0)
+
+
+def diagonals(rows: Array) -> Array:
+    """Diagonal matrices (N, k, k) of rows (N, k)."""
+    found = np.zeros((*rows.shape, rows.shape[1]))
+    each = np.arange(rows.shape[1])
+    found[:, each, each] = rows
+    return found
 
 
 def _positive_definite(Q: Array) -> bool:

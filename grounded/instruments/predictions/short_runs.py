@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.rollout import each_stepped
+from grounded.rollout import stepper
 from grounded.trial import Trial
 
 AHEAD = 0.25  # [s]
@@ -264,10 +264,11 @@ class Ahead:
         at = self.at - late[:, None]
         x, last = np.tile(self.first, (K, 1)), np.tile(self.last, (K, 1))
         own = np.repeat(np.broadcast_to(values, (K, values.shape[1])), N, axis=0)
+        stepped = stepper(self.model, own, self.dt)
         for j in range(self.steps):
             sent = self.sent[np.maximum(at + j, 0)]
             u = np.broadcast_to(sent * gains[:, None], (K, N, self.model.m))
-            x = each_stepped(self.model, x, u.reshape(K * N, -1), own, self.dt)
+            x = stepped(x, u.reshape(K * N, -1))
             x = np.fmax(np.fmin(x, FAR), -FAR)
         return np.asarray(self.model.difference(x, last)[:, self.shown].reshape(K, N, -1))
 

@@ -265,17 +265,19 @@ def _calibrated_as_degrees(model: Model, trial: Trial, shown: Sequence[int], odd
         logged, mended = (Ahead(model, t, shown, FEW) for t in (trial, odd.mended(trial)))
         if not (logged.enough and mended.enough):
             return False
-        own, free = logged.best([usual], free=False), logged.best([usual])
         rms = mended.best([usual], free=False).rms
-    rms[list(odd.states)] *= odd.factor  # as large as in the log
-    gained = np.log(own.rms / rms)
+        rms[list(odd.states)] *= odd.factor  # as large as in the log
+        if not np.log(logged.plain(usual).rms / rms).sum() > CLEAR:
+            return False  # calibrated, the errors of the log are smaller still
+        gained = np.log(logged.best([usual], free=False).rms / rms)
+        most = int(gained.argmax())
+        if not rms[most] < SEEN * logged.moved[most]:  # no unit makes the log predictable
+            return False
+        if not (gained.sum() > CLEAR and gained[most] > np.log(2.0)):
+            return False
+        free = logged.best([usual])
     strong = (free.gains > odd.factor / LIKE) & (free.gains < odd.factor * LIKE)
-    if free.score - np.log(rms).sum() < CLEAR and not strong.all():
-        return False
-    most = int(gained.argmax())
-    if not rms[most] < SEEN * logged.moved[most]:  # no unit makes the log predictable
-        return False
-    return bool(gained.sum() > CLEAR and gained[most] > np.log(2.0))
+    return bool(strong.all() or not free.score - np.log(rms).sum() < CLEAR)
 
 
 def _concordance(model: Model, trial: Trial, shown: Sequence[int], some: Sequence[int]) -> float:

@@ -22,7 +22,7 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
-from grounded.search.planner import predicted
+from grounded.rollout import Rollout
 from grounded.search.step.corrected import runs
 
 AGES = (0.0, 0.3, 0.6)  # age of the samples, as a fraction of a step
@@ -35,6 +35,7 @@ CAUTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25)  # gains that are tried, see `Maker
 def steadied(
     problem: Problem,
     policy: Policy,
+    run: Rollout,
     gently: Callable[[float], Policy],
     loose: Problem | None = None,
 ) -> Policy:
@@ -43,12 +44,13 @@ def steadied(
     Args:
         problem: the problem that predicts its run.
         policy: the policy as a robot runs it.
+        run: its run.
         gently: returns the same run with gains for larger input weights, given a caution.
         loose: the problem with dry friction that builds up slowly; None if there is none.
     """
     models = [problem] if loose is None else [problem, loose]
     own = worse_costs(models, policy)
-    if own.max() <= WORSE * -predicted(problem, policy).utility:
+    if own.max() <= WORSE * -run.utility:
         return policy
     gentler = [gently(caution) for caution in CAUTIONS]
     tried = [(own, policy), *zip(all_worse_costs(models, gentler), gentler, strict=True)]
@@ -77,14 +79,15 @@ def all_worse_costs(models: Sequence[Problem], policies: Sequence[Policy]) -> Ar
     fed_back = [one for one, policy in enumerate(policies) if policy.gain is not None]
     if not fed_back:
         return np.asarray(found.mean(axis=3), np.float64)
-    states, _ = runs(models[0], [policies[one] for one in fed_back])
-    noisy = [_noisy(policies[one], x) for one, x in zip(fed_back, states, strict=True)]
+    own = runs([models[0]] * len(fed_back), [policies[one] for one in fed_back])
+    noisy = [_noisy(policies[one], run.states) for one, run in zip(fed_back, own, strict=True)]
     known = [one for one, some in zip(fed_back, noisy, strict=True) if some]
     for i, model in enumerate(models if known else ()):
         for j, age in enumerate(AGES):
             late = replace(model, delay=model.delay + age)
-            _, costs = runs(late, [run for some in noisy for run in some])
-            found[known, i, j] = costs.reshape(len(known), SEEDS)
+            tried = [run for some in noisy for run in some]
+            costs = [-run.utility for run in runs([late] * len(tried), tried)]
+            found[known, i, j] = np.reshape(costs, (len(known), SEEDS))
     return np.asarray(found.mean(axis=3), np.float64)
 
 

@@ -80,7 +80,7 @@ def believed_by_step(
     ]
     price = PRICES[int(np.argmin(off))]
     models = [with_law(told.law(price), own, grounded).problem for told in rests]
-    missed = [unforetold(model, own, one) for model, one in zip(models, asked, strict=True)]
+    missed = unforetold(models, own, asked)
     if not np.mean(missed) < 1.0:
         return None
     told = Told.by(others, own, grounded)

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from grounded.compile import Backward, Problem, Swarm, System, deepest
 from grounded.compile.run.interpreted import linearised, rolled_out, sweep, trajectory_cost
-from grounded.frozen import Array, wrapped
+from grounded.frozen import Array, readonly, wrapped
 from grounded.policy import Policy
-from grounded.rollout import SETTLED, seen_late
+from grounded.rollout import SETTLED, Rollout, seen_late
 from grounded.search.planner import predicted
 
 MOST = 2**22  # gains held at once
@@ -38,7 +38,7 @@ class Corrected(System):
 
     Args:
         base: the system f.
-        law: C (H, n, 2 n + 2 m).
+        law: C (H, n, 2 n + 2 m); or (H, P, n, 2 n + 2 m) to step P runs, each with its own.
         x: states of the incumbent's trial (H, n).
         u: what its actuators received (H, m).
         before: the same, one step earlier (H, m).
@@ -189,48 +189,62 @@ class Corrected(System):
             return sweep(problem, u, linearised(self, problem, z, u), damping)
 
 
-def runs(problem: Problem, policies: Sequence[Policy]) -> tuple[Array, Array]:
-    """Return the states (P, H + 1, n) and costs (P,) of predicted runs, see `predicted`.
+def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollout]:
+    """Return the predicted runs of policies, each in its problem, as `predicted` does one by one.
 
     Args:
-        problem: the problem that predicts the runs.
-        policies: of one horizon, with feedback, over the problem's z or fewer states.
+        problems: alike except for their biases and the laws of their `Corrected` systems.
+        policies: as many, of one horizon, over the problems' z or fewer states.
     """
-    system = problem.system
-    if not isinstance(system, Corrected):
-        each = [predicted(problem, policy) for policy in policies]
-        return np.array([one.states for one in each]), np.array([-one.utility for one in each])
+    systems = [one.system for one in problems if isinstance(one.system, Corrected)]
+    open_loop = any(policy.gain is None for policy in policies)
+    if len(systems) < len(problems) or open_loop or not systems:
+        return [predicted(*each) for each in zip(problems, policies, strict=True)]
+    problem, system = problems[0], _with_each_law(systems)
     room = max(1, MOST // (problem.horizon * problem.nz * system.m))
     if len(policies) > room:  # long horizons
-        parts = [runs(problem, policies[i : i + room]) for i in range(0, len(policies), room)]
-        states, costs = zip(*parts, strict=True)
-        return np.concatenate(states), np.concatenate(costs)
+        parts = [slice(i, i + room) for i in range(0, len(policies), room)]
+        return [run for part in parts for run in runs(problems[part], policies[part])]
     for policy in policies:  # z holds all past inputs that any of them feeds back
         problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
-    angles = tuple(map(bool, problem.angles))
+    angles, n = tuple(map(bool, problem.angles)), system.n
     laid = [p.laid_out(system.states, angles, problem.depths) for p in policies]
-    sent = np.array([p.feedforward for p in laid])
+    sent, bias = np.array([p.feedforward for p in laid]), np.array([p.bias for p in problems])
     K, aim = np.array([p.gain for p in laid]), np.array([p.reference for p in laid])
-    z, found = _run(problem, system, sent, K, aim)
-    left, n = np.arange(len(laid) if problem.age else 0), system.n
+    found = _run(problem, system, sent, K, aim, bias)
+    z = found[0]
+    left = np.arange(len(laid) if problem.age else 0)
     for _ in range(problem.horizon):  # as in `simulate`, each until it agrees with what was seen
         if not len(left):
             break
         late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in z[left]]
-        seen = aim[left].copy()
-        seen[:, :, :n] -= late
-        again, found[left] = _run(problem, system, sent[left], K[left], seen)
-        scale = 1.0 + np.abs(again).max(axis=1, keepdims=True)
-        moved = (np.abs(again - z[left]) > SETTLED * scale).any(axis=(1, 2))
-        z[left] = again
+        seen = aim.copy()
+        seen[left, :, :n] -= late
+        again = _run(problem, system, sent, K, seen, bias)
+        scale = 1.0 + np.abs(again[0][left]).max(axis=1, keepdims=True)
+        moved = (np.abs(again[0][left] - z[left]) > SETTLED * scale).any(axis=(1, 2))
+        for before, after in zip(found, again, strict=True):
+            before[left] = after[left]
         left = left[moved]
-    return z[:, :, :n], np.where(np.isfinite(found), found, np.inf)
+    each = zip(*(readonly(one) for one in found), strict=True)
+    return [
+        Rollout(run, u, -float(cost) if np.isfinite(cost) else -np.inf, n) for run, u, cost in each
+    ]
+
+
+def _with_each_law(systems: Sequence[Corrected]) -> Corrected:
+    """Return a system that steps each of several runs with its own law."""
+    first = systems[0]
+    if all(one is first for one in systems):
+        return first
+    law = np.stack([one.law for one in systems], axis=1)
+    return Corrected(first.base, law, first.x, first.u, first.before, first.doubt)
 
 
 def _run(
-    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array
-) -> tuple[Array, Array]:
-    """Return z (P, H + 1, nz) and the costs (P,) of closed loops.
+    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array, bias: Array
+) -> tuple[Array, Array, Array]:
+    """Return z (P, H + 1, nz), inputs (P, H, m) and the costs (P,) of closed loops.
 
     Args:
         problem: the problem that predicts the runs.
@@ -238,6 +252,7 @@ def _run(
         sent: feedforward inputs (P, H, m).
         K: gains (P, H, m, nz).
         aim: reference of z (P, H, nz).
+        bias: what is added to the states in each step (P, H, n).
     """
     queue, n, H = problem.queue, system.n, problem.horizon
     z, u = np.empty((len(sent), H + 1, problem.nz)), np.empty((len(sent), H, system.m))
@@ -248,6 +263,6 @@ def _run(
             fed_back = (K[:, t] @ off[:, :, None])[:, :, 0]
             u[:, t] = np.clip(sent[:, t] + fed_back, problem.low, problem.high)
             received = problem.received(z[:, t], u[:, t], t)
-            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + problem.bias[t]
+            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + bias[:, t]
             z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
-        return z, trajectory_cost(problem, z, u)
+        return z, u, trajectory_cost(problem, z, u)

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -48,7 +49,7 @@ from grounded.policy import Policy
 from grounded.rollout import Run, apart, augmented
 from grounded.search.candidate import Tried
 from grounded.search.planner import Planner, predicted
-from grounded.search.step.corrected import Corrected
+from grounded.search.step.corrected import Corrected, runs
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
@@ -85,17 +86,24 @@ class Alternative:
     problem: Problem
     off: tuple[Array, ...]  # y_j (H, n)
 
-    def cost(self, policy: Policy) -> float:
-        """Return the mean cost of a policy over the disturbances, times the weight."""
+    def costs(self, policies: Sequence[Policy]) -> Array:
+        """Return the mean cost of policies over the disturbances, times the weight, (P,)."""
         if self.weight == 0:
-            return 0.0
-        return self.weight * float(np.mean([self._disturbed(y, policy) for y in self.off]))
+            return np.zeros(len(policies))
+        each = [policy for policy in policies for _ in self.off]
+        found = runs(self._disturbed * len(policies), each)
+        costs = np.minimum([-run.utility for run in found], WORST)
+        return np.asarray(self.weight * costs.reshape(-1, len(self.off)).mean(axis=1))
 
-    def _disturbed(self, y: Array, policy: Policy) -> float:
-        bias = self.problem.bias.copy()
-        bias[:, : y.shape[1]] += y
-        cost = -predicted(replace(self.problem, bias=bias), policy).utility
-        return cost if cost < WORST else WORST
+    @cached_property
+    def _disturbed(self) -> list[Problem]:
+        """The problem with each of the mispredictions added to its bias."""
+        found = []
+        for y in self.off:
+            bias = self.problem.bias.copy()
+            bias[:, : y.shape[1]] += y
+            found.append(replace(self.problem, bias=bias))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,13 +152,17 @@ def believed(
     others = [o for o, _ in nearest]
     refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
 
-    crude, corrected = [], []
-    for other in others[:ASKED] + refuting[:ASKED]:
-        rest = [o for o in others if o is not other]
-        law, left = laws(own, rest or others, grounded)
-        crude.append(unforetold(grounded, own, other))
-        share = 1.0 if law is None else unforetold(with_law(law, own, grounded).problem, own, other)
-        corrected.append(share if rest else max(share, left))
+    asked = others[:ASKED] + refuting[:ASKED]
+    rests = [[o for o in others if o is not other] for other in asked]
+    fits = [laws(own, rest or others, grounded) for rest in rests]
+    crude = unforetold([grounded] * len(asked), own, asked)
+    fitted = [k for k, (law, _) in enumerate(fits) if law is not None]
+    models = [with_law(fits[k][0], own, grounded).problem for k in fitted]
+    shares = dict(zip(fitted, unforetold(models, own, [asked[k] for k in fitted]), strict=True))
+    corrected = [
+        shares.get(k, 1.0) if rests[k] else max(shares.get(k, 1.0), left)
+        for k, (_, left) in enumerate(fits)
+    ]
     law, _ = laws(own, others, grounded)
     made, near = with_law(law, own, grounded), others[:ASKED]
     off = unexplained = tuple(o.y for o in near)
@@ -210,11 +222,22 @@ def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
     return Believed(made.on(grounded), made)
 
 
-def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
-    """Return the share of a trial's difference from the incumbent's that a model mispredicts."""
-    found = predicted(problem, other.policy)
-    run = (found.states, found.inputs)
-    return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
+def unforetold(models: Sequence[Problem], own: Seen, others: Sequence[Seen]) -> list[float]:
+    """Return the share of each trial's difference from the incumbent's that its model mispredicts.
+
+    Args:
+        models: one for each of the other trials, alike except for their laws.
+        own: the incumbent's trial.
+        others: other trials.
+    """
+    found = runs(models, [other.policy for other in others])
+    return [
+        min(
+            1.0,
+            apart(model, (run.states, run.inputs), other.run) / apart(model, own.run, other.run),
+        )
+        for model, run, other in zip(models, found, others, strict=True)
+    ]
 
 
 def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
@@ -325,15 +348,17 @@ def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
     size = np.einsum("j,jtk->k", near, y**2) * y.shape[2] + 1e-300
     parts, best = np.array_split(np.arange(d.shape[1]), PARTS), 1.0
     law = np.zeros((d.shape[2], y.shape[2]))
+    ridges = np.multiply.outer(PRICES, np.eye(len(law)))
     for fading in FADING:
         weight = (far / far[0]) ** -fading
         M = np.array([np.einsum("j,jtp,jtq->pq", weight, d[:, t], d[:, t]) for t in parts])
         N = np.array([np.einsum("j,jtp,jtk->pk", weight, d[:, t], y[:, t]) for t in parts])
-        for price in PRICES:
-            ridge = price * np.eye(len(law))
-            each = np.linalg.solve(M.sum(axis=0) - M + ridge, N.sum(axis=0) - N)
-            off = [y[:, t] - d[:, t] @ C for t, C in zip(parts, each, strict=True)]
-            left = float(sum(np.einsum("j,jtk,k->", near, e**2, 1 / size) for e in off))
+        each = np.linalg.solve(M.sum(axis=0) - M + ridges[:, None], (N.sum(axis=0) - N)[None])
+        off = [
+            y[:, t] - d[:, t] @ C[:, None] for t, C in zip(parts, each.swapaxes(0, 1), strict=True)
+        ]
+        lefts = sum(np.einsum("j,pjtk,k->p", near, e**2, 1 / size) for e in off)
+        for left, ridge in zip(lefts.tolist(), ridges, strict=True):
             if left < best:
                 best, law = left, np.linalg.solve(M.sum(axis=0) + ridge, N.sum(axis=0))
     return (law / scale[:, None]).T, best

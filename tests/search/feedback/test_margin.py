@@ -119,6 +119,8 @@ def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
     assert np.isclose(np.abs(plan.u[:, 1]), 0.3).sum() > 5
     now = standing(slow, [], [], SearchOptions(), planner.fingerprint)
     maker, problem = Maker(planner, now, "c0001", ""), planner.plan.problem(exact=True)
+    narrow = planner.narrowed(policy)
+    run = predicted(problem, narrow)
     for caution in (0.5, 1.0, 1.5):
-        gentle = maker._gently(planner.narrowed(policy), problem, caution)
+        gentle = maker._gently(narrow, problem, run, caution)
         assert np.abs(gentle.gain).max() < 10.0

@@ -141,13 +141,42 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     )
     alone = [predicted(late, one) for one in tried]
     one_by_one = len(steps)
-    states, costs = runs(late, tried)
+    together = runs([late] * len(tried), tried)
     assert len(steps) - one_by_one < 0.3 * one_by_one
-    np.testing.assert_allclose(states, [one.states for one in alone], atol=1e-9)
-    np.testing.assert_allclose(costs, [-one.utility for one in alone], rtol=1e-9)
+    assert_same_runs(together, alone)
     monkeypatch.setattr("grounded.search.step.corrected.MOST", 1)  # a long horizon: one at a time
-    np.testing.assert_allclose(runs(late, tried)[1], costs, rtol=1e-9)
+    assert_same_runs(runs([late] * len(tried), tried), alone)
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
+
+
+@pytest.mark.parametrize("age", [0.0, 0.013])
+def test_runs_together_may_differ_in_bias_and_law(grounded, age):
+    _, best, problem = grounded
+    own = seen(Planner(TASK, TASK), best, problem)
+    _, others = turning(own, 3)
+    told = Told.by(others, own, problem)
+    models = []
+    for k, price in enumerate(PRICES[:3]):
+        made = Corrected(problem.system, told.law(price), own.x, own.u, own.before).on(problem)
+        bias = made.bias + 1e-3 * k * np.sin(np.arange(made.bias.size)).reshape(made.bias.shape)
+        models.append(replace(made, bias=bias, age=age))
+    policy = best.candidate.policy
+    policies = [replace(policy, gain=share * policy.gain) for share in (1.0, 0.9, 0.8)]
+    alone = [predicted(*each) for each in zip(models, policies, strict=True)]
+    assert np.ptp([one.utility for one in alone]) > 1e-6
+    assert_same_runs(runs(models, policies), alone)
+    open_loop = [replace(policy, gain=None, reference=None), *policies[1:]]
+    alone = [predicted(*each) for each in zip(models, open_loop, strict=True)]
+    assert_same_runs(runs(models, open_loop), alone)
+
+
+def assert_same_runs(found, expected):
+    np.testing.assert_allclose(
+        [one.utility for one in found], [one.utility for one in expected], rtol=1e-9
+    )
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.states, other.states, atol=1e-9)
+        np.testing.assert_allclose(one.inputs, other.inputs, atol=1e-8)
 
 
 def test_doubt_is_a_cost_with_the_derivatives_of_its_steps(grounded):

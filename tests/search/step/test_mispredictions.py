@@ -231,6 +231,24 @@ def test_a_run_with_a_motor_wired_wrongly_corrects_no_derivatives():
     assert told.corrected is None and not told.alternatives
 
 
+def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
+    planner, history = Planner(found.task, found.task), found.search.standing.history
+    made = believed(planner, found.best, history, found.problem).alternatives
+    own = found.best.candidate.policy
+    policies = [own, replace(own, gain=0.8 * own.gain), history[0].candidate.policy]
+    assert made and any(one.weight for one in made)
+    for one in made:
+        alone = []
+        for policy in policies:
+            costs = []
+            for y in one.off:
+                bias = one.problem.bias.copy()
+                bias[:, : y.shape[1]] += y
+                costs.append(-predicted(replace(one.problem, bias=bias), policy).utility)
+            alone.append(one.weight * np.mean(costs))
+        np.testing.assert_allclose(one.costs(policies), alone, rtol=1e-9)
+
+
 def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
     """With the wild run of a motor they gave -2,014 for a best run of -1.553."""
     task = cart_task()
@@ -238,8 +256,8 @@ def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
     planner, history = Planner(task, task), found.search.standing.history
     moved = replace(found.problem, start=found.problem.start + 0.01)  # noise of the first sample
 
-    def flattered(problem, own, other):
-        return 1.0 if problem is moved else 0.0
+    def flattered(problems, own, others):
+        return [1.0 if problem is moved else 0.0 for problem in problems]
 
     def unstable(own, others, grounded):
         law = np.zeros((len(own.x), 2, 6))

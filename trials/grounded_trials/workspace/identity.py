@@ -49,7 +49,8 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
 T = TypeVar("T")
-MOST_KNOWN = 4  # files of candidates about which something is kept
+MOST_KNOWN = 2**25  # bytes of candidates' files about which something is kept; at least FEW files
+FEW = 4
 _ABSENT = {
     "predicted_gain": "nan",
     "damping": "1.0",
@@ -169,21 +170,25 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
 
 
 class _Recent(Generic[T]):
-    """What was found out about the latest few files, by their bytes.
+    """What was found out about the latest files, by their bytes.
 
     Those are megabytes: comparing them takes a third of the time of hashing them for a dictionary.
     """
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[bytes, T]] = deque(maxlen=MOST_KNOWN)
+        self._kept: deque[tuple[bytes, T]] = deque()
+        self._size = 0  # of those files, in bytes
 
     def get(self, data: bytes) -> T | None:
-        """Return what is known about a file, or None."""
-        return next((found for own, found in tuple(self._kept) if own == data), None)
+        """Return what was found out last about a file, or None."""
+        return next((found for own, found in tuple(self._kept)[::-1] if own == data), None)
 
     def add(self, data: bytes, found: T) -> T:
         """Keep what is known about a file, and return it."""
         self._kept.append((data, found))
+        self._size += len(data)
+        while self._size > MOST_KNOWN and len(self._kept) > FEW:
+            self._size -= len(self._kept.popleft()[0])
         return found
 
 
@@ -269,7 +274,7 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
-    known = _DECODED.get(data)  # one command decodes the same bytes up to three times
+    known = _DECODED.get(data)  # one command decodes the same bytes several times
     if known is None or known[0].id != identity:
         known = _DECODED.add(data, _decoded(data, identity))
     candidate, meta = known

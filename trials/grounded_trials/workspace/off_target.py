@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array, resampled_noise
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
 from grounded.search.certainty import began_apart
@@ -135,7 +135,7 @@ def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
 
     That of an encoder, which may rest on one count, is at least that of its counts.
     """
-    each = [resampled_noise(trial.states[: trial.finite_steps + 1]) for trial in trials]
+    each = [trial.noise(trial.finite_steps + 1) for trial in trials]
     noise = np.sqrt(np.mean(np.square(each), axis=0))
     return np.asarray(np.maximum(noise, _resolution(trials) / np.sqrt(12))[list(states)])
 
