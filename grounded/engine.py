@@ -18,12 +18,14 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -34,6 +36,8 @@ from grounded.forked import Forks, possible
 STACK = 16 * 2**20  # [bytes] stack size of a thread: kernels keep their matrices there
 CONNECT_S = 10.0  # [s] timeout for a cluster's scheduler to answer
 TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
+LOAD, TASKS = Path("/proc/loadavg"), Path("/proc/self/task")  # runnable threads: all, and these
+LOOKS, LOOK_S = 5, 0.002  # that they are counted, and [s] between
 LARGE = 2**28  # [bytes] freed blocks up to this size are reused
 T = TypeVar("T")
 
@@ -60,12 +64,17 @@ def _keep_pages() -> None:
 
 
 def idle() -> int:
-    """Return the number of processors that were idle in the last minute, at least 1."""
+    """Return the number of processors that nobody else uses now, at least 1; all if unknown."""
     try:
-        here, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    except (AttributeError, OSError):  # not Linux: there may be no such figures
+        here, busy = len(os.sched_getaffinity(0)), []
+        for _ in range(LOOKS):
+            states = [stat.read_text().rpartition(")")[2] for stat in TASKS.glob("*/stat")]
+            mine = sum(state.startswith(" R") for state in states)
+            busy.append(int(LOAD.read_text().split()[3].partition("/")[0]) - mine)
+            time.sleep(LOOK_S)
+    except (AttributeError, OSError):  # not Linux
         return os.cpu_count() or 1
-    return max(1, here - round(load))
+    return max(1, here - sorted(busy)[LOOKS // 2])
 
 
 @dataclass(frozen=True)
