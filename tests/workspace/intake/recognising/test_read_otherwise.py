@@ -157,13 +157,17 @@ def test_seconds_under_the_name_of_milliseconds_are_named(w, tmp_path):
     assert holds(said, "0 steps", "times 1000", "1e-05 s apart", "unit")
 
 
+@pytest.mark.parametrize("weight", [77.0, 0.5])
 @pytest.mark.parametrize("waits", [True, False])
-def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits):
-    """Its file is still on the robot; it was said that somebody drove."""
+def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
+    """Its file is still on the robot; it was said that somebody drove.
+
+    Of one that differs little, the run was stored as that of the new candidate.
+    """
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     toml = w.folder / "grounded.toml"
     written = toml.read_text()
-    toml.write_text(written.replace("[reward]\n", "[reward]\nterminal = { x = 77.0 }\n", 1))
+    toml.write_text(written.replace("[reward]\n", f"[reward]\nterminal = {{ x = {weight} }}\n", 1))
     if toml.read_text() == written or "terminal" in written:
         raise AssertionError("the task is to change")
     w = Workspace(w.folder)

@@ -176,19 +176,22 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
     assert not told or holds(told[0], " mm from its target", "--hold")
 
 
-def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task(tmp_path):
-    """It is the target, [reward] or the program that is to be changed, not the run."""
+def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_farther(tmp_path):
+    """It is the target, [reward] or the program that is to be changed, not the run.
+
+    A crane's load was told to swing 24 mrad after a run, but not that it swung 40 after another.
+    """
     w = waiting(tmp_path)
     _, table, beyond = driven_on(w, tmp_path)
-    table[beyond > 0, 1] = table[beyond <= 0, 1][-1] + 0.4 * beyond[beyond > 0]
-    told = []
-    for k in range(2):
+    end, told = table[beyond <= 0, 1][-1], []
+    for k, speed in enumerate((0.4, 0.4, 1.0)):
         again = tmp_path / f"again{k}.csv"
+        table[beyond > 0, 1] = end + speed * beyond[beyond > 0]
         table[:, 1] += 1e-6 * k
         np.savetxt(again, table, "%.7f", ",", header="t,x,v,force", comments="")
         said = Workspace(w.folder).ingest(again, candidate="c0002").warnings
         told.append(any("after the run" in one for one in said))
-    assert told == [True, False]
+    assert told == [True, False, True]
     same = Workspace(w.folder).ingest(tmp_path / "again0.csv").warnings
     assert any("after the run" in one for one in same)  # of the log that it was told of
 

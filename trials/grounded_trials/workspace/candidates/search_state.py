@@ -181,11 +181,14 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     return best.candidate.id
 
 
-def latest_candidates(workspace: Folder, most: int) -> list[Candidate]:
-    """Return the latest candidates of the task, including probes and void ones."""
-    found = []
+def latest_candidates(workspace: Folder, most: int) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the latest candidates of the task, probes and void ones too, and of earlier tasks.
+
+    most: number of latest candidates that are looked at.
+    """
+    found: tuple[list[Candidate], list[Candidate]] = [], []
     for identity in workspace.candidate_ids()[-most:]:
         with suppress(GroundedError):  # a damaged file can't have been run
             candidate, meta = workspace.candidate(identity)
-            found += [candidate] * (meta.get("task") == workspace.task.hash)
+            found[meta.get("task") != workspace.task.hash].append(candidate)
     return found

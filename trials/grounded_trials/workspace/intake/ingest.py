@@ -58,6 +58,7 @@ from grounded_trials.workspace.next_step import PROPOSE, after_log, another_tria
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
 from grounded_trials.workspace.unknown_id import refuse_ids
 
+FARTHER = 2.0  # times as far as was told: a robot that moves on after its run is told again
 ASIDE = "set aside"  # the verdict on a run that does not count
 
 
@@ -245,17 +246,23 @@ def _whole(read: Read, task: Task) -> Trial | None:
 def _told_once(workspace: Folder, added: Added, whole: Trial) -> list[str]:
     """Return how the robot moved on after its run, unless a run of this task told it before.
 
-    What is then to be changed is the target, [reward] or the robot's program, not the run.
+    What is then to be changed is the target, [reward] or the robot's program, not the run. It is
+    told again if other states moved on, or much farther.
     """
-    what, own = f"moved on, {workspace.task.hash}", added.sha256[:DIGITS]
-    if workspace.noted.told.get(what, own) != own:
+    found, own = moved_on(workspace.planner, whole), added.sha256[:DIGITS]
+    if found is None:
         return []
-    found = moved_on(workspace.planner, whole)
-    if found and what not in workspace.noted.told:
+    about = f"moved on, {workspace.task.hash}, {found.states}, "
+    told = {w: trial for w, trial in workspace.noted.told.items() if w.startswith(about)}
+    most = max((float(what.removeprefix(about)) for what in told), default=0.0)
+    if own not in told.values():
+        if found.far < FARTHER * most:
+            return []
+        what = f"{about}{found.far:.6g}"
         with suppress(GroundedError):  # a folder that can't be written: it is told again
             workspace.notes.add({"note": "told", "trial": own, "what": what}, again=False)
         vars(workspace).pop("noted", None)
-    return found
+    return [found.said]
 
 
 def _undo(identity: str) -> str:

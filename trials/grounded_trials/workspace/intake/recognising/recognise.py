@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
+from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import odd_columns
@@ -111,11 +112,11 @@ def recognised(
     ran = read.trial.candidate
     if not ran or (is_stored(workspace, read.data) and not (read.log and not read.log.stored)):
         return read  # a log whose trial is set aside is examined again
-    (own, _), candidates = workspace.candidate(ran), _may_have_run(workspace)
+    (own, _), (candidates, earlier) = workspace.candidate(ran), _may_have_run(workspace)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
         logs.append(late)
-    looks = [Look(read, one, own, candidates, workspace.task) for one in logs]
+    looks = [Look(read, one, own, [*earlier, *candidates], workspace.task) for one in logs]
     look = min(looks, key=lambda one: one.doubt)
     if look.read.log and look.read.cut:  # states may be unknown when the run begins
         look.read.log.refuse_late(look.read.cut)
@@ -127,6 +128,8 @@ def recognised(
     if look.old is not None:
         read = replace(read, aged=tuple(old_samples(workspace, own, whole, look.old)))
     why, other = seen.why, seen.other
+    if candidate is None and other in [one.id for one in earlier]:
+        raise _of_earlier_task(path, other)
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task
     again = NextCommand("ingest", (str(path) if read.log else "LOG",))  # LOG: of another run
@@ -251,12 +254,16 @@ def recognised(
 def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial: Trial) -> None:
     """Raise OfEarlierTask if a log is the run of a candidate of an earlier task."""
     if left := of_earlier_task(workspace, log, trial):
-        raise OfEarlierTask(
-            f"{path} ran {left}, which was made for an earlier task (other target, reward, limits, "
-            "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
-            "and diagnosis, and run a candidate of this task",
-            NextCommand("ingest", (str(path), "--data")),
-        )
+        raise _of_earlier_task(path, left)
+
+
+def _of_earlier_task(path: Path, ran: str) -> OfEarlierTask:
+    return OfEarlierTask(
+        f"{path} ran {ran}, which was made for an earlier task (other target, reward, limits, "
+        "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
+        "and diagnosis, and run a candidate of this task",
+        NextCommand("ingest", (str(path), "--data")),
+    )
 
 
 def turned_in(workspace: Folder, log: Recording, ran: str) -> str:
@@ -347,14 +354,20 @@ def _is(names: Sequence[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
-def _may_have_run(workspace: Folder) -> list[Candidate]:
-    """Return the latest candidates, preceded by the best one, which may still be on the robot."""
-    latest = latest_candidates(workspace, OTHERS)
+def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the candidates that may still be on the robot: of the task, and of earlier ones.
+
+    They are the latest ones. Those of the task are preceded by the best; those of earlier tasks
+    have as many steps as a run of this one.
+    """
+    task, (latest, earlier) = workspace.task, latest_candidates(workspace, OTHERS)
+    earlier = [one for one in earlier if _like_task(one.policy, task)]
     if len(workspace.candidate_ids()) <= OTHERS:
-        return latest
+        return latest, earlier
     best = standing_in(workspace).incumbent
-    known = best is None or best.candidate.id in [one.id for one in latest]
-    return latest if known or best is None else [best.candidate, *latest]
+    if best is not None and best.candidate.id not in [one.id for one in latest]:
+        latest = [best.candidate, *latest]
+    return latest, earlier
 
 
 def _like(read: Read, ran: str, found: Following | None) -> tuple[str, ...]:
@@ -373,6 +386,16 @@ def _unfed(own: Candidate, run: Trial, found: Following | None) -> tuple[str, ..
     if found is None or not without_feedback(own, run, found):
         return ()
     return (f"its commands are the feed-forward of {own.id} alone, {WITHOUT}",)
+
+
+def _like_task(policy: Policy, task: Task) -> bool:
+    """Return whether a policy has the steps, states and inputs of a task."""
+    names = (task.model.state_names, task.model.input_names)
+    return (policy.dt, policy.horizon, policy.state_names, policy.input_names) == (
+        task.dt,
+        task.horizon,
+        *names,
+    )
 
 
 class OfEarlierTask(GroundedError):

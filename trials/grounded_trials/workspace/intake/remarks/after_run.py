@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,7 +74,16 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     )
 
 
-def moved_on(planner: Planner, whole: Trial) -> list[str]:
+@dataclass(frozen=True)
+class Drift:
+    """What a robot did after its run: the warning, which states moved, and how far at most."""
+
+    said: str
+    states: str
+    far: float
+
+
+def moved_on(planner: Planner, whole: Trial) -> Drift | None:
     """Return a warning if a robot that was to reach a point drifts away from it after the run.
 
     Only if the inputs are constant after the run, so that nobody drove it. What counts is how far
@@ -86,7 +95,7 @@ def moved_on(planner: Planner, whole: Trial) -> list[str]:
     groups = weighed_groups(task) if reaches(task) else []
     held = whole.inputs[end:last]
     if not groups or last <= end + 1 or np.ptp(held[1:], axis=0).any():
-        return []
+        return None
     cost = DEAR * -task.utility(whole.until(end))
     for k, rate in enumerate(rates_among(task, groups)):
         states = [task.model.state_names.index(name) for name in groups[k][0]]
@@ -98,7 +107,7 @@ def moved_on(planner: Planner, whole: Trial) -> list[str]:
         if away or (far[worst] > 2 * far[end] and more > cost):
             break
     else:
-        return []
+        return None
     later, then = measured_alike([far[worst], far[end]], task.model.states[groups[k][0][0]])
     was = (
         f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its "
@@ -106,10 +115,11 @@ def moved_on(planner: Planner, whole: Trial) -> list[str]:
     )
     drift = off[worst] - off[end]
     if away and let_go(planner, whole, states, worst - end, drift):
-        return [was + _to_hold(planner, whole, held[-1])]
-    return [
-        f"{was}[reward] only judges the run. To make the robot stay there, {_to_stay(task, states)}"
-    ]
+        said = _to_hold(planner, whole, held[-1])
+    else:
+        stay = _to_stay(task, states)
+        said = f"[reward] only judges the run. To make the robot stay there, {stay}"
+    return Drift(was + said, groups[k][1], float(far[worst]))
 
 
 def _from_target(task: Task, run: Array, states: Sequence[int]) -> tuple[Array, float]:
