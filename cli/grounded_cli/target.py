@@ -104,7 +104,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
-    from grounded_trials.workspace.candidates.rest_at_end import names_told, rest_at_end
+    from grounded_trials.workspace.candidates.rest_at_end import NOISY, names_told, rest_at_end
     from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import driven, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
@@ -208,6 +208,17 @@ def command(
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
             told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
             sentence(f"[reward] {kind} is new, {by}: {told}")
+    weights = reward.get("terminal", {})
+    for name, deviation in ended.noise.items() if ended else ():
+        if ended is None or weights[name] != ended.weights[name]:
+            continue  # the user's own
+        its = with_unit(f"{deviation:.2g}", model.states[name])
+        remark(
+            "note",
+            f"the weight of {name} at the end is only {number(weights[name])}: with it, the "
+            f"sensor noise ({its}) costs {NOISY:g} of the utility; with a larger one, the inputs "
+            "would answer that noise",
+        )
     bounds = workspace.config.safety.pairs(list(model.states))
     for name, (low, high) in ranges.items():
         least, most = bounds.get(name, (-math.inf, math.inf))

@@ -10,6 +10,7 @@ from cli import grounded
 from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.candidates import rest_at_end
 from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.candidates.first_plan import in_another_unit
 from grounded_trials.workspace.folder import Folder
@@ -438,6 +439,26 @@ def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
     reward = tomllib.loads((w / "grounded.toml").read_text())["reward"]
     assert reward["terminal"].keys() == {"x", "v"} == reward["state"].keys()
     assert grounded("-C", w, "target", "step", "--to", "x=1", "--rest").code == 2
+
+
+def test_a_weight_at_the_end_is_bounded_by_the_noise_of_its_state(tmp_path, monkeypatch):
+    """By a weight of 100, noise of a load's angular rate cost a quarter of the utility."""
+    noise = np.array([0.01, 0.01, 0.002, 0.05])
+    monkeypatch.setattr(rest_at_end, "sensor_noise", lambda *_: noise)
+    (tmp_path / "ball.py").write_text(ROLLED)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "ball.py", "--dt", "0.02").code == 0
+    line = ("-C", w, "target", "line", "--to", "x=0.3", "--seconds", "2", "--rest")
+    done = grounded(*line)
+    said = " ".join((done.out + done.err).split())
+    assert holds(said, "weight of w at the end is only 8.000", "0.05 rad/s", "costs 0.02")
+    ends = tomllib.loads((w / "grounded.toml").read_text())["reward"]["terminal"]
+    assert (ends["th"], ends["w"]) == (1000.0, 8.0)
+    toml = w / "grounded.toml"
+    toml.write_text(toml.read_text().replace("w = 8.0", "w = 30.0"))
+    again = grounded(*line)
+    assert "only" not in again.out + again.err
+    assert tomllib.loads(toml.read_text())["reward"]["terminal"]["w"] == 30
 
 
 def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(tmp_path):

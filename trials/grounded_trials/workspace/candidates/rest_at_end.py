@@ -1,7 +1,9 @@
 """Let states that a line leaves free come to rest at its end, and only there.
 
 A column alone would get a weight at every step, and hold there what the run needs to move: a ball
-rolls only on a beam that tilts. So it is weighed in [reward] terminal.
+rolls only on a beam that tilts. So it is weighed in [reward] terminal. The weight of a noisy state
+is bounded by its noise: a load's angular rate cost a quarter of the utility by the noise of one
+sample, and gains that were to bring it to zero in the last steps answered that noise.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
 from grounded.search.safety import coasts_out
+from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.workspace.candidates.at_rest import rest_value
@@ -24,6 +27,7 @@ from grounded_trials.workspace.user_files.config import OFFERED
 from grounded_trials.workspace.user_files.task_file import LEAST
 
 HOLD = 1.0  # [s] at rest that are proposed at least
+NOISY = 0.02  # most utility that the noise of a state may cost at the end, by its weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +38,12 @@ class Rest:
         columns: of these states and their rates, (H + 1,) each; they count at the end only.
         weights: for [reward] terminal, also of the states that the line has: a ball that arrives
             too fast leaves a level beam as well.
+        noise: standard deviation of the states whose weight is bounded by it.
     """
 
     columns: dict[str, Array]
     weights: dict[str, float]
+    noise: dict[str, float]
 
 
 def rest_at_end(
@@ -68,7 +74,12 @@ def rest_at_end(
         if (rate := rates.get(name)) is not None and rate not in columns:
             found[rate], ranges[rate] = np.zeros(rows), ranges[name]  # only for its usual weight
     usual = usual_weights(model, {**columns, **ranges})
-    return Rest(found, {name: float(f"{OFFERED * w:.6g}") for name, w in usual.items()})
+    weights, noisy = {name: OFFERED * weight for name, weight in usual.items()}, {}
+    each = sensor_noise(workspace.task_trials(), model.n)
+    for name, noise in zip(model.state_names, each.tolist(), strict=True):
+        if name in found and weights[name] * noise**2 > NOISY:
+            weights[name], noisy[name] = NOISY / noise**2, noise
+    return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()}, noisy)
 
 
 def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
