@@ -223,10 +223,10 @@ def noise_share(best: Tried) -> str:
 
 
 def _of_it(noise: float, utility: float) -> str:
-    """Return how much of a logged run's cost is sensor noise, if it is much; else ""."""
+    """Return how much of a logged run's cost is expected of sensor noise, if it is much; else ""."""
     if not noise > MUCH * -utility:
         return ""
-    return f", about {number(min(noise, -utility))} of it sensor noise"
+    return f", {number(min(noise, -utility))} of it by sensor noise on average"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:

@@ -62,7 +62,7 @@ def test_the_noise_in_a_log_is_told_as_that_of_the_best_one():
         candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.006, off_target=()
     )
     assert _predicted(proposed).endswith(
-        "about -0.007600 in its log, about 0.006000 of it sensor noise"
+        "about -0.007600 in its log, 0.006000 of it by sensor noise on average"
     )
     rest = SimpleNamespace(
         candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.001, off_target=()
