@@ -15,7 +15,7 @@ from grounded.trial import Trial
 
 DEGREES = 57.29577951308232  # in a radian
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
-LEFT_OUT = "left out of the diagnosis: it adds nothing to"  # the log of its position
+LEFT_OUT = "left out of the diagnosis: it tells nothing more than"  # the log of its position
 SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
 AS_LATE = "is in one message with, and so as late as,"  # the signal that shows the delay
 ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
