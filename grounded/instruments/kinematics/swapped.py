@@ -2,7 +2,9 @@
 
 With the log as it is, a position does not move as its velocity implies; with two columns exchanged
 it does, in size and direction. No unmodelled effect causes that. Joints may move so much alike that
-each roughly follows the other's velocity; then an exchange must improve both.
+each roughly follows the other's velocity; then an exchange must improve both. Where a load swings,
+its velocity changes as its angle, with the opposite sign and another size: in either order the two
+have nearly the same shape, but only in the right one the same size, and the better shape.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ BROKEN, WHOLE = 0.8, 0.97  # cosine of displacements by position and velocity: b
 SIZED = 1.25  # factor within which the two sizes agree
 CLEARLY, ROUNDING = 4.0, 1e-9  # factor of the best 1 - cosine within which others are as good
 LEAST = 8  # windows that a trial must hold
+MIRRORED = ", one with the opposite sign,"  # of a position and its velocity, by a scale in [log]
 
 
 def swapped_columns(
@@ -33,6 +36,8 @@ def swapped_columns(
     relations: Sequence[Integral] | None = None,
 ) -> str:
     """Return the names of two exchanged signals of a trial, such as `x and v`; "" if none are.
+
+    `MIRRORED` follows the names of a position and its velocity of which one is negated as well.
 
     Args:
         model: however crude; used only for which state is the rate of which.
@@ -52,10 +57,18 @@ def swapped_columns(
     found = {}
     for pair in combinations(columns, 2):
         both = [odd[r] for r in odd if {r.i, r.j} & set(pair)]
+        named = f"{names[pair[0]]} and {names[pair[1]]}"
         if touched & set(pair) or len(both) > 1:
             left = _left(_exchanged(trial, pair), exact)
             if touched & set(pair) or CLEARLY * left < min(both):
-                found[f"{names[pair[0]]} and {names[pair[1]]}"] = left
+                found[named] = left
+        if own := [r for r in odd if {r.i, r.j} == set(pair)]:
+            back = _exchanged(trial, pair)
+            shape = 1 - max(_together(trial, one)[0] for r in own for one in (r, _negated(r)))
+            negated = [_negated(r) if r in own else r for r in exact]
+            for said, relied in ((named, exact), (f"{named}{MIRRORED}", negated)):
+                if CLEARLY * (left := _left(back, relied)) < shape:
+                    found[said] = left
     least = CLEARLY * max(min(found.values(), default=1.0), ROUNDING)
     found = {pair: left for pair, left in found.items() if left < min(least, 1 - WHOLE)}
     return " (or ".join(found) + ")" * (len(found) - 1)
@@ -116,7 +129,11 @@ def _together(trial: Trial, relation: Integral) -> tuple[float, float]:
 
 def _mirrored_too(trial: Trial, relation: Integral) -> float:
     """Return 1 - cosine of a relation, with either sign: a wrong sign is not an exchange."""
-    return min(_left(trial, [replace(relation, c=sign * relation.c)]) for sign in (1, -1))
+    return min(_left(trial, [one]) for one in (relation, _negated(relation)))
+
+
+def _negated(relation: Integral) -> Integral:
+    return replace(relation, c=-relation.c)
 
 
 def _left(trial: Trial, relations: Sequence[Integral]) -> float:

@@ -10,6 +10,7 @@ from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.workspace.intake.locating.run_start import Recording
+from grounded_trials.workspace.intake.recognising import recognise
 from recorded import LOGGED, record, waiting
 
 
@@ -84,6 +85,36 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     said = str(refused(w, edited(run, exchanged)))
     assert holds(said, "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_same(
+    w, tmp_path, monkeypatch, exchanged
+):
+    """A crane's, with the angle and its rate exchanged: `they are those of c0009`."""
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5, noise=(2e-4, 1e-3))
+    own, like = (w.candidate(one)[0] for one in ("c0002", "c0001"))
+    table = np.loadtxt(run, delimiter=",", skiprows=1)
+    sent = table[50 :: round(100 * w.task.dt), 3][: own.policy.horizon, None]
+    nearly = sent + 0.02 * np.ptp(sent) * np.sin(np.arange(len(sent)))[:, None]
+    like = replace(like, policy=replace(own.policy, feedforward=nearly, gain=0 * own.policy.gain))
+    monkeypatch.setattr(recognise, "_may_have_run", lambda _: [like, own])
+    if exchanged:
+        table[:, [1, 2]] = table[:, [2, 1]]
+        np.savetxt(run, table, "%.5f", ",", header="t,x,v,force", comments="")
+        error, before = refused(w, run), len(w.read().trials)
+        assert holds(str(error), "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+        assert "c0001" not in str(error) and error.then == NextCommand("ingest", (str(run),))
+        warned = " ".join(w.ingest(run, candidate="c0002").warnings)
+        assert before == 1 and "each other's column" in warned
+        return
+    assert w.ingest(run).candidate == "c0002"
+
+
+def test_a_run_of_another_candidate_is_not_called_exchanged(w, tmp_path):
+    run = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, 0.5, seed=3)
+    error = refused(w, run)
+    assert "those of c0001" in str(error) and "column" not in str(error)
 
 
 def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):

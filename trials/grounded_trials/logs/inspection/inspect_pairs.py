@@ -135,6 +135,11 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
     _, best, a, b = max(tried, key=lambda one: one[0])
     by = stated.factor(a, units[q.name]), stated.factor(b, units[w.name])
     logged, best = best, replace(best, slope=best.slope * by[1] / by[0])
+    crossed = _crossed(signals, a, b, best)
+    mirrored = best.correlation < -SURELY and abs(best.slope + 1) < SAME
+    if crossed and not mirrored:
+        found_q, found_w = (replace(moved_to(*one), sure=False) for one in ((q, a), (w, b)))
+        return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, crossed))}
     if abs(best.correlation) < FOLLOWS:
         why = f"it does not follow the derivative of {q.path} (correlation {best.correlation:.2f})"
         return {w.name: replace(w, sure=False, reasons=(*w.reasons, why))}
@@ -159,7 +164,37 @@ def _derivative(q: Guess, w: Guess, signals: Signals, units: Mapping[str, str]) 
     else:
         why += f", but {best.slope:.3g} times as large"
         found_w = replace(found_w, sure=False)
-    return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
+    if best.correlation < 0:  # either of the two may have the wrong sign, or be another signal
+        found_w = replace(found_w, sure=False)
+    reasons = (*found_w.reasons, f"{why}; or {crossed}" if crossed else why)
+    return {q.name: found_q, w.name: replace(found_w, reasons=reasons)}
+
+
+def _crossed(signals: Signals, a: str, b: str, as_named: Follows) -> str:
+    """Return that a position and its rate look exchanged, or "".
+
+    Where a load swings, its angular acceleration is opposite to the angle: with the columns
+    exchanged the rate follows the derivative of the position, too, but with the opposite sign or
+    another size. Only the right order has both right.
+
+    Args:
+        signals: with the samples of both.
+        a: the path of the position.
+        b: the path of its rate.
+        as_named: the comparison of `b` with the derivative of `a`.
+    """
+    if as_named.correlation > FOLLOWS and abs(as_named.slope - 1) < SAME:
+        return ""
+    if (gridded := signals.grid((b, a))) is None:
+        return ""
+    step, (position, rate) = gridded
+    back = follows(position, rate, step)
+    if back.correlation < SURELY or abs(back.slope - 1) > SAME:
+        return ""
+    return (
+        f"{a} and {b} look exchanged: {a} follows the derivative of {b}, correlation "
+        f"{back.correlation:.3f}, with the right sign and size; if so, exchange these paths"
+    )
 
 
 def agreed(

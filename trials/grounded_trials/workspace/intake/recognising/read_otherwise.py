@@ -112,14 +112,37 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> Misled | None:
             "cut nothing off; without its beginning the run can't be judged"
         )
     if found := _exchange(log, task, own):
-        return _in_other_column(log, task, own, *found[:2])
+        return _in_other_column(log, task, own, found)
     off = _off_zero(task, offset_in(log, task, own))
     return Misled(off) if off else None
 
 
-def _in_other_column(
-    log: Recording, task: Task, own: Candidate, pair: tuple[str, str], begins: float
-) -> Misled:
+def crossed(log: Recording | None, task: Task, own: Candidate, other: Candidate) -> Misled | None:
+    """Return that a log is a run with two columns exchanged, not another candidate's; or None.
+
+    Candidates that are nearly the same send nearly the same on exchanged columns, too. With the
+    columns put back the commands are those of the one that ran, and the motion is as predicted.
+
+    Args:
+        log: a log whose commands, as logged, are like those of `other`.
+        task: the task.
+        own: the candidate that should have run; its run is sought first.
+        other: the candidate that seems to have run, perhaps with exchanged columns as well.
+    """
+    run = _run_in(log, other.policy)
+    plain = run and follows(other.policy, run.until(other.policy.horizon), 0)
+    if log is None or not run or not plain:
+        return None
+    found = [(one, exchange) for one in (own, other) if (exchange := _exchange(log, task, one))]
+    if not found:
+        return None
+    whose, best = min(found, key=lambda each: each[1].error)
+    if plain.error < WORSE * (best.error + FINE) or best.far > apart(other, run):
+        return None
+    return _in_other_column(log, task, whose, best)
+
+
+def _in_other_column(log: Recording, task: Task, own: Candidate, found: Exchange) -> Misled:
     """Return what shows that two columns are exchanged, and whether the robot has them so, too.
 
     If the model predicts the motion with the commands as they are read, the commands were sent to
@@ -127,14 +150,14 @@ def _in_other_column(
     """
     from grounded.instruments.predictions.mistaken import Mistake, contradicted
 
-    (a, b), model = pair, task.model
+    (a, b), model = found.pair, task.model
     of = "state" if a in model.state_names else "input"
     said = (
         f"{a} and {b} seem to be in each other's column: only with them exchanged are its commands "
         f"those of {own.id}. Exchange the paths in [log.{of}.{a}] and [log.{of}.{b}], or the "
         "column headers in the log"
     )
-    run = log.trial_from(begins) if of == "input" else None
+    run = log.trial_from(found.begins) if of == "input" else None
     if run is None:
         return Misled(said)
     fault = Mistake(inputs=(model.input_names.index(a), model.input_names.index(b)))
@@ -180,15 +203,23 @@ def rather_exchanged(
 ) -> bool:
     """Return whether two exchanged columns explain a log better than another unit of some."""
     found = _exchange(log, task, own)
-    if found is None or (as_logged := log.trial_from(found[1])) is None:
+    if found is None or (as_logged := log.trial_from(found.begins)) is None:
         return False
-    return found[2] < apart(own, multiplied(as_logged, names, by)) - CLEARLY
+    return found.far < apart(own, multiplied(as_logged, names, by)) - CLEARLY
 
 
-def _exchange(
-    log: Recording, task: Task, own: Candidate
-) -> tuple[tuple[str, str], float, float] | None:
-    """Return two exchanged columns, where the run begins then, and how far it is [nats]."""
+@dataclass(frozen=True)
+class Exchange:
+    """Two columns with which exchanged a log contains a candidate's run."""
+
+    pair: tuple[str, str]
+    begins: float  # where the run begins then [s]
+    far: float  # how far it is from its prediction [nats]
+    error: float  # mean difference of its commands, relative to an input's size
+
+
+def _exchange(log: Recording, task: Task, own: Candidate) -> Exchange | None:
+    """Return the exchange of two columns that reveals a candidate's run, or None."""
     if (as_it_is := log.trial_from(log.first)) is None:
         return None
     policy, best, least = own.policy, None, np.inf
@@ -213,7 +244,7 @@ def _exchange(
         if there is not None and far > apart(own, there):
             continue  # farther from the prediction than as it is logged
         if (left := far + np.log(fit.error + FINE)) < least:
-            best, least = ((a, b), begun.seconds, far), left
+            best, least = Exchange((a, b), begun.seconds, far, fit.error), left
     return best
 
 

@@ -46,6 +46,8 @@ from grounded_trials.workspace.intake.opening.reading import (
 from grounded_trials.workspace.intake.recognising.look import Look
 from grounded_trials.workspace.intake.recognising.misused_run import exactly_misused, misused_in
 from grounded_trials.workspace.intake.recognising.read_otherwise import (
+    Misled,
+    crossed,
     misled,
     pace_of,
     rather_exchanged,
@@ -135,6 +137,9 @@ def recognised(
     again = NextCommand("ingest", (str(path) if read.log else "LOG",))  # LOG: of another run
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
+    swap = next((crossed(log, task, own, one) for one in candidates if one.id == other), None)
+    if swap and candidate is None:
+        raise _unreadable(path, ran, [swap.said], _then(again, swap))
     units, by = other_units(task, whole, own, seen.ran)
     units = units if not other and not _guessed(log) & {*units} else ()
     if read.log and not why and not units:
@@ -173,7 +178,7 @@ def recognised(
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
-        hides = None if turned or gone or other else misled(log, task, own)
+        hides = swap if other else None if turned or gone else misled(log, task, own)
         also = turned or gone or (hides.said if hides else "")
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
@@ -223,9 +228,9 @@ def recognised(
     named += [one.told(known, own=read.own) for one in odd]
     hides = None if named or other or seen.silent else misled(log, task, own)
     if hides:
-        named, again = [hides.said], NextCommand("next", ("LOG",)) if hides.rerun else again
+        named, again = [hides.said], _then(again, hides)
     if named:
-        raise GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(named)}", again)
+        raise _unreadable(path, ran, named, again)
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
         raise _misused(path, own, how)
     if guessed := sorted(_guessed(log)):  # the likeliest reason
@@ -249,6 +254,15 @@ def recognised(
         f"anyway{begins}",
         NextCommand("ingest", (str(path), "--data")),
     )
+
+
+def _unreadable(path: Path, ran: str, why: Sequence[str], then: NextCommand) -> GroundedError:
+    return GroundedError(f"{path} can't be read as a run of {ran}: {'; '.join(why)}", then)
+
+
+def _then(again: NextCommand, fault: Misled) -> NextCommand:
+    """Return the command after a log with a fault: for the same log, or that of the next run."""
+    return NextCommand("next", ("LOG",)) if fault.rerun else again
 
 
 def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial: Trial) -> None:

@@ -106,16 +106,21 @@ def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
 
 
 def _exchanged(workspace: Folder, known: Trial) -> Iterator[Fault]:
-    from grounded.instruments.kinematics.swapped import exchanged, swapped_columns
+    from grounded.instruments.kinematics.swapped import MIRRORED, exchanged, swapped_columns
     from grounded.instruments.predictions.mistaken import Mistake
     from grounded.places import integrals
 
-    model = workspace.base_model
+    model, mapping = workspace.base_model, workspace.log_mapping
     if pair := swapped_columns(model, known, relations=integrals(model)):
-        one, *more = (k for k, n in enumerate(model.state_names) if n in pair.split(" and "))
+        names = pair.removesuffix(MIRRORED).split(" and ")
+        one, *more = (k for k, n in enumerate(model.state_names) if n in names)
         fault = Mistake(states=((one, more[0]),)) if more else None  # else one is an input
         robot = _on_the_robot(workspace, known, fault) if fault else ""
-        yield Fault(exchanged(pair), "" if robot else "Exchange their paths in [log]", robot=robot)
+        mend = "Exchange their paths in [log]"
+        if pair.endswith(MIRRORED) and mapping:
+            odd = [n for n in names if n in mapping.states and mapping.states[n].scale < 0]
+            mend += f", and make the scale in [log.state.{odd[0]}] positive" if odd else ""
+        yield Fault(exchanged(pair), "" if robot else mend, robot=robot)
 
 
 def _by_model(workspace: Folder, known: Trial) -> tuple[Fault, ...]:
