@@ -130,16 +130,17 @@ def recognised(
     if look.old is not None:
         read = replace(read, aged=tuple(old_samples(workspace, own, whole, look.old)))
     why, other = seen.why, seen.other
-    if candidate is None and other in [one.id for one in earlier]:
-        raise _of_earlier_task(path, other)
     fell, stored = look.fell, read.log.stored if read.log else ()
     task = workspace.task
     again = NextCommand("ingest", (str(path) if read.log else "LOG",))  # LOG: of another run
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
-    swap = next((crossed(log, task, own, one) for one in candidates if one.id == other), None)
+    rival = next((one for one in (*earlier, *candidates) if one.id == other), None)
+    swap = crossed(log, task, own, rival) if rival else None
     if swap and candidate is None:
         raise _unreadable(path, ran, [swap.said], _then(again, swap))
+    if rival in earlier and candidate is None:
+        raise _of_earlier_task(path, other)
     units, by = other_units(task, whole, own, seen.ran)
     units = units if not other and not _guessed(log) & {*units} else ()
     if read.log and not why and not units:
