@@ -87,9 +87,9 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
     assert holds(said, "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
 
 
-@pytest.mark.parametrize("exchanged", [False, True])
+@pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, False), (True, True)])
 def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_same(
-    w, tmp_path, monkeypatch, exchanged
+    w, tmp_path, monkeypatch, exchanged, earlier
 ):
     """A crane's, with the angle and its rate exchanged: `they are those of c0009`."""
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5, noise=(2e-4, 1e-3))
@@ -98,7 +98,8 @@ def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_sa
     sent = table[50 :: round(100 * w.task.dt), 3][: own.policy.horizon, None]
     nearly = sent + 0.02 * np.ptp(sent) * np.sin(np.arange(len(sent)))[:, None]
     like = replace(like, policy=replace(own.policy, feedforward=nearly, gain=0 * own.policy.gain))
-    monkeypatch.setattr(recognise, "_may_have_run", lambda _: [like, own])
+    others = ([own], [like]) if earlier else ([like, own], [])  # of this task, of an earlier one
+    monkeypatch.setattr(recognise, "_may_have_run", lambda _: others)
     if exchanged:
         table[:, [1, 2]] = table[:, [2, 1]]
         np.savetxt(run, table, "%.5f", ",", header="t,x,v,force", comments="")
