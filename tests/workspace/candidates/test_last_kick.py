@@ -11,7 +11,7 @@ from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.remarks.after_run import kicked, moved_on
 from small_tasks import rover_task
-from workspaces import CONFIG, make
+from workspaces import CONFIG, MODEL, make
 
 ENDS = CONFIG.replace("{ x = 10.0 }", "{ }\nterminal = { x = 100.0 }")
 
@@ -38,6 +38,20 @@ def test_what_is_on_target_for_one_sample_only_is_told(tmp_path, last, lag, said
     assert bool(told) == said
     if said:
         assert holds(told, "force at a limit", "one sample", "--hold")
+
+
+def test_a_plan_that_rests_against_a_force_is_no_kick(tmp_path):
+    """An arm that stood still within 1 mrad was to let its target rest for longer."""
+    model = MODEL.replace("a.force - p", "a.force - 5.0 * s.x - p")
+    assert model != MODEL
+    planner = Folder(make(tmp_path / "w", config=ENDS, model=model).folder).planner
+    task = planner.task
+    states, inputs = np.array(task.target), np.full((task.horizon, 1), 5.0)
+    states[np.isnan(states)] = 0.0
+    run = Trial(states, inputs, task.dt, ("x", "v"), ("force",))
+    told = kicked(planner, run, np.zeros(1))
+    assert holds(told, "force at a limit", "force = 0 N", "lets it go", "runner.done(t)")
+    assert "one sample" not in told and "--hold" not in told
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.008])

@@ -43,13 +43,16 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     """Return a warning if a plan reaches its target only by a last command at its limit; or "".
 
     Weights of the last state alone are met by a kick in the last steps, for one sample: by the
-    model, the robot leaves the target in the next second.
+    model, the robot leaves the target in the next second. An arm at rest against its weight leaves
+    it, too, but because the input that is sent afterwards lets it go.
 
     Args:
         planner: the task, and the model with adopted effects.
         run: the predicted run, with the planning model's states.
         held: the input that is sent after it (m,).
     """
+    from grounded.places import integrals
+
     task = planner.task
     groups = weighed_groups(task) if reaches(task) else []
     ends = np.vstack([task.low, task.high])
@@ -59,14 +62,28 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     if not groups or not at.any():
         return ""
     names, what = groups[0]
-    after = coasting(planner.plan, run, held)[: 1 + math.ceil(1.0 / task.dt), : task.model.n]
-    errors, way = _from_target(task, after, [task.model.state_names.index(name) for name in names])
+    states, next_s = [task.model.state_names.index(n) for n in names], math.ceil(1.0 / task.dt)
+    after = coasting(planner.plan, run, held)[: 1 + next_s, : task.model.n]
+    errors, way = _from_target(task, after, states)
     off = np.linalg.norm(errors, axis=1)
     worst = int(np.argmax(off))
     if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
         return ""
+    still = run.states.copy()
+    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
+    rest = replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
+    let = coasting(planner.plan, rest, held)[: 1 + next_s, : task.model.n]
+    drift = np.linalg.norm(task.model.difference(let, let[:1])[:, states], axis=1)
     later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
     sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
+    if drift.max() > CAUSED * off[worst]:
+        pairs = zip(task.model.inputs.items(), held.tolist(), strict=True)
+        sends = listed(with_unit(f"{name} = {value:.3g}", unit) for (name, unit), value in pairs)
+        return (
+            f"it ends with {sent} at a limit, and after it the runner sends {sends}, which by the "
+            f"model lets it go: {what} {later} from its target {worst * task.dt:.2g} s later. "
+            "Switch to a controller that holds it as soon as `runner.done(t)` is true"
+        )
     return (
         f"it ends with {sent} at a limit and reaches its target for one sample only: the model "
         f"predicts {what} {later} from it {worst * task.dt:.2g} s later, {then} at the end. Let "
