@@ -136,7 +136,7 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
     if not one.known:
         sentence(f"{name} is stored as {one.trial}")
     if not one.candidate:
-        show(field("data", "for fit and diagnose: it ran no candidate", "  "))
+        show(field("data", "for fit and diagnose: it is no run of a candidate of this task", "  "))
     else:
         passed = best is not None and best.candidate.id != one.candidate
         passed = passed and (one.verdict == AGAIN or (one.known and one.verdict in BEST))

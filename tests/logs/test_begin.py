@@ -21,7 +21,7 @@ from grounded_trials import Workspace
 from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.report.gathering import gather
-from grounded_trials.starting.begin import begin
+from grounded_trials.starting.begin import _start, begin
 from grounded_trials.starting.first_toml import _inline, _span, held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
@@ -1161,7 +1161,13 @@ def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
     ramp = {"thrust": sent["thrust"] + np.clip(1 - 2 * t, 0, None)}  # it is still settling
     assert not held_first(model, columns, ramp, 0.02, ranges)
     sinks = {**columns, "z": columns["z"] - 0.3 * t}
-    assert not held_first(model, sinks, sent, 0.02, ranges)
+    assert held_first(model, sinks, sent, 0.02, ranges) is None
+    low = {**columns, "z": columns["z"] - 0.8}
+    idle = {"thrust": np.where(t > 1, sent["thrust"] - 5.33, 0.0)}
+    spans = {n: (x.min(), x.max()) for n, x in {**low, **idle}.items()}
+    assert held_first(model, low, idle, 0.02, spans) == {}  # an arm hung at 0: "shows no rest"
+    assert _start(model, {}, ()).startswith("empty, that is 0, where it stood")
+    assert _start(model, None, ()).startswith("empty, the log shows no rest")
 
 
 SLED = """from grounded import Model, Param

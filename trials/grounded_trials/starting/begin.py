@@ -264,12 +264,12 @@ def _begin(
     rates = velocities(found)
     table = mapping_toml(states, inputs, simulated=is_simulated(report), rates=rates)
 
-    stood: dict[str, float] = {}
+    stood: dict[str, float] | None = None
 
     def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
-        name, held = Path(log).name, held_first(found, columns, sent, step, ranges)
-        stood.clear()
-        stood.update(held)
+        nonlocal stood
+        name, stood = Path(log).name, held_first(found, columns, sent, step, ranges)
+        held = stood or {}
         write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name, held)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
@@ -441,13 +441,15 @@ def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
     return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
 
 
-def _start(model: Model, stood: Mapping[str, float], states: Sequence[Guess]) -> str:
+def _start(model: Model, stood: Mapping[str, float] | None, states: Sequence[Guess]) -> str:
     """Say what [task] start holds, or why it is empty and what to enter."""
     if stood:
         told = ", ".join(f"{name} = {value:.4g}" for name, value in stood.items())
         return f"{told}, where it stood in the log's first rows"
     if has_plane(model):
         return "empty: a run begins where the target does"
+    if stood is not None:
+        return "empty, that is 0, where it stood in the log's first rows"
     lost = [guess.name for guess in states if not guess.path]
     why = f"no rest is seen without {listed(lost)} in the log" if lost else "the log shows no rest"
     return f"empty, {why}: enter where a run begins in [task] start"

@@ -112,15 +112,17 @@ def held_first(
     sent: Mapping[str, Array],
     dt: float,
     ranges: Mapping[str, tuple[float, float] | None],
-) -> dict[str, float]:
+) -> dict[str, float] | None:
     """Return the states in which a robot stands at the start of a log, and the inputs holding it.
+
+    States at 0 are not named.
 
     A controller may sag at first and its commands may tremble, so inputs only need to be `steady`
     in the second half of the first `STOOD` seconds. If none has to hold it, none is named:
     inputs then count as 0 before a run, which is also what is sent after it; it may then stand for
     a moment only (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is
-    named without such an input. Returns {} if the robot moves or an input changes. Also returns {}
-    for a model without a speed, since a slow drift could not be detected.
+    named without such an input. Returns None if the robot moves or an input changes. Also returns
+    None for a model without a speed, since a slow drift could not be detected.
 
     Args:
         model: the model of the states and inputs.
@@ -133,13 +135,15 @@ def held_first(
     speeds = {name for name, unit in model.states.items() if unit.endswith("/s")}
     whole = set(sent) == set(model.inputs) and set(columns) == set(model.states)
     if not speeds or not whole or steps < 2:
-        return {}
+        return None
     spans = {name: ranges[name] or (0.0, 0.0) for name in (*columns, *sent)}
-    found, held = _stood(columns, sent, speeds, steps, spans)
-    if held:
-        return found | held
-    brief, held = _stood(columns, sent, speeds, max(round(BEGAN / dt), 2), spans)
-    return {} if held or has_plane(model) else found or brief
+    long = _stood(columns, sent, speeds, steps, spans)
+    if long and long[1]:
+        return long[0] | long[1]
+    brief = _stood(columns, sent, speeds, max(round(BEGAN / dt), 2), spans)
+    if brief is None or brief[1] or has_plane(model):
+        return None
+    return (long and long[0]) or brief[0]
 
 
 def _stood(
@@ -148,18 +152,21 @@ def _stood(
     speeds: set[str],
     steps: int,
     spans: Mapping[str, tuple[float, float]],
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return where a robot stood in its first rows, and the inputs that had to hold it there."""
+) -> tuple[dict[str, float], dict[str, float]] | None:
+    """Return where a robot stood in its first rows, and the inputs that had to hold it there.
+
+    None if it did not stand.
+    """
     first = {name: values[:steps] for name, values in {**columns, **sent}.items()}
     if not all(len(v) == steps and np.isfinite(v).all() for v in first.values()):
-        return {}, {}
+        return None
     found, held = {}, {}
     for name in columns:
         low, high = spans[name]
         most = max(abs(low), abs(high)) if name in speeds else high - low
         off = first[name].mean() if name in speeds else drift(first[name])
         if abs(off) > STEADY * most:
-            return {}, {}
+            return None
         at = float(first[name][steps // 2 :].mean())
         if name not in speeds and abs(at) > STEADY * most:
             found[name] = at
@@ -168,7 +175,7 @@ def _stood(
         low, high = spans[name]
         later = first[name][steps // 2 :]
         if not steady(later, high - low):
-            return {}, {}
+            return None
         held[name] = float(later.mean() if np.ptp(later) else later[0])
         needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STEADY * (high - low))
     return found, held if needed else {}
