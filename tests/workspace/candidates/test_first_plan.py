@@ -441,6 +441,39 @@ def test_rest_of_a_free_state_is_asked_for_at_the_end_only(tmp_path):
     assert grounded("-C", w, "target", "step", "--to", "x=1", "--rest").code == 2
 
 
+ARM = """
+from grounded import Model
+
+def rate(s, a, p):
+    return {"q": s.w, "w": (0.9 * a.amps - 3.2 * s.q + 0.5 * s.q**3 - 0.05 * s.w) / 0.08}
+
+model = Model(states={"q": "rad", "w": "rad/s"}, inputs={"amps": "A"}, derivative=rate)
+"""
+
+
+@pytest.mark.parametrize(("to", "said"), [("1.2", True), ("0.8", False)])
+def test_a_pose_that_the_limits_can_t_hold_is_told_before_the_first_run(tmp_path, to, said):
+    """Three runs of an arm were spent on 1.2 rad; `diagnose` was the first to speak of 4 A."""
+    (tmp_path / "arm.py").write_text(ARM)
+    w = tmp_path / "w"
+    assert grounded("init", w, "--blank", "--model", tmp_path / "arm.py", "--dt", "0.02").code == 0
+    toml = w / "grounded.toml"
+    limits = "[limits]\namps = [-3.0, 3.0]\n"
+    text = re.sub(r"(?m)^\[limits\][^\n]*\n(?:[#a-z]+.*\n)*", limits, toml.read_text())
+    assert limits in text
+    toml.write_text(text)
+    line = ("-C", w, "target", "line", "--to", f"q={to}", "--seconds", "1.5", "--hold", "0.5")
+    assert grounded(*line).code == 0
+    told = " ".join(grounded("-C", w, "propose").err.split())
+    assert ("reaching and holding it" in told) is said
+    # after its end it falls, from rest as well: to hold the target for longer does not help
+    toml.write_text(toml.read_text() + "\n[safety]\nq = [-0.3, 1.5]\n")
+    again = grounded("-C", w, "propose")
+    assert "leaves [safety] q" in " ".join(again.err.split())
+    assert "target line" not in again.out
+    assert not said or holds(told, "amps is at its limit of 3 A from", "s on", "of the target")
+
+
 def test_a_weight_at_the_end_is_bounded_by_the_noise_of_its_state(tmp_path, monkeypatch):
     """By a weight of 100, noise of a load's angular rate cost a quarter of the utility."""
     noise = np.array([0.01, 0.01, 0.002, 0.05])

@@ -50,6 +50,7 @@ BOUND = 0.05  # share of the steps at limits that only a log gave from which it 
 TIGHTER = 0.9  # of the plan's smallest turning radius: a target below it turns too tightly
 ROUND = 0.05  # of that radius by which a plan must be off
 TURNING = 0.1  # share of the steps at a limit above which that limit is the reason
+LASTING = 0.25  # share of a plan at whose end an input is at a limit that keeps it off its target
 SHORT = 0.25  # share of the target's extent by which a plan may end away from the target's end
 MISSED = 0.1  # share of the target's extent above which an error is reported
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
@@ -258,16 +259,32 @@ def _leaving(task: Task, plan: Candidate) -> NDArray[np.bool_]:
 
 
 def _held_back(task: Task, first: Candidate) -> list[str]:
-    """Return a note if [limits] keep a plan off its target: an input is nearly always at one."""
+    """Return a note if [limits] keep a plan off its target.
+
+    An input is at one nearly always, or throughout the last part, as for a pose that it can't hold.
+    """
     names, sent, aim = task.model.input_names, first.predicted_inputs, task.input_target
     assert aim is not None
-    held = []
+    held, ended = [], []
     for j, name in enumerate(names):
         for end in (float(task.low[j]), float(task.high[j])):
-            share = float(np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9).mean())
-            if np.isfinite(end) and share > HELD and not np.allclose(aim[:, j], end):
-                limit = with_unit(f"{end:.4g}", task.model.inputs[name])
-                held.append(f"{name} is at its limit of {limit} for {percent(share)} of the plan")
+            at = np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9)
+            last = len(at) if at.all() else int(np.argmin(at[::-1]))
+            if not np.isfinite(end) or np.allclose(aim[:, j], end):
+                continue
+            its = f"{name} is at its limit of {with_unit(f'{end:.4g}', task.model.inputs[name])}"
+            if (share := float(at.mean())) > HELD:
+                held.append(f"{its} for {percent(share)} of the plan")
+            elif last > LASTING * len(at):
+                ended.append(f"{its} from {(len(at) - last) * task.dt:.3g} s on")
+    off, far, what, unit = _end_off(task, first)
+    if ended and not held and off > MISSED * far > 0:
+        short, way = measured_alike([off, far], unit)
+        return [
+            f"{' and '.join(ended)}, and still the plan ends {short} from the end of the target, "
+            f"which moves {what} over {way}: [limits] don't seem to allow reaching and holding it. "
+            "Widen them if the robot can take more, or let the target end nearer or later"
+        ]
     if not held or not (missed := _most_missed(task, first.predicted_run)):
         return []
     return [
@@ -314,12 +331,7 @@ def _turns_wide(task: Task, first: Candidate, off: float) -> list[str]:
 
 def _falls_short(task: Task, first: Candidate) -> list[str]:
     """Return a note if a plan ends far from the target's end although no input is at its limit."""
-    if not (groups := weighed_groups(task)):
-        return []
-    names, what = groups[0]
-    states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
-    left = task.model.difference(first.predicted_states[-1], task.target[-1])[states]
-    off, far = float(np.linalg.norm(left)), _extent(task, states)
+    off, far, what, unit = _end_off(task, first)
     if not off > SHORT * far > 0:
         return []
     short, way_told = measured_alike([off, far], unit)
@@ -329,6 +341,16 @@ def _falls_short(task: Task, first: Candidate) -> list[str]:
         "get there in time. Weigh inputs and their changes less, draw a slower target, or check "
         "model.py"
     ]
+
+
+def _end_off(task: Task, first: Candidate) -> tuple[float, float, str, str]:
+    """Return how far a plan ends from the target's end, the target's extent, what that is, unit."""
+    if not (groups := weighed_groups(task)):
+        return 0.0, 0.0, "", ""
+    names, what = groups[0]
+    states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
+    left = task.model.difference(first.predicted_states[-1], task.target[-1])[states]
+    return float(np.linalg.norm(left)), _extent(task, states), what, unit
 
 
 def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:

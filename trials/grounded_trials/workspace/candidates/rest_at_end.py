@@ -87,9 +87,12 @@ def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
 
     It draws the same line so that free states rest at its end, and holds it there for a while.
     """
+    from grounded_trials.workspace.intake.remarks.after_run import ended_at_rest
+
     planner, task = workspace.planner, workspace.task
     held = np.clip(made.policy.past, made.policy.low, made.policy.high)
-    if not coasts_out(task, planner.plan, planner.lift(made.predicted_run), held):
+    run = planner.lift(made.predicted_run)
+    if not coasts_out(task, planner.plan, run, held):
         return None
     if (line := drawn(task)) is None or line.arguments[0] != "line":
         return None
@@ -100,6 +103,8 @@ def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
     words += ["--seconds", f"{seconds:.6g}"]
     if not free and rests * task.dt >= HOLD:
         return None
+    if not free and coasts_out(task, planner.plan, ended_at_rest(task, run, held), held):
+        return None  # an arm falls from rest as well: the input that is sent afterwards lets it go
     words += ["--hold", f"{max(rests * task.dt, HOLD):.6g}", *["--rest"] * bool(free)]
     return NextCommand("target", tuple(words))
 

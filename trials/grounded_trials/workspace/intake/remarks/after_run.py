@@ -51,8 +51,6 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
         run: the predicted run, with the planning model's states.
         held: the input that is sent after it (m,).
     """
-    from grounded.places import integrals
-
     task = planner.task
     groups = weighed_groups(task) if reaches(task) else []
     ends = np.vstack([task.low, task.high])
@@ -69,9 +67,7 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     worst = int(np.argmax(off))
     if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
         return ""
-    still = run.states.copy()
-    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
-    rest = replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
+    rest = ended_at_rest(task, run, held)
     let = coasting(planner.plan, rest, held)[: 1 + next_s, : task.model.n]
     drift = np.linalg.norm(task.model.difference(let, let[:1])[:, states], axis=1)
     later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
@@ -89,6 +85,21 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
         f"predicts {what} {later} from it {worst * task.dt:.2g} s later, {then} at the end. Let "
         "the target rest for longer (`grounded target --hold`), or lower [reward] terminal"
     )
+
+
+def ended_at_rest(task: Task, run: Trial, held: Array) -> Trial:
+    """Return a run that ends where a predicted one does, but at rest and under the held input.
+
+    Args:
+        task: says which states are rates of positions.
+        run: the predicted run, with the planning model's states.
+        held: the input that is sent after it (m,).
+    """
+    from grounded.places import integrals
+
+    still = run.states.copy()
+    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
+    return replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
 
 
 @dataclass(frozen=True)
