@@ -143,7 +143,8 @@ class Engine:
 
 
 Results = Generator[tuple[int, Any], None, None]  # index of a piece, its result
-_pool: ContextVar[Callable[[Any, Sequence[Any]], Results] | None] = ContextVar("pool", default=None)
+Call = Callable[[Any, Sequence[Any]], Results]  # of a function and the rows of its arguments
+_pool: ContextVar[Call | None] = ContextVar("pool", default=None)
 
 
 @contextmanager
@@ -161,7 +162,7 @@ def running(engine: Engine | None, *, copied: bool = True) -> Iterator[None]:
         yield
         return
     with ExitStack() as stack:
-        call: Callable[[Any, Sequence[Any]], Results]
+        call: Call
         if engine.name == "local" and copied and possible():
             call = Forks(engine.jobs, (SentOnce,))
         elif engine.name == "local":

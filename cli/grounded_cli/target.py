@@ -208,16 +208,16 @@ def command(
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
             told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
             sentence(f"[reward] {kind} is new, {by}: {told}")
-    weights = reward.get("terminal", {})
-    for name, deviation in ended.noise.items() if ended else ():
-        if ended is None or weights[name] != ended.weights[name]:
+    noisy = {} if ended is None else {n: (s, ended.weights[n]) for n, s in ended.noise.items()}
+    for name, (deviation, weight) in noisy.items():
+        if reward["terminal"][name] != weight:
             continue  # the user's own
         its = with_unit(f"{deviation:.2g}", model.states[name])
         remark(
             "note",
-            f"the weight of {name} at the end is only {number(weights[name])}: with it, the "
-            f"sensor noise ({its}) costs {NOISY:g} of the utility; with a larger one, the inputs "
-            "would answer that noise",
+            f"the weight of {name} at the end is only {number(weight)}: with it, the sensor noise "
+            f"({its}) costs {NOISY:g} of the utility; with a larger one, the inputs would answer "
+            "that noise",
         )
     bounds = workspace.config.safety.pairs(list(model.states))
     for name, (low, high) in ranges.items():

@@ -34,6 +34,7 @@ from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import decide
@@ -194,7 +195,7 @@ def diagnose(
     joints = options.library.joints(data.model, data.scales)
     joints = knowable(data, [e for e in joints if e.name not in settled])
     limit = options.max_effects or MOST_EFFECTS
-    copied = data.model.system.how != "differenced"
+    copied = not simulated(data.model)
     with running(engine, copied=copied):
         search, best = attribute(
             data,

@@ -378,15 +378,21 @@ model = Model(states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"}, angles=("ps
 """
 
 
+def limited(folder, limits):
+    """Write the [limits] of a workspace that was made with --blank."""
+    file = folder / "grounded.toml"
+    text = re.sub(r"(?m)^\[limits\].*$", limits, file.read_text())
+    assert limits in text
+    file.write_text(text)
+
+
 @pytest.mark.parametrize(("size", "tight"), [(1, True), (3, False)])
 def test_a_target_that_turns_tighter_than_the_model_can_is_told(tmp_path, size, tight):
     """A figure-8 with turns of 0.4 m for a car that needs 0.8 m was only off by 134 mm."""
     (tmp_path / "car.py").write_text(STEERED)
     w = tmp_path / "w"
     assert grounded("init", w, "--blank", "--model", tmp_path / "car.py", "--dt", "0.05").code == 0
-    file = w / "grounded.toml"
-    limits = "[limits]\nsteer = [-0.36, 0.36]\nspeed = [0, 3]"
-    file.write_text(re.sub(r"(?m)^\[limits\].*$", limits, file.read_text()))
+    limited(w, "[limits]\nsteer = [-0.36, 0.36]\nspeed = [0, 3]")
     drawn = grounded("-C", w, "target", "figure-8", "--size", f"{size}", "--speed", "1.5")
     radius = 1e3 * float(re.search(r"turning radius ([\d.]+) m", drawn.out)[1])
     assert radius == pytest.approx(417 * size, rel=0.1)
@@ -457,11 +463,8 @@ def test_a_pose_that_the_limits_can_t_hold_is_told_before_the_first_run(tmp_path
     (tmp_path / "arm.py").write_text(ARM)
     w = tmp_path / "w"
     assert grounded("init", w, "--blank", "--model", tmp_path / "arm.py", "--dt", "0.02").code == 0
-    toml = w / "grounded.toml"
-    limits = "[limits]\namps = [-3.0, 3.0]\n"
-    text = re.sub(r"(?m)^\[limits\][^\n]*\n(?:[#a-z]+.*\n)*", limits, toml.read_text())
-    assert limits in text
-    toml.write_text(text + "\n[safety]\nq = [-0.3, 1.5]\n")
+    bounds = "[limits]\namps = [-3.0, 3.0]\n\n[safety]\nq = [-0.3, 1.5]"
+    limited(w, bounds)
     line = ("-C", w, "target", "line", "--to", f"q={to}", "--seconds", "1.5", "--hold", "0.5")
     assert grounded(*line).code == 0
     done = grounded("-C", w, "propose")

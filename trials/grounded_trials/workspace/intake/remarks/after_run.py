@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.model import Model
 from grounded.result import listed, measured_alike
 from grounded.search.planner import Planner
 from grounded.search.safety import coasting
@@ -73,12 +74,11 @@ def kicked(planner: Planner, run: Trial, held: Array) -> str:
     later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
     sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
     if drift.max() > CAUSED * off[worst]:
-        pairs = zip(task.model.inputs.items(), held.tolist(), strict=True)
-        sends = listed(with_unit(f"{name} = {value:.3g}", unit) for (name, unit), value in pairs)
         return (
-            f"it ends with {sent} at a limit, and after it the runner sends {sends}, which by the "
-            f"model lets it go: {what} {later} from its target {worst * task.dt:.2g} s later. "
-            "Switch to a controller that holds it as soon as `runner.done(t)` is true"
+            f"it ends with {sent} at a limit, and after it the runner sends "
+            f"{_told(task.model, held)}, which by the model lets it go: {what} {later} from its "
+            f"target {worst * task.dt:.2g} s later. Switch to a controller that "
+            "holds it as soon as `runner.done(t)` is true"
         )
     return (
         f"it ends with {sent} at a limit and reaches its target for one sample only: the model "
@@ -211,13 +211,8 @@ def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
         found = resting(there, memory, replace(planner.loose, start=there.start, past=held))
         lost = found is None and moves_by(there, memory) > 0
 
-    def told(values: Array, digits: int = 3) -> str:
-        pairs = zip(model.inputs.items(), values + 0.0, strict=True)
-        return listed(
-            with_unit(f"{name} = {value:.{digits}g}", unit) for (name, unit), value in pairs
-        )
-
-    would = f" (by the model {told(found[len(memory) :], 2)} would)" if found is not None else ""
+    own = "" if found is None else _told(model, found[len(memory) :], 2)
+    would = f" (by the model {own} would)" * bool(own)
     then = "Switch to a controller that holds it as soon as `runner.done(t)` is true"
     if lost:  # such as a boat in a current from the side
         would = " (and by the model no constant input does)"
@@ -227,9 +222,15 @@ def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
             "[task] start"
         )
     return (
-        f"after it the runner sends {told(held)}, which does not hold it there{would}. {then}. No "
-        "weight in [reward] changes this"
+        f"after it the runner sends {_told(model, held)}, which does not hold it there{would}. "
+        f"{then}. No weight in [reward] changes this"
     )
+
+
+def _told(model: Model, inputs: Array, digits: int = 3) -> str:
+    """Return the inputs (m,) as `force = 0 N and steer = 0.1 rad`."""
+    pairs = zip(model.inputs.items(), inputs + 0.0, strict=True)
+    return listed(with_unit(f"{name} = {value:.{digits}g}", unit) for (name, unit), value in pairs)
 
 
 def _to_stay(task: Task, states: Sequence[int]) -> str:
