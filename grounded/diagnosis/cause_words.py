@@ -219,6 +219,31 @@ def counted(effect: Effect, acting: Sequence[Effect]) -> str:
     return f", counted {'before' if at < gains[0] else 'after'} the change of {gain}"
 
 
+def at_middle(
+    effect: Effect, acting: Sequence[Effect], values: Mapping[str, Mapping[str, Estimate]]
+) -> str:
+    """Return the command to which a claimed gain belongs, beside a curve of its input; else "".
+
+    The factor of `input_curve` is 1 at (L + U) / 2: elsewhere both change the gain.
+
+    Args:
+        effect: a claimed effect.
+        acting: all claimed effects.
+        values: the estimates of each effect, by name.
+    """
+    site = effect.site
+    if effect.family.name != "input_gain" or len(site.targets) > 1:
+        return ""
+    own = f"input_curve:{site.target}"
+    curve = next((e for e in acting if e.name == own), None)
+    if curve is None or "b" not in _told(values[own]):
+        return ""
+    ends = {q.name: q.start for q in curve.quantities if q.fixed}
+    middle = with_unit(number((ends["L"] + ends["U"]) / 2), site.model.inputs[site.target])
+    least = "its smallest" if ends["L"] > 0 else "zero"
+    return f" at {middle}, half way between {least} and its largest command"
+
+
 def other_unit(name: str, params: Mapping[str, Estimate]) -> str:
     """Return a clause for an input's gain of about a power of ten: its log may be in another unit.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.cause_words import (
     GIVEN,
     OWN,
+    at_middle,
     clauses,
     comparison,
     counted,
@@ -250,6 +251,7 @@ def _causes(
     for one in credit:
         if one.of in effects:
             text = meaning(effects[one.of], values[one.of])
+            text += at_middle(effects[one.of], acting, values)
             text += other_unit(one.of, values[one.of])
             text += counted(effects[one.of], acting)
             if one.share < BARELY and one.of in claims.held_up:

@@ -8,6 +8,7 @@ from facts import holds
 from grounded.diagnosis.cause_words import (
     DISAGREE,
     all_called,
+    at_middle,
     called,
     clauses,
     counted,
@@ -74,6 +75,20 @@ def test_volts_are_said_to_be_counted_before_or_after_a_gain_of_their_input():
     for without in (friction, zone):
         assert not counted(without, [friction, zone, known[BIAS]])
     assert not any(counted(one, [gain, one]) for one in (known[TWO], late, known[BIAS], fade))
+
+
+def test_a_gain_beside_a_curve_of_its_input_says_at_which_command():
+    """Both change the gain: `48 % stronger` was so at 2.4 A and at no other current."""
+    gain, other = (Library().effect(name, arm) for name in (GAIN, "input_gain:t2"))
+    curve = Library().effect("input_curve:t1", arm)
+    peak = next(q.start for q in curve.quantities if q.name == "U")
+    values = {curve.name: {"a": Estimate(0.0, 0.0, unit="1"), "b": Estimate(-0.4, 0.02, unit="1")}}
+    said = at_middle(gain, [gain, curve], values)
+    assert holds(said, f"{peak / 2:g} N m", "half way between zero and its largest command")
+    assert not at_middle(other, [other, curve], values)
+    assert not at_middle(gain, [gain], values)
+    only_sides = {curve.name: {"a": Estimate(0.1, 0.01, unit="1"), "b": Estimate(0.01, 0.02)}}
+    assert not at_middle(gain, [gain, curve], only_sides)
 
 
 def test_the_smallest_of_many_are_told_in_words_with_their_values():
