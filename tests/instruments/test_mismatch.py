@@ -228,7 +228,7 @@ def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
         y[:, 2] = np.cumsum(steps - 2 * np.pi * np.rint(steps / (2 * np.pi)))
         return y
 
-    with pytest.raises(GroundedError, match=r"\[log\.state\.psi\] scale = 0\.0174532"):
+    with pytest.raises(GroundedError, match=r"scale in \[log\.state\.psi\] by 0\.0174532"):
         preflight(BOAT, logged(BOAT, folded))
 
 

@@ -247,35 +247,72 @@ def _within(a: Change, b: Change) -> bool:
     return a.factor == b.factor and set(a.states) < set(b.states)
 
 
-def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:
-    """Raise an error for an angle in degrees that was unwrapped as if it were in radians.
+@dataclass(frozen=True)
+class Folded:
+    """An angle (state i) in degrees that was unwrapped in radians, and in which trials.
 
     Resampled as radians, 350 degrees become 350 - 56 x 2 pi, so steps of more than pi degrees are
     lost and dividing the trial by 57.3 does not restore them.
+    """
+
+    state: int
+    trials: tuple[int, ...]
+
+    def told(self, model: Model) -> str:
+        """Return a clause that continues a sentence after the angle's name."""
+        unit = list(model.states.values())[self.state]
+        return f"is in degrees, but was unwrapped as an angle in {unit}"
+
+
+def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> list[Folded]:
+    """Return the angles in degrees that were unwrapped as if they were in radians.
+
+    Args:
+        model: however crude.
+        trials: of this model's states.
+        rows: kinematic rows, see `rows.kinematic_rows`.
+    """
+    found = []
+    for row in rows:
+        if not model.angle_mask[row.i]:
+            continue
+        some = tuple(k for k, trial in enumerate(trials) if _folds(model, trial, row))
+        if some:
+            found.append(Folded(row.i, some))
+    return found
+
+
+def _folds(model: Model, trial: Trial, row: Row) -> bool:
+    """Return whether an angle turns 57.3 times as far as its row says, but for whole turns."""
+    steps = list(per_step(model, trial, [row]))
+    moved, said = (
+        np.concatenate([np.empty(0), *(pair[k][:, row.i] for pair in steps)]) for k in (0, 1)
+    )
+    turned = DEGREES * said
+    if len(moved) < 20 or not (np.abs(turned) > np.pi).mean() > 0.01:
+        return False
+    off = wrapped((moved - turned)[:, None], [True])
+    plain = wrapped((moved - said)[:, None], [True])
+    return bool(np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / 2))
+
+
+def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:
+    """Raise an error for an angle in degrees that was unwrapped as if it were in radians.
 
     Raises:
         GroundedError: with the scale with which to ingest the log again.
     """
-    for row in rows:
-        if not model.angle_mask[row.i]:
-            continue
-        steps = [pair for trial in trials for pair in per_step(model, trial, [row])]
-        moved, said = (
-            np.concatenate([np.empty(0), *(pair[k][:, row.i] for pair in steps)]) for k in (0, 1)
+    for one in folded(model, trials, rows):
+        name = model.state_names[one.state]
+        ids = tuple(trials[k].id for k in one.trials if trials[k].id)
+        where = f"in trial{'s' * (len(ids) > 1)} {listed(ids)} " if ids else ""
+        raise GroundedError(
+            f"{where}{name} {one.told(model)} when the log was ingested: multiply the scale in "
+            f"[log.state.{name}] by {1 / DEGREES:.8g} (a missing scale is 1) or write "
+            f"{model.states[name]} into the log, discard {'these trials' if ids[1:] else 'it'} and "
+            f"ingest {'their logs' if ids[1:] else 'the log'} again",
+            then=NextCommand("discard", ids) if ids else None,
         )
-        turned = DEGREES * said
-        if len(moved) < 20 or not (np.abs(turned) > np.pi).mean() > 0.01:
-            continue
-        off = wrapped((moved - turned)[:, None], [True])
-        plain = wrapped((moved - said)[:, None], [True])
-        if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / 2):
-            name, ids = model.state_names[row.i], tuple(t.id for t in trials if t.id)
-            raise GroundedError(
-                f"{name} is in degrees, but was unwrapped as an angle in {model.states[name]} when "
-                f"the log was ingested: set [log.state.{name}] scale = {1 / DEGREES:.8g}, discard "
-                "these trials and ingest their logs again",
-                then=NextCommand("discard", ids) if ids else None,
-            )
 
 
 def _said(model: Model, change: Change, *, log: bool) -> str:

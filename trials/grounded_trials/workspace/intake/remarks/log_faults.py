@@ -241,9 +241,23 @@ def positions_faults(model: Model, known: Trial) -> list[Fault]:
 
 
 def _degrees(model: Model, known: Trial) -> list[Fault]:
-    """Return faults for angles in degrees that a diagnosis would correct."""
+    """Return faults for angles in degrees that a diagnosis would correct, or refuse."""
+    from grounded.instruments.finding import DEGREES
+    from grounded.instruments.kinematics.rows import kinematic_rows
     from grounded.instruments.preflight import preflight
+    from grounded.instruments.units.mismatch import folded
 
+    if lost := folded(model, [known], kinematic_rows(model, range(model.n))):
+        names = [model.state_names[one.state] for one in lost]
+        return [
+            Fault(
+                f"{name} {one.told(model)}",
+                f"Multiply the scale in [log.state.{name}] by {1 / DEGREES:.8g} (a missing scale "
+                "is 1)",
+                f"write {model.states[name]}",
+            )
+            for name, one in zip(names, lost, strict=True)
+        ]
     try:
         findings = preflight(model, [replace(known, id="")]).findings
     except GroundedError:  # the diagnosis reports it
