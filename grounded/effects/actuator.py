@@ -84,13 +84,14 @@ def _curve(site: Site) -> tuple[Quantity, ...]:
     L is the smallest command of a log that keeps clear of zero, such as a hover's thrust. So the
     model's own gain stays what it is amid the commands that were sent.
     """
-    scales, name = site.scales, site.target
-    peak = scales.peak(name)
-    high, low = scales.high.get(name, 1.0), scales.low.get(name, -1.0)
-    whole = Quantity("U", site.unit(name), fixed=True, start=peak)
-    least = min(max(low, -high, 0.0), NARROWEST * peak)
-    end = Quantity("L", site.unit(name), fixed=True, start=least)
-    sides = Quantity("a", low=-0.9, high=0.9, fixed=min(high, -low) < ONE_SIDED * peak)
+    scales, names = site.scales, site.targets
+    peak = max(scales.peak(name) for name in names)
+    ends = [(scales.low.get(name, -1.0), scales.high.get(name, 1.0)) for name in names]
+    whole = Quantity("U", site.unit(site.target), fixed=True, start=peak)
+    least = min(max(low, -high, 0.0) for low, high in ends)
+    end = Quantity("L", site.unit(site.target), fixed=True, start=min(least, NARROWEST * peak))
+    one_sided = all(min(high, -low) < ONE_SIDED * peak for low, high in ends)
+    sides = Quantity("a", low=-0.9, high=0.9, fixed=one_sided)
     return (sides, Quantity("b", low=-1.8, high=1.8), whole, end)
 
 
@@ -166,7 +167,7 @@ input_curve = InputFamily(
     sentence="the gain of {target} is [{a%higher|lower} for positive commands than for negative "
     "ones & {b%higher|lower} at {U}, its largest command in the log, than {least}]",
     ratio=_end_to_end,
-    targets=places.inputs,
+    targets=_one_or_alike,
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),
     vague=0.5,

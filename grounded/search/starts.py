@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.places import true_values
 from grounded.search.planner import Planner, predicted
 from grounded.search.scatter import beyond_noise
 
@@ -71,11 +72,14 @@ class Starts:
 def worth_of_start(planner: Planner, policy: Policy, off: Array) -> float:
     """Return by how much a start that is off s_0 by `off` (n,) changes the utility in the model.
 
-    NaN if the model fails from s_0, -inf if it fails from there only.
+    True values behind late or filtered logs are off by as much: else the log would soon show the
+    robot at s_0. NaN if the model fails from s_0, -inf if it fails from there only.
     """
     problem = planner.feeding_back((policy,)).plan.problem(exact=True)
-    moved = problem.start.copy()
-    moved[: len(off)] += off
+    moved, names, n = problem.start.copy(), planner.plan.model.state_names, len(off)
+    moved[:n] += off
+    for memory, logged in true_values(names, names[n:]).items():
+        moved[memory] += off[logged]
     with np.errstate(all="ignore"):
         from_there, from_s_0 = (
             predicted(replace(problem, start=start), policy).utility

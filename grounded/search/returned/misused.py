@@ -55,17 +55,15 @@ class Way:
 
     policy: Policy  # as it acts on what the program passes
     said: str  # what that means, and the remedy
-    names: tuple[str, ...] = ()  # states that are passed multiplied, or in each other's place
+    names: tuple[str, ...] = ()  # states that are passed multiplied, or in another's place
     factor: float = 1.0
-    exchanged: bool = False
+    order: tuple[str, ...] = ()  # all states, as they are passed; () if in the right order
 
     def passed(self, trial: Trial) -> Trial:
         """Return a trial with its states as the program passed them."""
-        if not self.exchanged:
+        if not self.order:
             return multiplied(trial, self.names, self.factor) if self.names else trial
-        i, j = (trial.state_names.index(name) for name in self.names)
-        order = np.arange(len(trial.state_names))
-        order[[i, j]] = j, i
+        order = [trial.state_names.index(name) for name in self.order]
         return replace(trial, states=trial.states[:, order])
 
     @property
@@ -74,7 +72,9 @@ class Way:
         return len(self.names)
 
 
-def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
+def misused(
+    task: Task, own: Candidate, trial: Trial, plain: Following, *, acts: bool = False
+) -> str:
     """Return what the program passed to its candidate that reproduces the commands, and the remedy.
 
     Args:
@@ -82,13 +82,15 @@ def misused(task: Task, own: Candidate, trial: Trial, plain: Following) -> str:
         own: the candidate.
         trial: the run, not longer than the horizon.
         plain: the comparison of its commands with those on the logged states and times.
+        acts: whether other commands than those held before a run are sent elsewhere in its log.
 
     Returns:
         The end of a sentence about its commands; "" if nothing reproduces them.
     """
     late, most, found = latest(task), min(LEAVES * plain.error, NEARLY), []
-    held = np.allclose(trial.inputs[0], own.policy.past, rtol=0, atol=1e-9)
-    for way in ways(task.model, own, unsent=held):
+    held = np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
+    over = bool(held.all()) and not acts
+    for way in ways(task.model, own, unsent=bool(held[0]), over=over):
         fit = follows(way.policy, way.passed(trial), late)
         if fit is None or not (fit.alike and fit.error < most):
             continue
@@ -156,13 +158,14 @@ def _beside(trial: Trial, fit: Following) -> bool:
     return bool((np.abs(off) <= CLEAR * fit.fine / FINE).all(axis=1).mean() >= BESIDE)
 
 
-def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:
+def ways(model: Model, own: Candidate, *, unsent: bool, over: bool = False) -> Iterator[Way]:
     """Yield the ways in which a program may have misused its candidate.
 
     Args:
         model: the model with the units of the states.
         own: the candidate.
         unsent: whether the first command is the one held before the run, so that none was sent.
+        over: whether all are.
     """
     policy, name = own.policy, own.id
     for unit, factor in TIMES.items():
@@ -172,7 +175,7 @@ def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:
                 f"they are what {name} sends if the time is passed to `runner.action` in {unit}: "
                 "pass t in seconds since the start of the run",
             )
-    if unsent:
+    if over:
         yield Way(
             _at_times(policy, np.inf),
             f"all are the {_held(model, policy)} that {name} sends once its time is past the end: "
@@ -203,14 +206,34 @@ def ways(model: Model, own: Candidate, *, unsent: bool) -> Iterator[Way]:
             names,
             factor,
         )
-    for one, other in combinations(model.state_names, 2):
+    right = model.state_names
+    for order in _orders(right):
+        moved = tuple(was for was, now in zip(right, order, strict=True) if was != now)
+        passed = f"the states are passed to `runner.action` in the order {', '.join(order)}"
+        if len(moved) == 2:
+            passed = f"{listed(moved)} are passed to `runner.action` in each other's place"
         yield Way(
             policy,
-            f"they are what {name} sends if {one} and {other} are passed to `runner.action` in "
-            f"each other's place: the order is {', '.join(model.state_names)}",
-            (one, other),
-            exchanged=True,
+            f"they are what {name} sends if {passed}: pass them in the order {', '.join(right)}",
+            moved,
+            order=order,
         )
+
+
+def _orders(right: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield wrong orders of states that occur: two exchanged, some of the first ones last, sorted.
+
+    A program has positions before velocities where the model has them after, for example.
+    """
+    found = {right}
+    pairs = combinations(range(len(right)), 2)
+    orders = [tuple({i: j, j: i}.get(k, k) for k in range(len(right))) for i, j in pairs]
+    named = [tuple(right[k] for k in order) for order in orders]
+    named += [right[k:] + right[:k] for k in range(1, len(right))]
+    for order in (*named, tuple(sorted(right))):
+        if order not in found:
+            found.add(order)
+            yield order
 
 
 def _unit(model: Model, names: Sequence[str], factor: float) -> str:

@@ -260,14 +260,22 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
-    """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again."""
-    used = diagnosable(workspace)
+    """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again.
+
+    Raises:
+        GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
+            an adopted delay of that sensor has no rows that show it.
+    """
+    from grounded.instruments.kinematics.rows import kinematic_rows
+    from grounded.instruments.units.mismatch import stop_at_folded
+
+    used, model = diagnosable(workspace), workspace.base_model
     names = named_trials(workspace, names, [trial.id for trial in used])
+    some = [trial for trial in used if not names or trial.id in names]
+    stop_at_folded(model, some, kinematic_rows(model, range(model.n)))
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
     return [
-        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
-        for trial in used
-        if not names or trial.id in names
+        _measured(trial, [name for name in guessed[trial.id].split(",") if name]) for trial in some
     ]
 
 

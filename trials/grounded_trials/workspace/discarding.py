@@ -87,5 +87,7 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
         read_otherwise(meta, workspace.log_mapping)
         or any(one.mend for one in log_faults(workspace, interpolate_gaps(trial).trial))
     ):
-        return again(workspace, meta, trial.candidate)
+        own = standing_in(workspace).outstanding if trial.candidate else None
+        waits = own is not None and own.id == trial.candidate
+        return again(workspace, meta, trial.candidate, waits=waits)
     return status_of(workspace, standing_in(workspace)).then if trial.candidate else None

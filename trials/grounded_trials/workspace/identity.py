@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate
 from grounded.task import Task
@@ -311,3 +313,24 @@ def stored_candidate(data: bytes, identity: str) -> StoredCandidate:
     """Decode a candidate as `candidate_of`, with its kind, its task and the hash of the file."""
     candidate, meta = candidate_of(data, identity)
     return StoredCandidate(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))
+
+
+def other_task(task: Task, made: Candidate) -> str:
+    """Return in what a task differs from that of a candidate, as far as the candidate shows it.
+
+    Args:
+        task: the present task.
+        made: a candidate of another one, for a model with the same states and inputs.
+    """
+    policy, then = made.policy, made.predicted_states[0]
+    ends = zip(policy.low, policy.high, strict=True)
+    told = [
+        f"limits of {name}: [{low:g}, {high:g}] then"
+        for j, (name, (low, high)) in enumerate(zip(task.model.input_names, ends, strict=True))
+        if not np.allclose((low, high), (task.low[j], task.high[j]))
+    ]
+    if policy.horizon != task.horizon:
+        told.append(f"a horizon of {policy.horizon} steps then")
+    if not np.allclose(then, task.start):
+        told.append("another start")
+    return "; ".join(told) or "another target, reward or feedback"

@@ -104,10 +104,15 @@ def changed_since(
     return found
 
 
-def again(workspace: Folder, meta: Mapping[str, str], candidate: str) -> NextCommand:
-    """Return the command that ingests a trial's log again."""
+def again(
+    workspace: Folder, meta: Mapping[str, str], candidate: str, *, waits: bool = False
+) -> NextCommand:
+    """Return the command that ingests a trial's log again.
+
+    If its candidate waits for a trial, it needs no name: it is recognised, or the log is refused.
+    """
     what = ("--candidate", candidate) if candidate else ("--data",)
-    return NextCommand("ingest", (_log_of(workspace, meta), *what))
+    return NextCommand("ingest", (_log_of(workspace, meta), *(what if not waits else ())))
 
 
 def last_again(workspace: Folder, trials: Sequence[StoredTrial]) -> NextCommand | None:

@@ -37,7 +37,7 @@ from grounded_trials.store.store import Stored
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
+from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
@@ -281,8 +281,8 @@ class Check:
         yield from outside_limits(self.workspace.task, made.policy)
         if not self.same_task and not (self.other_task and self._ever_ran):
             yield (
-                "it was made for another task (other target, reward, limits, start, feedback or "
-                f"horizon){', and was not run there' * self.other_task}"
+                f"it was made for another task ({other_task(self.workspace.task, made)})"
+                f"{', and was not run there' * self.other_task}"
             )
         elif self.void:
             yield "it was not run and is void: the model was changed since it was made"

@@ -27,7 +27,14 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.candidates.standing_without import asked_again
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, ROWS, sha256
+from grounded_trials.workspace.identity import (
+    ESTIMATED_WITH,
+    LASTED,
+    READ_BY,
+    ROWS,
+    other_task,
+    sha256,
+)
 from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.stored_before import (
     Aside,
@@ -166,12 +173,12 @@ def _check_candidate(
             "to use it for fitting and diagnosis"
         )
     own = workspace.task.hash
-    _, meta = workspace.candidate(candidate)
+    made, meta = workspace.candidate(candidate)
     if meta.get("task") != own or task not in ("", own):
         raise GroundedError(
-            f"{path} ran {candidate} for another task (other target, reward, limits, start or "
-            "horizon); its utility can't be compared. Ingest it with --data to use it for fitting "
-            "and diagnosis"
+            f"{path} ran {candidate} for another task ({other_task(workspace.task, made)}); its "
+            "utility can't be compared. Ingest it with --data to use it for fitting and diagnosis; "
+            "or change the task back, then ingest it"
         )
     if policy is not None and policy != workspace.candidate_bytes(candidate):
         raise GroundedError(

@@ -60,11 +60,12 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
         task: the task with the control step.
         own: the candidate.
     """
+    acts = not np.allclose(log.whole.inputs, own.policy.past, rtol=0, atol=1e-9)
     for begins in dict.fromkeys([log.first, *log.openings[:TRIED]]):
         if trial := log.trial_from(begins):
             run = trial.until(min(trial.finite_steps, task.horizon))
             plain = follows(own.policy, run, latest(task))
-            if plain and not plain.beyond and (told := misused(task, own, run, plain)):
+            if plain and not plain.beyond and (told := misused(task, own, run, plain, acts=acts)):
                 return told
     return ""
 
@@ -118,9 +119,9 @@ def _left(log: Recording, own: Candidate, way: Way, at: float) -> float:
 def _as_passed(log: Recording, way: Way) -> Recording:
     """Return a log with its states as the program passed them."""
     series = dict(log.series)
-    if way.exchanged:
-        one, other = way.names
-        series[one], series[other] = series[other], series[one]
+    if way.order:
+        given = zip(way.policy.state_names, way.order, strict=True)
+        series |= {name: log.series[passed] for name, passed in given}
     else:
         for name in way.names:
             spec = series[name].spec

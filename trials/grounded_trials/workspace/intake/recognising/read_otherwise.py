@@ -5,9 +5,10 @@ Tried are: another rate, another unit, two signals in each other's columns, and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,15 +31,20 @@ from grounded.search.returned.who_drove import FINE, Following, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.intake.locating.missed_steps import begins_late
 from grounded_trials.workspace.intake.locating.run_start import TRIED, Recording, recording
 from grounded_trials.workspace.user_files.config import FILE
+
+if TYPE_CHECKING:
+    from grounded.instruments.predictions.mistaken import Mistake
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged
 CLEARLY = 0.5  # [nats] by which an exchange must bring a log nearer to the prediction than a unit
 PACES = (2.0, 0.5)  # rates of a recording that are tried
+
+Proven = Callable[["Mistake"], Sequence[str]]  # trials, read by the same [log], without a fault
 
 
 def pace_of(log: Recording, task: Task, own: Candidate) -> float | None:
@@ -102,8 +108,17 @@ class Misled:
     rerun: bool = False  # the robot did not run its candidate as it should: run it again
 
 
-def misled(log: Recording | None, task: Task, own: Candidate) -> Misled | None:
-    """Return another fault of a log that hides its run, or None."""
+def misled(
+    log: Recording | None, task: Task, own: Candidate, proven: Proven = lambda fault: ()
+) -> Misled | None:
+    """Return another fault of a log that hides its run, or None.
+
+    Args:
+        log: a log in which no run of the candidate was found.
+        task: the task.
+        own: the candidate.
+        proven: which stored trials, read by the same [log], contradict an exchange.
+    """
     if log is None:
         return None
     if late := begins_late(log, own.policy):
@@ -111,13 +126,27 @@ def misled(log: Recording | None, task: Task, own: Candidate) -> Misled | None:
             f"its first row is {late:.3g} s after {own.id} began: record from before the run, and "
             "cut nothing off; without its beginning the run can't be judged"
         )
-    if found := _exchange(log, task, own):
-        return _in_other_column(log, task, own, found)
+    if swap := exchanged_in(log, task, own, proven):
+        return swap
     off = _off_zero(task, offset_in(log, task, own))
     return Misled(off) if off else None
 
 
-def crossed(log: Recording | None, task: Task, own: Candidate, other: Candidate) -> Misled | None:
+def exchanged_in(
+    log: Recording, task: Task, own: Candidate, proven: Proven = lambda fault: ()
+) -> Misled | None:
+    """Return that a log is a candidate's run with two columns exchanged, or None; see `misled`."""
+    found = _exchange(log, task, own)
+    return _in_other_column(log, task, own, found, proven) if found else None
+
+
+def crossed(
+    log: Recording | None,
+    task: Task,
+    own: Candidate,
+    other: Candidate,
+    proven: Proven = lambda fault: (),
+) -> Misled | None:
     """Return that a log is a run with two columns exchanged, not another candidate's; or None.
 
     Candidates that are nearly the same send nearly the same on exchanged columns, too. With the
@@ -128,6 +157,7 @@ def crossed(log: Recording | None, task: Task, own: Candidate, other: Candidate)
         task: the task.
         own: the candidate that should have run; its run is sought first.
         other: the candidate that seems to have run, perhaps with exchanged columns as well.
+        proven: as in `misled`.
     """
     run = _run_in(log, other.policy)
     plain = run and follows(other.policy, run.until(other.policy.horizon), 0)
@@ -139,35 +169,57 @@ def crossed(log: Recording | None, task: Task, own: Candidate, other: Candidate)
     whose, best = min(found, key=lambda each: each[1].error)
     if plain.error < WORSE * (best.error + FINE) or best.far > apart(other, run):
         return None
-    return _in_other_column(log, task, whose, best)
+    return _in_other_column(log, task, whose, best, proven)
 
 
-def _in_other_column(log: Recording, task: Task, own: Candidate, found: Exchange) -> Misled:
-    """Return what shows that two columns are exchanged, and whether the robot has them so, too.
+def _in_other_column(
+    log: Recording, task: Task, own: Candidate, found: Exchange, proven: Proven
+) -> Misled:
+    """Return what shows that two columns are exchanged: in the log, or by the robot's program.
 
-    If the model predicts the motion with the commands as they are read, the commands were sent to
-    each other's motor: with the log corrected, the robot would be said to exchange them.
+    If the model predicts the motion with the columns as they are read, the log is right, and the
+    program passed them to the policy, or on to the motors, in each other's place. (With both [log]
+    and the wires exchanged a log looks the same, unless [log] read earlier trials well.)
     """
     from grounded.instruments.predictions.mistaken import Mistake, contradicted
 
     (a, b), model = found.pair, task.model
     of = "state" if a in model.state_names else "input"
+    tables = f"[log.{of}.{a}] and [log.{of}.{b}]"
+    names = model.state_names if of == "state" else model.input_names
+    pair = (names.index(a), names.index(b))
+    fault = Mistake(states=(pair,)) if of == "state" else Mistake(inputs=pair)
+    run = log.trial_from(found.begins)
+    if run is None or not contradicted(model, run.until(run.known_steps), range(model.n), fault):
+        return Misled(
+            f"{a} and {b} seem to be in each other's column: only with them exchanged are its "
+            f"commands those of {own.id}. Exchange the paths in {tables}, or the column headers "
+            "in the log"
+        )
     said = (
-        f"{a} and {b} seem to be in each other's column: only with them exchanged are its commands "
-        f"those of {own.id}. Exchange the paths in [log.{of}.{a}] and [log.{of}.{b}], or the "
-        "column headers in the log"
+        f"only with {a} and {b} exchanged are its commands those of {own.id}, but the robot moved "
+        "as the log says"
     )
-    run = log.trial_from(found.begins) if of == "input" else None
-    if run is None:
-        return Misled(said)
-    fault = Mistake(inputs=(model.input_names.index(a), model.input_names.index(b)))
-    if not contradicted(model, run.until(run.known_steps), range(model.n), fault):
-        return Misled(said)
-    return Misled(
-        f"{said}. But the robot moved as if {a} was sent as {b}, and the reverse: swap its wires, "
-        f"or the outputs of its program, back and run {own.id} again",
-        rerun=True,
-    )
+    if right := proven(fault):
+        show = "shows" if len(right) == 1 else "show"
+        said += f", and {ranges(right)}, read in the same way, {show} no exchange"
+    if of == "state":
+        how = (
+            f"so the log is right, and its program passes {a} and {b} to `runner.action` in each "
+            f"other's place: the order is {', '.join(names)}. Mend that"
+        )
+    elif right:
+        how = (
+            f"so the log is right, and its program sends {a} as {b}, and the reverse. Swap its "
+            "outputs back"
+        )
+    else:
+        how = (
+            f"so its program sends {a} as {b}, and the reverse (swap its outputs back); or both "
+            f"[log] and the robot have them exchanged (exchange the paths in {tables}, and swap "
+            "its wires back). Mend that"
+        )
+    return Misled(f"{said}: {how} and run {own.id} again", rerun=True)
 
 
 def zero_in(

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
@@ -48,6 +50,7 @@ from grounded_trials.workspace.intake.recognising.misused_run import exactly_mis
 from grounded_trials.workspace.intake.recognising.read_otherwise import (
     Misled,
     crossed,
+    exchanged_in,
     misled,
     pace_of,
     rather_exchanged,
@@ -59,7 +62,11 @@ from grounded_trials.workspace.intake.remarks.control_loop import old_samples
 from grounded_trials.workspace.intake.remarks.log_faults import (
     dead_sensors,
     mistaken_in,
+    without,
 )
+
+if TYPE_CHECKING:
+    from grounded.instruments.predictions.mistaken import Mistake
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
@@ -76,6 +83,8 @@ def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
             candidate, or data.
     """
     if not error.best:
+        read = read_log_file(workspace, path, None, True)
+        _refuse_earlier(workspace, path, read.log and read.log.recording, read.trial)
         raise error
     try:
         read = read_log_file(workspace, path, error.best, False)
@@ -136,11 +145,16 @@ def recognised(
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell.steps, "") if fell and fell.steps in accepted else read
     rival = next((one for one in (*earlier, *candidates) if one.id == other), None)
-    swap = crossed(log, task, own, rival) if rival else None
+    unstored = replace(read.trial, id="")
+
+    def proven(fault: Mistake) -> list[str]:
+        return without(workspace, unstored, fault)
+
+    swap = crossed(log, task, own, rival, proven) if rival else None
     if swap and candidate is None:
         raise _unreadable(path, ran, [swap.said], _then(again, swap))
     if rival in earlier and candidate is None:
-        raise _of_earlier_task(path, other)
+        raise _of_earlier_task(workspace, path, other)
     units, by = other_units(task, whole, own, seen.ran)
     units = units if not other and not _guessed(log) & {*units} else ()
     if read.log and not why and not units:
@@ -167,19 +181,21 @@ def recognised(
         units, by = unit_of(log, task, own)
     if log and units and why and rather_exchanged(log, task, own, units, by):
         units = ()
-    if fell and not (units or slow or misled(log, task, own)):
+    if fell and not (units or slow or misled(log, task, own, proven)):
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"multiply the stamps by {slow:g} and ingest it again"
     )
-    turned = ""
+    turned, exchange = "", None
     if log and whole.inputs.any() and not (units or slow or other or (found and found.opens_alike)):
-        turned = turned_in(workspace, log, ran)
+        exchange = exchanged_in(log, task, own, proven)  # one turns inputs round, as the model sees
+        turned = "" if exchange else turned_in(workspace, log, ran)
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
-        hides = swap if other else None if turned or gone else misled(log, task, own)
+        hides = exchange or misled(log, task, own, proven)
+        hides = swap if other else None if turned or gone else hides
         also = turned or gone or (hides.said if hides else "")
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
@@ -227,7 +243,8 @@ def recognised(
         odd += [*dead_sensors(workspace.base_model, whole)]
     named = [*(misread(read.log) if read.log else ())]
     named += [one.told(known, own=read.own) for one in odd]
-    hides = None if named or other or seen.silent else misled(log, task, own)
+    unseen = named or other or seen.silent
+    hides = None if unseen else exchange or misled(log, task, own, proven)
     if hides:
         named, again = [hides.said], _then(again, hides)
     if named:
@@ -269,14 +286,15 @@ def _then(again: NextCommand, fault: Misled) -> NextCommand:
 def _refuse_earlier(workspace: Folder, path: Path, log: Recording | None, trial: Trial) -> None:
     """Raise OfEarlierTask if a log is the run of a candidate of an earlier task."""
     if left := of_earlier_task(workspace, log, trial):
-        raise _of_earlier_task(path, left)
+        raise _of_earlier_task(workspace, path, left)
 
 
-def _of_earlier_task(path: Path, ran: str) -> OfEarlierTask:
+def _of_earlier_task(workspace: Folder, path: Path, ran: str) -> OfEarlierTask:
+    was = other_task(workspace.task, workspace.candidate(ran)[0])
     return OfEarlierTask(
-        f"{path} ran {ran}, which was made for an earlier task (other target, reward, limits, "
-        "start or horizon): its utility can't be compared. Ingest it with --data for fitting "
-        "and diagnosis, and run a candidate of this task",
+        f"{path} ran {ran}, which was made for an earlier task ({was}): its utility can't be "
+        "compared. Ingest it with --data for fitting and diagnosis, and run a candidate of this "
+        "task; or change the task back, then ingest it",
         NextCommand("ingest", (str(path), "--data")),
     )
 

@@ -37,6 +37,7 @@ from grounded_trials.workspace.intake.remarks.control_loop import steps_skipped
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
+from grounded_trials.workspace.read_before import paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -112,6 +113,12 @@ def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
     ]
     right, wrong = ([name for name, sign in each if sign == s] for s in (1, -1))
     again = f"mend it and run {trial.candidate} again" if trial.candidate else "mend it"
+    if right and trial.candidate and _elsewhere(workspace, found.input, right):
+        return Asked(
+            f"{found.said}. [log.input.{found.input}] reads another column now than for "
+            f"{ranges(right)}: is that right? If not, `discard {trial.id}`, correct it and ingest "
+            "the log again; if it is, `propose` goes on"
+        )
     if right:
         wired = f"Is it wired, or its sign switched, otherwise than in {ranges(right)}?"
         if not trial.candidate:
@@ -125,6 +132,15 @@ def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
     return Asked(
         f"{found.said}{like}. {wired} Then `discard {trial.id}`, {again}; if not, `propose` goes on"
     )
+
+
+def _elsewhere(workspace: Folder, name: str, trials: Sequence[str]) -> bool:
+    """Return whether [log] read an input of all of some trials from another column than now."""
+    if workspace.log_mapping is None:
+        return False
+    own = paths_of(read_by(workspace.log_mapping), [name])
+    metas = {one.stored.id: one.meta for one in workspace.whole_trials()}
+    return all(paths_of(metas[one], [name]) not in ((), own) for one in trials if one in metas)
 
 
 def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Asked | None:

@@ -147,7 +147,7 @@ def _on_the_robot(workspace: Folder, trial: Trial, fault: Mistake) -> str:
     """
     parts = ("wires", "sends or logs") if fault.inputs else ("sensors", "reads or logs")
     where = "the robot's {}, or what its program {},".format(*parts)
-    if right := _without(workspace, trial, fault):
+    if right := without(workspace, trial, fault):
         show = "shows" if len(right) == 1 else "show"
         return f"{ranges(right)}, read in the same way, {show} no exchange. Swap {where} back"
     if not _as_sent(workspace, trial, fault):
@@ -158,7 +158,7 @@ def _on_the_robot(workspace: Folder, trial: Trial, fault: Mistake) -> str:
     )
 
 
-def _without(workspace: Folder, trial: Trial, fault: Mistake) -> list[str]:
+def without(workspace: Folder, trial: Trial, fault: Mistake) -> list[str]:
     """Return the other trials that were read in the same way and contradict an exchange."""
     from grounded.instruments.predictions.mistaken import contradicted
     from grounded_trials.workspace.last_diagnosis import diagnosable
