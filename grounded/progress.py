@@ -63,8 +63,8 @@ class Stages:
             return
         text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
         if self.end is not None and (left := _round(self.end - taken)) > 0:
-            most = "" if self.open_ended else "up to "
-            text += f", {most}about {duration(left).replace('.0 ', ' ')} left"
+            most, more = ("", ", more if more is found") if self.open_ended else ("up to ", "")
+            text += f", {most}about {duration(left).replace('.0 ', ' ')} left{more}"
         self.tell(text)
 
 

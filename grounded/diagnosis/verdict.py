@@ -141,7 +141,7 @@ def verdict(
         {row.effect: row.params for row in ranking},
     )
     words = [sentence(told), improvement(rows, tracked), worsened(rows)]
-    words += [runaway(rows), wider(claims.parameters())]
+    words += [runaway(rows), wider(claims.parameters()), *_unneeded(claims.parameters(), adopted)]
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [_combined(claims.data.model, one) for one in combinations]
     words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
@@ -284,6 +284,25 @@ def _geared(model: Model, claimed: Sequence[str]) -> list[str]:
         f"same in any log: measure how far {name} really moves."
         for name, rate in pairs.items()
         if f"sensor_scale:{name}" in claimed
+    ]
+
+
+def _unneeded(known: Mapping[str, Estimate], adopted: Collection[str]) -> list[str]:
+    """Return a sentence for each adopted effect whose one calibrated value may be zero.
+
+    What an earlier diagnosis took for a drift of the speed was a thruster's weaker way astern.
+    """
+    from grounded.diagnosis.validation.motions import KNOWN
+    from grounded.effects import param_name
+
+    of = {name: effect_of(name, adopted) for name in known}
+    owned = {one: [name for name, own in of.items() if own == one] for one in {*of.values()} - {""}}
+    return [
+        f"The adopted {effect} may be none beside these "
+        f"({name.removeprefix(param_name(effect, ''))} = {give_or_take(known[name])}): remove it "
+        "from [model] effects, then diagnose again to see whether it is missed."
+        for effect, (name, *more) in sorted(owned.items())
+        if not more and abs(known[name].value) < KNOWN * known[name].std
     ]
 
 

@@ -34,7 +34,7 @@ from grounded.diagnosis.ruler_words import (
 )
 from grounded.diagnosis.tables import effect_table, error_table, larger
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
-from grounded.diagnosis.verdict import verdict
+from grounded.diagnosis.verdict import _unneeded, verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from small_tasks import cart_task
@@ -402,3 +402,18 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
     assert "same inputs" in by_hand and "best" not in by_hand
     assert "same inputs" not in another_look(task, [ran(1, ""), ran(1, "")], "x")
     assert next_trial(_claims(), by_hand, ()) == by_hand
+
+
+def test_an_adopted_effect_that_may_be_none_is_told():
+    """A boat's drift of the speed, adopted at 0.181 +- 0.027, was 0.050 +- 0.079 later."""
+    adopted = ("offset:u", "joint_friction:t1<-q1")
+    known = {
+        "offset_u_c": Estimate(0.05, 0.079, None, "m/s^2"),
+        "m": Estimate(0.1, 1.0, None, "kg"),
+        "joint_friction_t1_from_q1_c": Estimate(0.0, 0.1, None, "N m"),
+        "joint_friction_t1_from_q1_b": Estimate(0.2, 0.01, None, "N m s/rad"),
+    }
+    (told,) = _unneeded(known, adopted)
+    assert holds(told, "offset:u", "c = 0.0500 +- 0.079 m/s^2", "remove it from [model] effects")
+    assert not _unneeded({"offset_u_c": Estimate(0.05, 0.01, None, "m/s^2")}, adopted)
+    assert not _unneeded(known, ())

@@ -108,6 +108,40 @@ def test_the_cause_is_found_with_its_size(model, truth, effect, values):
         assert found.ranking[0].params[name].value == pytest.approx(value, rel=0.1, abs=0.02)
 
 
+boat = Model(
+    name="boat",
+    states={"v": "m/s", "r": "rad/s", "psi": "rad"},
+    inputs={"left": "1", "right": "1"},
+    params={"k": Param(1.0, "m/s^2", 0.2, 4.0), "arm": Param(1.5, "1/m", 0.3, 6.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "v": p.k * (a.left + a.right) - 0.6 * s.v,
+        "r": p.k * p.arm * (a.right - a.left) - 1.1 * s.r,
+        "psi": s.r,
+    },
+)
+
+
+@pytest.mark.slow
+def test_thrusters_that_are_weaker_astern_are_named_together():
+    """One curve alone explains too little: a drift of the speed was claimed in its place."""
+    rng, astern, trials = np.random.default_rng(5), 0.6, []
+    for _ in range(3):
+        sent = np.repeat(rng.uniform(-0.9, 0.9, (20, 2)), 8, axis=0)
+        got, x = np.where(sent < 0, astern, 1.0) * sent, [np.zeros(3)]
+        for u in got:
+            after = boat.system.step(x[-1][None], u[None], boat.values, DT)[0]
+            x.append(after + 1e-3 * rng.standard_normal(3))
+        seen = np.array(x) + 4e-3 * rng.standard_normal((len(x), 3))
+        trials.append(Trial(seen, sent, DT, boat.state_names, boat.input_names))
+    found = gr.diagnose(boat, trials)
+    assert found.effects[0] == "input_curve:left+right"
+    assert not any(name.startswith(("offset", "input_bias")) for name in found.effects)
+    ahead = found.ranking[0].params["a"]  # beside a gain
+    assert ahead.value == pytest.approx((1 - astern) / (1 + astern), abs=4 * ahead.std)
+    assert "the inputs left and right" in found.sentence and "drift" not in found.sentence
+
+
 def test_an_adopted_sensor_lag_is_a_filter():
     effect = Library().effect("sensor_lag:v", car)
     assert isinstance(effect.family, SensorLagFamily)

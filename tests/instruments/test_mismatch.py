@@ -221,15 +221,25 @@ def test_one_trial_that_is_off_is_named_alone():
     assert "t0002" in one.finding and one.log == ""
 
 
-def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
-    def folded(x: Array) -> Array:
-        y = np.array(x)
-        steps = np.rad2deg(np.diff(x[:, 2], prepend=0.0))
-        y[:, 2] = np.cumsum(steps - 2 * np.pi * np.rint(steps / (2 * np.pi)))
-        return y
+def folded(x: Array) -> Array:
+    """Return states whose heading was in degrees and was unwrapped as radians."""
+    y = np.array(x)
+    steps = np.rad2deg(np.diff(x[:, 2], prepend=0.0))
+    y[:, 2] = np.cumsum(steps - 2 * np.pi * np.rint(steps / (2 * np.pi)))
+    return y
 
+
+def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
     with pytest.raises(GroundedError, match=r"scale in \[log\.state\.psi\] by 0\.0174532"):
         preflight(BOAT, logged(BOAT, folded))
+
+
+def test_of_several_trials_the_one_with_a_folded_heading_is_named():
+    """A rover's later log alone was in degrees: `no fault found in the sensors`."""
+    trials = [*logged(BOAT)[:2], logged(BOAT, folded)[2]]
+    with pytest.raises(GroundedError, match="in trial t0002 psi is in degrees") as error:
+        preflight(BOAT, trials)
+    assert error.value.then is not None and error.value.then.arguments == ("t0002",)
 
 
 def test_what_no_single_change_mends_is_stated():

@@ -13,6 +13,7 @@ from grounded.search.planner import Planner
 from grounded.search.standing import standing
 from grounded.search.starts import Starts, worth_of_start
 from grounded.search.step.step_size import SearchOptions, losers_of
+from grounded_trials.workspace.adopted import planner_of
 from small_tasks import cart_task, drive, other
 
 TASK = cart_task()
@@ -116,3 +117,12 @@ def test_the_candidate_whose_start_matters_more_is_run_again(story):
     assert to_settle(best, twice, 2) is best
     policy = doubt.candidate.policy
     assert worth_of_start(PLANNER, policy, OFF) < 0 == worth_of_start(PLANNER, policy, 0 * OFF)
+
+
+def test_a_start_behind_a_late_sensor_costs_as_much(story):
+    """Only the log began off the start: a rover's start was told to matter little."""
+    policy = story.candidates[1].policy
+    late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])
+    assert late.plan.model.n > TASK.model.n
+    plain, behind = (worth_of_start(planner, policy, OFF) for planner in (PLANNER, late))
+    assert behind == pytest.approx(plain, rel=0.3) and behind < 0

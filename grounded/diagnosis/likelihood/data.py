@@ -194,13 +194,13 @@ def prepare(
     slow = simulated(model)
     state_at, step_at, valid, trial_of = _cut(lengths, SHORTER_RUN if slow else LONGEST_RUN)
     some = MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)
-    # runs of a few trials are kept if possible: repeats, which show the noise, are among them
     most = max(1, len(step_at) if len(step_at) <= min(SESSION, ROOMY * some) else int(some))
     begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
     if slow:
         few = max(PIECES, min(len(begins), BEGINNINGS), SIMULATED // step_at.shape[1])
         most = min(most, few)
-    keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)
+    twice = _repeats([trial.candidate for trial, _ in used])
+    keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most, twice)
     return Data(
         model=model,
         dt=dt,
@@ -259,19 +259,30 @@ def _cut(lengths: Any, longest: int) -> tuple[Any, Any, Array, Any]:
     return state_at, step_at, valid, np.array([i for i, *_ in pieces])
 
 
-def _informative(signals: Sequence[Array], begins: Any, most: int) -> Any:
+def _repeats(candidates: Sequence[str]) -> list[int]:
+    """Return the latest two trials of one candidate, as indices; [] if none ran twice."""
+    for k in range(len(candidates) - 1, 0, -1):
+        if candidates[k] and candidates[k] in candidates[:k]:
+            return [k - 1 - candidates[:k][::-1].index(candidates[k]), k]
+    return []
+
+
+def _informative(signals: Sequence[Array], begins: Any, most: int, twice: Sequence[int]) -> Any:
     """Select at most `most` runs, those in which the signals (B, any, k) vary most.
 
     A signal counts by its variance within the run, relative to its variance over all runs. One run
     is taken from each group of neighbouring runs, so that all trials and all of their duration are
     represented. Some of the runs kept are `begins`, those that a trial begins with, because whole
-    trials are predicted from there.
+    trials are predicted from there. The beginnings of the trials `twice`, repeats of one run, are
+    among them: they show the noise.
     """
     count = len(signals[0])
     if count <= most:
         return np.arange(count)
-    some = np.linspace(0, len(begins) - 1, min(len(begins), BEGINNINGS, max(1, most // 2)))
-    first = begins[some.astype(int)]
+    many = min(len(begins), BEGINNINGS, max(1, most // 2))
+    own = list(twice[: len(twice) * (many >= len(twice))])
+    some = np.linspace(0, len(begins) - 1, max(many - len(own), 1)).astype(int)
+    first = begins[list(dict.fromkeys([*own, *some.tolist()]))[:many]]
     parts = [x.var(axis=1) / np.maximum(x.var(axis=(0, 1)), 1e-300) for x in signals]
     moves = np.concatenate(parts, axis=1).mean(axis=1)
     others, left = np.setdiff1d(np.arange(count), first), most - len(first)

@@ -49,6 +49,15 @@ def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
     assert prepare(predictor.data.model, trials).skipped == 8  # too much memory for all
 
 
+def test_of_long_data_two_runs_of_one_candidate_are_kept_from_their_beginning(known):
+    """`How much of that is noise is not known: repeat one run`, where two had been run twice."""
+    predictor, _, trials = known
+    ran = [replace(t, candidate=c) for t, c in zip(trials, ["a", "b", "b", "c"], strict=True)]
+    data = prepare(predictor.data.model, ran)
+    begins = data.trial_of[data.time[0] == 0.0]
+    assert {1, 2} <= {*begins.tolist()} and len(data.valid) == 7
+
+
 def test_a_utility_is_predicted_from_the_trials_own_start(known):
     predictor, fit, trials = known
     task = pushed_cart_task(predictor.data.model, STEPS)

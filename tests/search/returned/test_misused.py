@@ -9,7 +9,7 @@ from facts import holds
 from grounded.onboard import Runner
 from grounded.search.ask_tell import Search
 from grounded.search.returned.misused import misused
-from grounded.search.returned.who_drove import follows, suspicion
+from grounded.search.returned.who_drove import follows, latest, suspicion
 from grounded.trial import Trial
 from small_tasks import rover_task
 
@@ -38,6 +38,7 @@ WAYS = {
     "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, ("psi", "degrees", "pass rad")),
     "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, ("x", "y", "mm", "pass m")),
     "order": ({"states": lambda x: x[[1, 0, 2]]}, ("x and y", "order")),
+    "last first": ({"states": lambda x: x[[2, 0, 1]]}, ("order psi, x, y", "order x, y, psi")),
     "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),
     "minutes": ({"times": lambda t: t / 60}, ("in minutes", "seconds")),
     "clock": ({"times": lambda t: 1.7e9 + t}, ("speed = 0.5 m/s", "a clock")),
@@ -54,6 +55,15 @@ def test_what_the_program_passed_is_named(waiting, way):
     trial = driven(task, made, **wrong)
     found = suspicion(task, trial, made, [made])
     assert holds(found.why, *named, "runner.action")
+
+
+def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
+    """A rover's states in another order: its log ended in a second of zeros, "all are 0"."""
+    task, made = waiting
+    trial = driven(task, made, times=lambda t: 1.7e9 + t)
+    plain = follows(made.policy, trial, latest(task))
+    assert "past the end" in misused(task, made, trial, plain)
+    assert "past the end" not in misused(task, made, trial, plain, acts=True)
 
 
 def test_feedback_on_another_pose_is_not_called_no_feedback(waiting):

@@ -9,6 +9,7 @@ import pytest
 from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError, NextCommand
+from grounded.onboard import Runner
 from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
@@ -288,3 +289,54 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
         .replace("/csv.A", "/csv.starboard")
     )
     assert Workspace(w.folder).ingest(path).candidate == plan.id
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before):
+    """`Exchange the paths in [log]`, said of a truthful log: obeyed, it spoilt all later runs."""
+    if before:
+        w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
+    wired = replace(
+        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
+    )
+    ran = Plant(wired).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
+    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs[:, ::-1]])
+    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    said = str(refused.value)
+    assert holds(said, "moved as the log says", f"run {plan.id} again")
+    assert ("the log is right" in said) == before == ("[log.input" not in said)
+    assert ("t0001" in said) == before and "column" not in said
+    assert refused.value.then == NextCommand("next", ("LOG",))
+
+
+def test_states_that_a_program_exchanged_are_mended_there(w, tmp_path):
+    w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
+    runner, x, rows = Runner(plan.policy), w.task.start.copy(), []
+    for k in range(w.task.horizon):
+        seen = x + RNG.normal(0, 2e-3, 3)
+        u = runner.action(k * w.task.dt, seen[[1, 0, 2]])
+        rows.append([k * w.task.dt, *seen, *u])
+        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+    np.savetxt(path, rows, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "v and r", "`runner.action`", "the order", "v, r, psi")
+    assert "[log" not in str(refused.value)
+
+
+def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_path, monkeypatch):
+    """`right acted the other way round, with 280 % of its effect. Is it wired the wrong way?`"""
+    plan = w.propose().candidate
+    w.run()
+    trial = read_trial(next((w.folder / "runs").iterdir()))[0]
+    t, path = trial.dt * np.arange(trial.steps), tmp_path / "run.csv"
+    table = np.column_stack([t, trial.states[:-1], trial.inputs])
+    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,starboard,port", comments="")
+    monkeypatch.setattr(recognise, "turned_in", lambda *_: "port acted the other way round")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)

@@ -1,5 +1,6 @@
 """A run that its log hides: each was told as `somebody, or another controller, drove`."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -207,7 +208,7 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     if not waits:
         w.ingest(record(w, tmp_path / "own.csv", own.policy, 0.0, seed=3))
     error = refused(w, run)
-    assert holds(str(error), "ran c0002", "earlier task", "--data")
+    assert holds(str(error), "ran c0002", "earlier task", "another target, reward", "--data")
     assert error.then == NextCommand("ingest", (str(run), "--data"))
     done = grounded("-C", w.folder, "ingest", run, "--data")
     assert done.code == 0, done.err
@@ -246,3 +247,20 @@ def _by_hand(policy):
     """Commands that nobody planned, (H, m)."""
     k = np.arange(policy.horizon)
     return (4 * np.sin(k / 3) * np.sin(k / 11))[:, None]
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_limits_that_were_changed_since_the_export_are_named(w, tmp_path, waits):
+    """A boat's, narrowed after the export: `none is waiting for a trial: name it`."""
+    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
+    low, high = w.task.low[0], w.task.high[0]
+    toml = w.folder / "grounded.toml"
+    written = toml.read_text()
+    toml.write_text(re.sub(r"(?m)^force = \[.*\]", f"force = [{0.8 * low}, {high}]", written))
+    w = Workspace(w.folder)
+    if waits:
+        w.propose()
+    error = refused(w, run)
+    assert holds(str(error), "ran c0002", f"limits of force: [{low:g}, {high:g}] then", "back")
+    toml.write_text(written)
+    assert Workspace(w.folder).ingest(run).candidate == "c0002"

@@ -12,6 +12,7 @@ from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 from grounded_trials.workspace.intake.remarks.log_faults import _degrees
 from ros_bags import rover_bag
+from tests.instruments.test_mismatch import BOAT, folded, logged
 
 CAR = Model(
     states={"psi": "rad", "qz": "1", "z": "m"},
@@ -78,3 +79,12 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
     assert (fault.inputs, fault.factor) == (("rudder",), pytest.approx(57.29578))
     assert fault.said.startswith("rudder ")
     assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program
+
+
+def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
+    """Stored as -59.67, "what the search improves on", it was called an odd run at most."""
+    sound, odd = (logged(BOAT, *fault)[0] for fault in ((), (folded,)))
+    assert not _degrees(BOAT, sound)
+    (fault,) = _degrees(BOAT, odd)
+    assert holds(fault.said, "psi", "degrees", "unwrapped")
+    assert holds(fault.mend, "[log.state.psi]", "0.017453293")

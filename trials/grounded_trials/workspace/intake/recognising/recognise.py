@@ -84,7 +84,7 @@ def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
     """
     if not error.best:
         read = read_log_file(workspace, path, None, True)
-        _refuse_earlier(workspace, path, read.log and read.log.recording, read.trial)
+        _refuse_earlier(workspace, path, read.log.recording if read.log else None, read.trial)
         raise error
     try:
         read = read_log_file(workspace, path, error.best, False)
