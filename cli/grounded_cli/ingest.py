@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import click
@@ -152,6 +153,8 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
             meaning = " than those before it"
         ended = one.utility == float("-inf")
         gained = "no utility" if ended else f"utility {number(one.utility)}"
+        if one.runs > 1 and number(one.mean) != number(one.utility) and math.isfinite(one.mean):
+            gained += f" (mean of its {one.runs} runs: {number(one.mean)})"
         text = f"{gained}, {one.verdict}{_earlier(one) or meaning}"
         if one.verdict == "crashed" and one.then.verb == "discard":
             text = f"no utility: it ended early{meaning}"

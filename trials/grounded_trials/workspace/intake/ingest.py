@@ -78,6 +78,8 @@ class Ingested(Result):
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
     to_settle: str = ""  # the candidate to be run again, if the verdict is "in doubt"
+    mean: float = math.nan  # utility of the candidate's runs, by which it is judged
+    runs: int = 0  # how many these are
     off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
     faults: tuple[str, ...] = ()  # those warnings that say that columns of the log are wrong
     then: NextCommand = PROPOSE
@@ -214,6 +216,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         signals=read.signals,
         verdict=verdict,
         to_settle=tried.to_settle if tried else "",
+        mean=tried.utility if tried else math.nan,
+        runs=len(tried.trials) if tried else 0,
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
