@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.task import Task
@@ -55,7 +56,8 @@ def warnings_about(
             "as ended there"
         )
     if not trial.candidate:
-        return (*found, *_still(whole), *_beyond(workspace, whole, scaled))
+        stood = _halted(workspace, whole)
+        return (*found, *_still(whole), *stood, *_beyond(workspace, whole, scaled))
     if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
@@ -143,6 +145,22 @@ def _still(trial: Trial) -> list[str]:
     return [
         "no state changes in it: was the robot switched on, and are these the columns of its "
         f"sensors? fit and diagnose learn nothing from it; `discard {trial.id}` sets it aside"
+    ]
+
+
+def _halted(workspace: Folder, trial: Trial) -> list[str]:
+    """Return a warning if the robot stood still in data under commands that had moved it before."""
+    from grounded.instruments.predictions.halted import halted
+
+    if (stood := halted(workspace.base_model, trial)) is None:
+        return []
+    to_its_end = stood.ends > trial.known_steps * trial.dt - 1.0
+    when = f"{stood.begins:.1f} s on" if to_its_end else f"{stood.begins:.1f} to {stood.ends:.1f} s"
+    sent = f"{listed(stood.inputs)} change{'s' * (len(stood.inputs) == 1)}"
+    return [
+        f"nothing moves from {when}, though {sent}, and the robot had set off with less: was it "
+        "against a wall or a stop, or switched off? A diagnosis takes that for its physics: "
+        f"cut the log there ([log.span] end), `discard {trial.id}` and ingest it again"
     ]
 
 
