@@ -125,7 +125,10 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             "([search] repeats), to see smaller gains"
         )
     elif max(placed.runs) < FEWEST:
-        does += f" (after {FEWEST + 1} runs, offsets within their scatter are not told again)"
+        does += (
+            f" (after {FEWEST + 1} runs, offsets within their scatter are told only if they explain "
+            "a loss)"
+        )
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
         by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]
