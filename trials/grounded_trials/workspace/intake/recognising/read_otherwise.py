@@ -189,20 +189,21 @@ def _in_other_column(
     names = model.state_names if of == "state" else model.input_names
     pair = (names.index(a), names.index(b))
     fault = Mistake(states=(pair,)) if of == "state" else Mistake(inputs=pair)
-    run = log.trial_from(found.begins)
+    run, right = log.trial_from(found.begins), proven(fault)
+    show = f"{ranges(right)}, read in the same way, show{'s' * (len(right) == 1)} no exchange"
     if run is None or not contradicted(model, run.until(run.known_steps), range(model.n), fault):
+        mend = f"Exchange the paths in {tables}, or the column headers in the log"
+        if right:
+            mend = f"{show}, so [log] is right: exchange the column headers in this log"
         return Misled(
             f"{a} and {b} seem to be in each other's column: only with them exchanged are its "
-            f"commands those of {own.id}. Exchange the paths in {tables}, or the column headers "
-            "in the log"
+            f"commands those of {own.id}. {mend}"
         )
     said = (
         f"only with {a} and {b} exchanged are its commands those of {own.id}, but the robot moved "
         "as the log says"
     )
-    if right := proven(fault):
-        show = "shows" if len(right) == 1 else "show"
-        said += f", and {ranges(right)}, read in the same way, {show} no exchange"
+    said += f", and {show}" * bool(right)
     if of == "state":
         how = (
             f"so the log is right, and its program passes {a} and {b} to `runner.action` in each "

@@ -237,14 +237,14 @@ def recognised(
             NextCommand("export", (ran, "--runner")),
         )
     known = replace(read.trial, id="").until(read.trial.known_steps)
-    odd = []
-    if not seen.silent:  # without them the model can't tell what moves the robot
+    odd, hides = [], exchange  # by its commands, which tell a log's fault from the robot's
+    if not (seen.silent or exchange):  # without them the model can't tell what moves the robot
         odd += [*mistaken_in(workspace, known)]
         odd += [*dead_sensors(workspace.base_model, whole)]
-    named = [*(misread(read.log) if read.log else ())]
+    named = [*(misread(read.log) if read.log and not exchange else ())]
     named += [one.told(known, own=read.own) for one in odd]
-    unseen = named or other or seen.silent
-    hides = None if unseen else exchange or misled(log, task, own, proven)
+    if not (named or other or seen.silent or hides):
+        hides = misled(log, task, own, proven)
     if hides:
         named, again = [hides.said], _then(again, hides)
     if named:

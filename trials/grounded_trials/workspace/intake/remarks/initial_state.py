@@ -126,8 +126,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         )
     elif max(placed.runs) < FEWEST:
         does += (
-            f" (after {FEWEST + 1} runs, offsets within their scatter are told only if they explain "
-            "a loss)"
+            f" (after {FEWEST + 1} runs, offsets within their scatter are told only if they "
+            "explain a loss)"
         )
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
