@@ -169,6 +169,7 @@ def _so_far(
     model replays: it costs less than they do, because their scatter is averaged out), and the rest,
     which is the model's own error if it exceeds the scatter of the runs, if that is known.
     """
+    from grounded.search.certainty import cost_of_start
     from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
 
@@ -189,7 +190,8 @@ def _so_far(
     if not math.isfinite(candidate.base_as_run):
         return f"{apart}{then}"
     elsewhere = began_elsewhere(task, best.trials, best.candidate.predicted_states, estimated)
-    start = same - candidate.base_as_run if elsewhere else 0.0
+    start = cost_of_start(best, candidate) if elsewhere else 0.0
+    start = start if math.isfinite(start) else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
     if candidate.seen and not {trial.id for trial in best.trials} <= {*candidate.seen}:

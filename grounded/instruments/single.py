@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, white_noise
 from grounded.instruments.finding import Finding
 from grounded.model import Model
 from grounded.places import integrals
@@ -16,6 +16,7 @@ from grounded.trial import Trial
 
 STUCK = 8  # equal samples before a jump
 JUMP = 3.0  # the jump, relative to the change that follows
+UNMOVED, SMALL_RATE = 8.0, 0.03  # range of noise, and share of the largest rate, that are rest
 HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
 COARSE = 0.7  # of the rms change from sample to sample: a larger quantum is reported
 CLIPPED = 0.02  # share of samples above which clipping is reported
@@ -64,6 +65,9 @@ def signal_of(model: Model, trials: Sequence[Trial], i: int, shown: Sequence[int
     for one in integrals(model):
         if one.j == i and one.i in shown:
             rests = at_rest([t.states[:, one.i] for t in trials], [one.c * w for w in columns], dt)
+    if not rests and model.states[name].endswith("/s"):
+        places = [k for k in shown if not list(model.states.values())[k].endswith("/s")]
+        rests = [_unmoved(trial.states, i, places) for trial in trials] if places else []
     return Signal(name, model.states[name], bool(model.angle_mask[i]), columns, dt, rests)
 
 
@@ -101,6 +105,21 @@ def at_rest(position: Sequence[Array], velocity: Sequence[Array], dt: float) -> 
                 rest[stay] = np.abs(w[stay]) * length * dt <= 0.5 * count
         found.append(rest)
     return found
+
+
+def _unmoved(x: Array, i: int, places: Sequence[int]) -> Any:
+    """Return where velocity i of a trial (T + 1, n) keeps a value near 0 and no position moves.
+
+    The wheels of a rover at a wall stand still, whatever its camera's noise.
+    """
+    rest, own = np.zeros(len(x), bool), x[:, i]
+    least = UNMOVED * white_noise(x[:, places])
+    small = SMALL_RATE * float(np.nanmax(np.abs(own), initial=0.0))
+    for start, length in zip(*runs(own), strict=True):
+        stay = slice(start, start + length)
+        if length >= STUCK and abs(own[start]) <= small:
+            rest[stay] = bool((np.ptp(x[stay][:, places], axis=0) <= least).all())
+    return rest
 
 
 def _changes(columns: Sequence[Array]) -> Any:

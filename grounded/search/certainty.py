@@ -371,11 +371,24 @@ def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
         if not beyond_noise(one.trials, off, s_0, one.candidate.predicted_states).any():
             return 0.0
         found = [c for t in history if (c := t.candidate).base == one.candidate.id]
-        starts = [c.expected_of_base - c.base_as_run for c in found]
-        known = [start for start in starts if math.isfinite(start)]
+        known = [cost for c in found if math.isfinite(cost := cost_of_start(one, c))]
         return known[-1] if known else math.nan
 
     return worth(before) - worth(after)
+
+
+def cost_of_start(best: Tried, made: Candidate) -> float:
+    """Return what the starts of a candidate's runs cost on average, by the model; NaN if unknown.
+
+    Args:
+        best: the candidate.
+        made: one that was planned from its runs. The model that was grounded on those tells it; of
+            runs that came later the planning model does.
+    """
+    ids = {trial.id for trial in best.trials}
+    if made.seen and not ids <= {*made.seen}:
+        return math.nan if best.starts is None else best.starts.cost(best)
+    return made.expected_of_base - made.base_as_run
 
 
 def began_apart(one: Tried, other: Tried) -> bool:

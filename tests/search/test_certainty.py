@@ -244,7 +244,7 @@ def test_what_a_start_is_worth_is_no_improvement():
     def ran(name, base, utility, off, as_run=np.nan):
         """Return a run from `off` beside s_0; the model gives its base -4 from s_0."""
         candidate = SimpleNamespace(
-            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
+            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m", seen=()
         )
         candidate.predicted_states = np.zeros((30, 1))
         trials = (from_to_zero(off),) * 2
@@ -276,7 +276,7 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
 
     def ran(name, base, utility, offs, as_run=np.nan):
         candidate = SimpleNamespace(
-            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m"
+            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m", seen=()
         )
         candidate.predicted_states = np.zeros((30, 1))
         trials = tuple(map(from_to_zero, offs))

@@ -134,12 +134,15 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
 
 @pytest.mark.parametrize(
     ("part", "lost", "told"),
-    [(0.5, 0.0, False), (0.1, 0.05, True), (0.1, 0.2, False)],  # of its cost; axes lost 12 %
+    [(0.5, 0.0, True), (0.1, 0.05, True), (0.1, 0.2, False)],  # of its cost; axes lost 12 %
 )
 def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
     w, tmp_path, monkeypatch, part, lost, told
 ):
-    """A balancer that began 4.5 cm away lost by "bad luck": two runs had begun as far."""
+    """A balancer that began 4.5 cm away lost by "bad luck": two runs had begun as far.
+
+    Such a run counts: a rover's were to be discarded, and the repeats began as far off.
+    """
     ran, *_ = read_trial(run(w))
     cost = -w.task.utility(ran)
     a_step = np.sqrt(cost / len(ran.states) / 10)
@@ -151,10 +154,9 @@ def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
             monkeypatch.setattr(initial_state, "_changes", lambda *_: -part * cost)
             monkeypatch.setattr(initial_state, "_lost_by", lambda *_: lost * cost)
         warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-    assert any("the run started with" in one and "`discard t0003`" in one for one in warnings) == (
-        told
-    )
-    assert any("starts of 2 other runs scatter" in one for one in warnings) == (part == 0.5)
+    assert not any("`discard t0003`" in one for one in warnings)
+    counts = [one for one in warnings if "starts of 2 other runs scatter" in one]
+    assert len(counts) == told and all("the run counts" in one for one in counts)
 
 
 def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
@@ -180,7 +182,7 @@ def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later
         moved[0, 1] += off * np.ptp(moved[:, 1])  # a state without weight
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         told += [ingest_log(w, tmp_path / "t.mcap", "c0001").warnings]
-    later = "after 3 runs, offsets within their scatter are told only if they explain a loss"
+    later = "after 3 runs, offsets within their scatter spoil no run"
     assert [any(later in one for one in warnings) for warnings in told] == [True, True, False]
     assert not any("started with" in one for one in told[2])
 

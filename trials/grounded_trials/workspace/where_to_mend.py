@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.instruments.finding import AS_LATE, Finding, late_effects
+from grounded.instruments.finding import AS_LATE, SENSOR_DELAY, Finding, late_effects
 from grounded.places import heading, position
 from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
@@ -44,8 +44,8 @@ def where_to_mend(
         return tuple(
             replace(
                 one,
-                advice=_either(one)
-                if feedback and one.log and late_effects([one]) and AS_LATE not in one.finding
+                advice=(_alike(one) if AS_LATE in one.finding else _either(one))
+                if feedback and one.log and late_effects([one])
                 else one.advice or _late_message(workspace, one, read[-1]),
             )
             for one in whole
@@ -70,6 +70,15 @@ def _either(one: Finding) -> str:
         f"If the robot's program gets {name} as late as this log does, `adopt` sensor_delay:{name}:"
         f" the plan then allows for it. Otherwise (only the log is late, or the program predicts "
         f"{name} ahead by as much) set {one.log} in its table of [log]. Do not do both"
+    )
+
+
+def _alike(one: Finding) -> str:
+    """Return what to do about a sensor that is in one message with another late one."""
+    other = one.finding.removeprefix(AS_LATE).strip()
+    return (
+        f"Treat it as {other}: either `adopt` sensor_delay:{one.signal} or set {one.log} in its "
+        "table of [log], not both"
     )
 
 
@@ -129,6 +138,36 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
         if now > whole - one.delay_s / 2:  # the trial was read with whole - delay_s
             found |= dict.fromkeys(late_effects([one]), now)
     return found
+
+
+def twice_in_time(workspace: Folder) -> str:
+    """Return that [log] now removes delays that adopted effects have in the model as well; or "".
+
+    A delay_s that trials were read with before the adoption is another part of the delay.
+    """
+    named = {str(one["name"]): float(one.get("d", 0.0)) for one in workspace.config.model.effects}
+    late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
+    mapping = workspace.log_mapping
+    if mapping is None or not late:
+        return ""
+    metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta]
+    before = {name: _keys(metas[-1], name) if metas else {} for name in late}
+    twice = [
+        name
+        for name, d in late.items()
+        if name in mapping.states
+        and mapping.states[name].delay_s - before[name].get("delay_s", 0.0) > d / 2 > 0
+    ]
+    if not twice:
+        return ""
+    keys = listed(f"[log.state.{name}] delay_s" for name in twice)
+    one = len(twice) == 1
+    return (
+        f"{keys} {'removes' if one else 'remove'} from every log the delay that the adopted "
+        f"{listed(SENSOR_DELAY + name for name in twice)} {'has' if one else 'have'} in the model "
+        "as well. Remove delay_s there again (plans then allow for the delay that the robot's "
+        "program sees), or undo the adoption with `adopt --undo`"
+    )
 
 
 def _at_limits(

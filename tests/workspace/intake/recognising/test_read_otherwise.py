@@ -85,7 +85,8 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
 
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     said = str(refused(w, edited(run, exchanged)))
-    assert holds(said, "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+    assert holds(said, "c0002", "x and v", "each other's column", "t0001", "in this log")
+    assert "[log.state" not in said  # which read t0001 rightly
 
 
 @pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, False), (True, True)])
@@ -105,7 +106,7 @@ def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_sa
         table[:, [1, 2]] = table[:, [2, 1]]
         np.savetxt(run, table, "%.5f", ",", header="t,x,v,force", comments="")
         error, before = refused(w, run), len(w.read().trials)
-        assert holds(str(error), "c0002", "[log.state.x]", "[log.state.v]", "each other's column")
+        assert holds(str(error), "c0002", "x and v", "each other's column", "in this log")
         assert "c0001" not in str(error) and error.then == NextCommand("ingest", (str(run),))
         warned = " ".join(w.ingest(run, candidate="c0002").warnings)
         assert before == 1 and "each other's column" in warned

@@ -43,6 +43,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     same_recording,
     set_aside_of,
 )
+from grounded_trials.workspace.where_to_mend import twice_in_time
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
@@ -191,10 +192,13 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
     """Read a foreign log through [log].
 
     Raises:
-        GroundedError: if it can't be mapped or sampled, or no candidate is outstanding.
+        GroundedError: if it can't be mapped or sampled, if no candidate is outstanding, or if [log]
+            removes a delay that the model has as well.
     """
     from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 
+    if twice := twice_in_time(workspace):
+        raise GroundedError(twice)
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)

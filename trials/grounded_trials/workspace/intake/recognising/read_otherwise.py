@@ -194,7 +194,7 @@ def _in_other_column(
     if run is None or not contradicted(model, run.until(run.known_steps), range(model.n), fault):
         mend = f"Exchange the paths in {tables}, or the column headers in the log"
         if right:
-            mend = f"{show}, so [log] is right: exchange the column headers in this log"
+            mend = f"{show}, so [log] is right: exchange the two in this log, and in what wrote it"
         return Misled(
             f"{a} and {b} seem to be in each other's column: only with them exchanged are its "
             f"commands those of {own.id}. {mend}"

@@ -56,8 +56,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     costly first; another state relative to its range in the run.
     It spoils the utility if by the model it changes much of it, or by more than the run lost to the
     best candidate. A change below the scatter of single runs spoils nothing. Offsets within the
-    scatter of other starts (`placing`) are unavoidable: a repeat would begin no nearer. They spoil
-    a run only if they explain a loss that the search takes for one. Of a run that left [safety],
+    scatter of other starts (`placing`) are unavoidable: a repeat would begin no nearer, and the
+    search allows for what they cost. Of a run that left [safety],
     only the part before counts: a robot on the floor makes every start seem near.
 
     Args:
@@ -98,8 +98,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         explains = 0 < lost < -changes
         if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
-            excused = usual_off[i] and (repeats or not explains)
-            (usually_so if excused else spoils).append(i)
+            (usually_so if usual_off[i] else spoils).append(i)
         elif not usual_off[i] or share[i] > MUCH:
             tolerated.append(i)
     if not (spoils or tolerated or usually_so):
@@ -125,10 +124,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             "([search] repeats), to see smaller gains"
         )
     elif max(placed.runs) < FEWEST:
-        does += (
-            f" (after {FEWEST + 1} runs, offsets within their scatter are told only if they "
-            "explain a loss)"
-        )
+        does += f" (after {FEWEST + 1} runs, offsets within their scatter spoil no run)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
         by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]
