@@ -5,6 +5,7 @@ import pytest
 
 from grounded import Model, Trial
 from grounded.instruments.predictions.halted import halted
+from grounded.instruments.preflight import preflight
 from grounded_trials import Workspace
 from tests.workspace.intake.recognising.test_mistaken_logs import CONFIG, MODEL, TARGET
 from workspaces import make
@@ -80,3 +81,32 @@ def test_ingest_of_data_says_where_to_cut_the_log(tmp_path):
     np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
     told = [one for one in w.ingest(path, data=True).warnings if "nothing moves from" in one]
     assert len(told) == 1 and "[log.span] end" in told[0] and "discard t0001" in told[0]
+
+
+def test_wheels_at_a_wall_are_no_sensor_that_sticks():
+    """`v sticks to its last value, up to 1.15 s at a time, and then jumps`: it stood still."""
+    rover = Model(
+        states={"x": "m", "psi": "rad", "v": "m/s"},
+        inputs={"u": "1", "turn": "rad/s"},
+        derivative=lambda s, a, p: {
+            "x": s.v * np.cos(s.psi),
+            "psi": a.turn,
+            "v": 2 * a.u - 3 * s.v,
+        },
+        angles=("psi",),
+    )
+    cart, rng = driven(wave(), wall=4.0), np.random.default_rng(1)
+    v = np.where(abs(cart.states[:, 1]) > 0.02, cart.states[:, 1], 0.0)
+    v[cart.states[:, 0] > 3.99] = 0.0
+    v[-100:-97] = 0.3  # it slips once
+    psi = rng.normal(0, 2e-3, len(v))
+    x = np.column_stack([cart.states[:, 0], psi, v])
+    u = np.hstack([cart.inputs, 0 * cart.inputs])
+
+    def stuck(states):
+        trial = Trial(states, u, DT, rover.state_names, rover.input_names)
+        return [one.signal for one in preflight(rover, [trial]).findings if one.kind == "stuck"]
+
+    assert "v" not in stuck(x)
+    moving = np.column_stack([np.linspace(0, 6, len(v)), psi, v])
+    assert "v" in stuck(moving)  # the camera sees it move on

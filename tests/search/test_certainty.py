@@ -12,6 +12,7 @@ from grounded.search.candidate import Tried
 from grounded.search.certainty import (
     beyond_one_trial,
     chance,
+    cost_of_start,
     error_between,
     explained,
     few,
@@ -288,3 +289,15 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
     assert owed_to_start(first, second, [first, second, third]) == 0.0
     apart = ran("c0001", "", -6.0, (-9.1, -6.0, -7.5, -9.1))
     assert owed_to_start(apart, second, [apart, second, third]) == pytest.approx(1.8)
+
+
+def test_what_starts_cost_is_not_that_of_the_first_runs_alone():
+    """A rover's start was worth 0.0087 by one run; a second, which lost 0.022, changed nothing."""
+    trials = tuple(replace(from_to_zero(0.07), id=name) for name in ("t1", "t2"))
+    made = SimpleNamespace(expected_of_base=-4.0, base_as_run=-5.9, seen=("t1", "t2", "t0"))
+    best = Tried(SimpleNamespace(id="c0001"), trials, (-6.0, -6.1), True)
+    assert cost_of_start(best, made) == pytest.approx(1.9)
+    made.seen = ("t1",)
+    assert np.isnan(cost_of_start(best, made))
+    starts = SimpleNamespace(cost=lambda tried: 0.7 if tried.trials == trials else np.nan)
+    assert cost_of_start(replace(best, starts=starts), made) == 0.7

@@ -81,6 +81,24 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     assert not found_in(w).advice
 
 
+def test_a_delay_is_not_removed_from_logs_that_the_model_has(tmp_path):
+    """Both were done, as told at x and y: a rover's run of -0.083 became one of -0.407."""
+    w, trial = make(tmp_path / "w"), late()
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + LOG)
+    rows = np.column_stack([0.05 * np.arange(trial.steps), trial.states[:-1], trial.inputs])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
+    ingest_log(w, tmp_path / "log.csv", data=True)
+    added = 'effects = [{ name = "sensor_delay:v", d = 0.1 }]'
+    toml.write_text(toml.read_text().replace("[model]\n", f"[model]\n{added}\n", 1))
+    ingest_log(Folder(w.folder), tmp_path / "log.csv", data=True)
+    toml.write_text(toml.read_text().replace('path = "/csv.v"', 'path = "/csv.v", delay_s = 0.1'))
+    np.savetxt(tmp_path / "b.csv", rows[:-5], "%.6f", ",", header="t,x,v,force", comments="")
+    with pytest.raises(GroundedError) as refused:
+        ingest_log(Folder(w.folder), tmp_path / "b.csv", data=True)
+    assert holds(str(refused.value), "[log.state.v] delay_s", "sensor_delay:v", "adopt --undo")
+
+
 @pytest.mark.parametrize(("topic", "alone"), [("/mocap", False), ("/imu", True)])
 def test_one_message_is_late_as_a_whole(tmp_path, topic, alone):
     """A car's heading was called 137 ms late beside its position, from the same stamps."""

@@ -103,7 +103,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
         text += f"best {best.candidate.id} {figure(best.utility)}"
-        if math.isfinite(first.utility) and first.utility < 0:
+        own = best.candidate.id == first.candidate.id  # it leads no other
+        if math.isfinite(first.utility) and first.utility < 0 and not own:
             tried = {one.candidate.id: one for one in history}
             two = tried[first.candidate.id], tried[best.candidate.id]
             why = explained(*two, history)
