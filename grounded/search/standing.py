@@ -434,6 +434,8 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
         lost, from_start = f"{doubt.candidate.id} lost to {best.id}", ""
         if excused := doubt.excused(now.incumbent):
             from_start = ", from [task] start"
+            if made is best and len(doubt.trials) > 1:  # the start may have cost the other more
+                from_start += f" ({doubt.candidate.id} ran {len(doubt.trials)} times)"
             gain = doubt.gain_over(now.incumbent)
             lost += (
                 f" by {figure(now.incumbent.utility - doubt.utility)}, but by the model it lost "
