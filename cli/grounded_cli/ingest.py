@@ -161,7 +161,8 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         if one.verdict == ASIDE and ended:
             text = f"{ASIDE}{meaning}"
         if passed and best is not None:
-            text += f"; the best is now {best.candidate.id}, {number(best.utility)}"
+            luck = ", perhaps by luck: see `status`" * (best.verdict() == "maybe better")
+            text += f"; the best is now {best.candidate.id}, {number(best.utility)}{luck}"
         show(field(one.candidate, text, "  "))
     if one.off_target:
         show(field("off target", "; ".join(each.summary() for each in one.off_target), "  "))

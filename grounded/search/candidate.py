@@ -160,7 +160,8 @@ class Candidate(Result):
             stop = f". {run_or_stop(gain, best)}"
         may = "may well lose"
         if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
-            may = f"may lose, as was said of {best.candidate.id}, which won"
+            luck = ", perhaps by luck" * (best.probability < SURE or best.unsure)
+            may = f"may lose, as was said of {best.candidate.id}, which won{luck}"
         return (
             f"{self.id} {may}: it promises {gain:.3g} over {over}, but judging by earlier "
             f"trials the model's likely error there is {off}{stop}"

@@ -288,9 +288,13 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         )
     if error == 0:
         return f"the last gain in utility is {figure(gain, 3)}; repeated trials agree exactly"
+    began = 0.0 if after.starts is None else after.starts.owed(after, before)
+    lucky = math.isfinite(began) and began > PART * abs(gain)
     return (
         f"the last gain in utility is {with_error(gain, error)}: an improvement with probability "
         f"{chance(before, after, history):.2f}{few(Repeats(history).near(after.utility).repeats)}"
+        + f"; by the model, {began:.2g} of it is due to where their runs began"
+        * lucky
     )
 
 

@@ -201,9 +201,14 @@ def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
 def test_a_rerun_says_who_is_best_now_where_it_is_another(capsys):
     """A car's next step went out from c0003 after c0001 was run again, without a word."""
     one = Ingested("t0009", "", False, "c0001", -0.1273, None, (), (), verdict="run again")
-    best = SimpleNamespace(candidate=SimpleNamespace(id="c0003"), utility=-0.1143)
+    made = SimpleNamespace(id="c0003")
+    best = SimpleNamespace(candidate=made, utility=-0.1143, verdict=lambda: "maybe better")
     _tell("q5", one, best, small_tasks.cart)
-    assert re.search(r"best is now c0003,\s+-0\.1143", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(r"best is now c0003,\s+-0\.1143", said) and "perhaps by luck" in said
+    best.verdict = lambda: "better"
+    _tell("q5", one, best, small_tasks.cart)
+    assert "luck" not in capsys.readouterr().out
     _tell("q5", replace(one, candidate="c0003"), best, small_tasks.cart)
     assert "best" not in capsys.readouterr().out
 

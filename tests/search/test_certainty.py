@@ -291,6 +291,22 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
     assert owed_to_start(apart, second, [apart, second, third]) == pytest.approx(1.8)
 
 
+def test_a_lead_that_lucky_starts_explain_is_told_so():
+    """A rover's c0009 led by 0.009 +- 0.026; by the model 0.023 of that was its start."""
+
+    def ran(name, utilities, owed=0.0):
+        candidate = SimpleNamespace(id=name, base="", model="m", seen=())
+        candidate.predicted_states = np.zeros((30, 1))
+        starts = SimpleNamespace(owed=lambda one, other: owed)
+        trials = (from_to_zero(0.0),) * len(utilities)
+        return Tried(candidate, trials, utilities, True, starts=starts)
+
+    first = ran("c0001", (-5.0, -6.0))
+    assert "0.9 of it is due to where" in last_improvement([first, ran("c2", (-4.9,), owed=0.9)])
+    assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=0.01)])
+    assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=np.nan)])
+
+
 def test_what_starts_cost_is_not_that_of_the_first_runs_alone():
     """A rover's start was worth 0.0087 by one run; a second, which lost 0.022, changed nothing."""
     trials = tuple(replace(from_to_zero(0.07), id=name) for name in ("t1", "t2"))
