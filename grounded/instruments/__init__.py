@@ -6,6 +6,7 @@ where that is certain. `sound_trials` runs these checks and those by the model's
 
 single        one signal at a time
 inputs        commands: copies, limits
+halted        where a robot stands still under commands that had moved it before
 lag           the delay between two signals of one quantity
 kinematics/   what positions, velocities and headings imply about each other, whatever the physics
 predictions/  what only the model's predictions show: exchanged commands, signs, clocks

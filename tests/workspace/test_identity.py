@@ -6,6 +6,7 @@ averaged two policies called c0002, one bit in diagnosis.json was adopted as 9.5
 """
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,9 +19,10 @@ from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import StudyStore, proven
 from grounded_trials.workspace import identity
 from grounded_trials.workspace.candidates.search_state import standing_in
-from grounded_trials.workspace.identity import _decoded, candidate_of
+from grounded_trials.workspace.identity import _decoded, candidate_of, other_task
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from reported import cart, copied
+from small_tasks import cart_task, rover_task
 from workspaces import CONFIG, make
 
 __all__ = ["cart"]
@@ -250,3 +252,15 @@ def test_a_diagnosis_is_told_apart_from_no_diagnosis(tmp_path):
     w.reports.mkdir()
     diagnosed(w.folder)
     assert read_diagnosis(w.reports) is not None
+
+
+def test_a_candidate_of_another_model_is_told_as_that():
+    """Its limits and its start have other lengths than those of the task."""
+    rover, cart = rover_task(), cart_task()
+    made = SimpleNamespace(
+        policy=SimpleNamespace(
+            state_names=rover.model.state_names, input_names=rover.model.input_names
+        ),
+        predicted_states=[rover.start],
+    )
+    assert other_task(cart, made) == "a model with other states or inputs"

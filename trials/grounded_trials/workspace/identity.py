@@ -320,9 +320,11 @@ def other_task(task: Task, made: Candidate) -> str:
 
     Args:
         task: the present task.
-        made: a candidate of another one, for a model with the same states and inputs.
+        made: a candidate of another one.
     """
-    policy, then = made.policy, made.predicted_states[0]
+    policy, then, model = made.policy, made.predicted_states[0], task.model
+    if (policy.state_names, policy.input_names) != (model.state_names, model.input_names):
+        return "a model with other states or inputs"
     ends = zip(policy.low, policy.high, strict=True)
     told = [
         f"limits of {name}: [{low:g}, {high:g}] then"

@@ -150,7 +150,7 @@ def _still(trial: Trial) -> list[str]:
 
 def _halted(workspace: Folder, trial: Trial) -> list[str]:
     """Return a warning if the robot stood still in data under commands that had moved it before."""
-    from grounded.instruments.predictions.halted import halted
+    from grounded.instruments.halted import halted
 
     if (stood := halted(workspace.base_model, trial)) is None:
         return []

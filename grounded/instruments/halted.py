@@ -1,6 +1,6 @@
 """Find where a robot stood still under commands that had moved it before: a wall, a stop, no power.
 
-No model tells it. Commands vary in such a stretch, while every state keeps to its noise; and the
+No model is needed. Commands vary in such a stretch, while every state keeps to its noise; and the
 robot set off from rest with commands that were no larger. So a held pose is none (its commands are
 constant), nor a dead zone or a friction that holds a robot (it would not have set off with less).
 """
