@@ -92,7 +92,7 @@ def test_the_most_time_that_may_be_left_follows_from_the_least_share_done(monkey
     assert told[5].endswith("up to about 1 s left")
     assert told[6] == "refine, 90 s so far"  # it took longer: nothing is known
     more = clocked(monkeypatch, run, open_ended=True)  # after a gap, 6 s became 90
-    assert more[2] == "scan, 10 s so far, about 90 s left"
+    assert more[2] == "scan, 10 s so far, about 90 s left, more if more is found"
 
 
 def test_a_part_of_a_stage_counts_as_another_one():
