@@ -340,3 +340,20 @@ def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_p
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)
+
+
+@pytest.mark.parametrize("waits", [0, 8])
+def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
+    """It stood still for a second and skipped 20 steps: -1.704 became a run of the first policy."""
+    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
+    runner, x, rows = Runner(plan.policy), w.task.start.copy(), []
+    for k in range(w.task.horizon):
+        seen = x + RNG.normal(0, 1e-3, 3)
+        u = runner.action(k * w.task.dt, seen) if k >= waits else np.zeros(2)
+        rows.append([k * w.task.dt, *seen, *u])
+        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    found = w.ingest(path)
+    told = [one for one in found.warnings if "sent nothing but what was held" in one]
+    assert len(told) == (waits > 0) == (found.then.verb == "discard")
+    assert all(holds(one, "8 steps (0.4 s)", "since the run began", plan.id) for one in told)

@@ -124,7 +124,8 @@ def misled(
     if late := begins_late(log, own.policy):
         return Misled(
             f"its first row is {late:.3g} s after {own.id} began: record from before the run, and "
-            "cut nothing off; without its beginning the run can't be judged"
+            "cut nothing off; without its beginning the run can't be judged. If nothing was cut "
+            "off, the program's clock began before the run"
         )
     if swap := exchanged_in(log, task, own, proven):
         return swap

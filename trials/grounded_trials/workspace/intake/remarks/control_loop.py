@@ -30,6 +30,8 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
+UNSENT = 5  # steps without a command that are fewer are sought where the run begins
+LACKING, SENT = 0.05, 0.25  # difference of commands in these, and share of it in the later steps
 MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
 NAMED = 2  # largest number of states that are named
@@ -52,10 +54,18 @@ def steps_skipped(workspace: Folder, trial: Trial) -> str:
         return ""
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
     past = policy.past if trial.start_inputs is None else trial.start_inputs
-    before = policy.commands(trial.states[None, :T], past, sent[None])[0][:-1]
+    asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
+    before = asked[:-1]
     shifted = trial.states[None, np.r_[0, : T - 1]]  # no new states since the step before
     after = policy.commands(shifted, past, sent[None])[0][1:]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    if unsent := _unsent(np.abs(asked - sent) / size, np.abs(sent - past) / size):
+        return (
+            f"its first {unsent} steps ({unsent * task.dt:.3g} s) sent nothing but what was held "
+            f"before the run, and from then on it sent the commands of {ran}: pass "
+            "`runner.action` the seconds since the run began, not since the log did, and run "
+            f"{ran} again"
+        )
     moved = np.abs(np.diff(sent, axis=0))
     finest = np.where(moved > 0, moved, size).min(axis=0)  # to which the log is rounded
     tells = (np.abs(after - before) > np.maximum(CHANGES * size, finest)).any(axis=1)
@@ -73,6 +83,22 @@ def steps_skipped(workspace: Folder, trial: Trial) -> str:
         f"log every command, and run {ran} again; if the robot can't, set [task] dt = "
         f"{every * task.dt:.3g}"
     )
+
+
+def _unsent(off: Array, held: Array) -> int:
+    """Return how many steps of a run passed before its program sent anything; 0 for few or none.
+
+    Args:
+        off: (T, m) differences of the commands from the policy's, relative to their size.
+        held: (T, m) differences from what was held before the run.
+    """
+    begins = int(np.argmax((held > CHANGES).any(axis=1)))
+    if not UNSENT < begins < len(off) - LEAST:
+        return 0
+    lacking, sent = (
+        float(np.median(off[part].max(axis=1))) for part in (slice(begins), slice(begins, None))
+    )
+    return begins if lacking > LACKING and sent < SENT * lacking else 0
 
 
 def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> list[str]:
