@@ -169,7 +169,7 @@ def _so_far(
     model replays: it costs less than they do, because their scatter is averaged out), and the rest,
     which is the model's own error if it exceeds the scatter of the runs, if that is known.
     """
-    from grounded.search.certainty import cost_of_start
+    from grounded.search.certainty import cost_of_start, planned_before
     from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
 
@@ -194,8 +194,8 @@ def _so_far(
     start = start if math.isfinite(start) else 0.0
     each = [task.utility(trial) for trial in best.trials]
     mean = task.utility(mean_trial(best.trials, task.model.angle_mask)) - sum(each) / len(each)
-    if candidate.seen and not {trial.id for trial in best.trials} <= {*candidate.seen}:
-        mean = 0.0  # it was planned before the latest of them
+    if planned_before(best, candidate):
+        mean = 0.0
     off = listed(elsewhere.values())
     reasons = (
         (start, f"it begins at [task] start, the runs began off that, by {off}"),

@@ -231,16 +231,15 @@ def at_middle(
         acting: all claimed effects.
         values: the estimates of each effect, by name.
     """
-    site = effect.site
-    if effect.family.name != "input_gain" or len(site.targets) > 1:
+    own, of_curve = {*effect.site.targets}, "input_curve"
+    curves = (e for e in acting if e.family.name == of_curve and own <= {*e.site.targets})
+    curve = next(curves, None) if effect.family.name == "input_gain" else None
+    if curve is None or "b" not in _told(values[curve.name]):
         return ""
-    own = f"input_curve:{site.target}"
-    curve = next((e for e in acting if e.name == own), None)
-    if curve is None or "b" not in _told(values[own]):
-        return ""
-    ends = {q.name: q.start for q in curve.quantities if q.fixed}
-    middle = with_unit(number((ends["L"] + ends["U"]) / 2), site.model.inputs[site.target])
-    least = "its smallest" if ends["L"] > 0 else "zero"
+    ends = {q.name: q for q in curve.quantities if q.fixed}
+    low, high = ends["L"], ends["U"]
+    middle = with_unit(number((low.start + high.start) / 2), high.unit)
+    least = "its smallest" if low.start > 0 else "zero"
     return f" at {middle}, half way between {least} and its largest command"
 
 

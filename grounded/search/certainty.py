@@ -381,6 +381,11 @@ def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     return worth(before) - worth(after)
 
 
+def planned_before(best: Tried, made: Candidate) -> bool:
+    """Return whether a candidate was planned before the latest run of its base, `best`."""
+    return bool(made.seen) and not {trial.id for trial in best.trials} <= {*made.seen}
+
+
 def cost_of_start(best: Tried, made: Candidate) -> float:
     """Return what the starts of a candidate's runs cost on average, by the model; NaN if unknown.
 
@@ -389,8 +394,7 @@ def cost_of_start(best: Tried, made: Candidate) -> float:
         made: one that was planned from its runs. The model that was grounded on those tells it; of
             runs that came later the planning model does.
     """
-    ids = {trial.id for trial in best.trials}
-    if made.seen and not ids <= {*made.seen}:
+    if planned_before(best, made):
         return math.nan if best.starts is None else best.starts.cost(best)
     return made.expected_of_base - made.base_as_run
 

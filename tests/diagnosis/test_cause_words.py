@@ -87,6 +87,11 @@ def test_a_gain_beside_a_curve_of_its_input_says_at_which_command():
     assert holds(said, f"{peak / 2:g} N m", "half way between zero and its largest command")
     assert not at_middle(other, [other, curve], values)
     assert not at_middle(gain, [gain], values)
+    both, of_both = (
+        Library().effect(f"{kind}:t1+t2", arm) for kind in ("input_gain", "input_curve")
+    )
+    values[of_both.name] = values[curve.name]
+    assert at_middle(both, [both, of_both], values) and at_middle(gain, [gain, of_both], values)
     only_sides = {curve.name: {"a": Estimate(0.1, 0.01, unit="1"), "b": Estimate(0.01, 0.02)}}
     assert not at_middle(gain, [gain, curve], only_sides)
 

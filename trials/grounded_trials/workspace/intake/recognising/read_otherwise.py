@@ -109,7 +109,10 @@ class Misled:
 
 
 def misled(
-    log: Recording | None, task: Task, own: Candidate, proven: Proven = lambda fault: ()
+    log: Recording | None,
+    task: Task,
+    own: Candidate,
+    swapped: Callable[[], Misled | None] | None = None,
 ) -> Misled | None:
     """Return another fault of a log that hides its run, or None.
 
@@ -117,7 +120,7 @@ def misled(
         log: a log in which no run of the candidate was found.
         task: the task.
         own: the candidate.
-        proven: which stored trials, read by the same [log], contradict an exchange.
+        swapped: what `exchanged_in` returns, if it is known or may be asked for again.
     """
     if log is None:
         return None
@@ -127,7 +130,7 @@ def misled(
             "cut nothing off; without its beginning the run can't be judged. If nothing was cut "
             "off, the program's clock began before the run"
         )
-    if swap := exchanged_in(log, task, own, proven):
+    if swap := swapped() if swapped else exchanged_in(log, task, own):
         return swap
     off = _off_zero(task, offset_in(log, task, own))
     return Misled(off) if off else None
@@ -136,7 +139,14 @@ def misled(
 def exchanged_in(
     log: Recording, task: Task, own: Candidate, proven: Proven = lambda fault: ()
 ) -> Misled | None:
-    """Return that a log is a candidate's run with two columns exchanged, or None; see `misled`."""
+    """Return that a log is a candidate's run with two columns exchanged, or None.
+
+    Args:
+        log: a log in which no run of the candidate was found.
+        task: the task.
+        own: the candidate.
+        proven: which stored trials, read by the same [log], contradict an exchange.
+    """
     found = _exchange(log, task, own)
     return _in_other_column(log, task, own, found, proven) if found else None
 
@@ -158,7 +168,7 @@ def crossed(
         task: the task.
         own: the candidate that should have run; its run is sought first.
         other: the candidate that seems to have run, perhaps with exchanged columns as well.
-        proven: as in `misled`.
+        proven: as in `exchanged_in`.
     """
     run = _run_in(log, other.policy)
     plain = run and follows(other.policy, run.until(other.policy.horizon), 0)

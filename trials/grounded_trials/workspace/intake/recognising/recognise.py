@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,6 +151,10 @@ def recognised(
     def proven(fault: Mistake) -> list[str]:
         return without(workspace, unstored, fault)
 
+    @cache  # it takes seconds
+    def swapped() -> Misled | None:
+        return exchanged_in(log, task, own, proven) if log else None
+
     swap = crossed(log, task, own, rival, proven) if rival else None
     if swap and candidate is None:
         raise _unreadable(path, ran, [swap.said], _then(again, swap))
@@ -181,7 +186,7 @@ def recognised(
         units, by = unit_of(log, task, own)
     if log and units and why and rather_exchanged(log, task, own, units, by):
         units = ()
-    if fell and not (units or slow or misled(log, task, own, proven)):
+    if fell and not (units or slow or misled(log, task, own, swapped)):
         return cut_short(read, fell.steps, fell.told)
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
@@ -189,12 +194,12 @@ def recognised(
     )
     turned, exchange = "", None
     if log and whole.inputs.any() and not (units or slow or other or (found and found.opens_alike)):
-        exchange = exchanged_in(log, task, own, proven)  # one turns inputs round, as the model sees
+        exchange = swapped()  # one turns inputs round, as the model sees
         turned = "" if exchange else turned_in(workspace, log, ran)
     if candidate is not None:
         seem = f"with {listed(units)} times {by:.6g} it is its run: another unit, or sign?"
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
-        hides = exchange or misled(log, task, own, proven)
+        hides = exchange or misled(log, task, own, swapped)
         hides = swap if other else None if turned or gone else hides
         also = turned or gone or (hides.said if hides else "")
         doubts = [seem if units else pace or also or why]
@@ -244,7 +249,7 @@ def recognised(
     named = [*(misread(read.log) if read.log and not exchange else ())]
     named += [one.told(known, own=read.own) for one in odd]
     if not (named or other or seen.silent or hides):
-        hides = misled(log, task, own, proven)
+        hides = misled(log, task, own, swapped)
     if hides:
         named, again = [hides.said], _then(again, hides)
     if named:

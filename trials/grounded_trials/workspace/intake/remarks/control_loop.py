@@ -39,7 +39,7 @@ LEADS = 0.3  # share of a state's error over the run: a smaller motion since the
 
 
 def steps_skipped(workspace: Folder, trial: Trial) -> str:
-    """Return the warning for a run in which many steps were not run; or "".
+    """Return the warning for a run in which many steps, or the first ones, were not run; or "".
 
     Args:
         workspace: the workspace with the task and the candidate.
