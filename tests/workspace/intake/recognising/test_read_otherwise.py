@@ -73,8 +73,10 @@ def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
     times = np.array([float(line.split(",")[0]) for line in lines[1:]])
     rows = round(8 * dt / float(np.median(np.diff(times))))
     run.write_text("\n".join([lines[0], *lines[1 + rows :]]))
-    said = str(refused(w, run))
+    error = refused(w, run)
+    said = str(error)
     assert holds(said, "c0002", "record from before the run") and "somebody" not in said
+    assert error.then.arguments == ("LOG",)  # this one would be refused again
     late = float(said.split("its first row is ")[1].split(" ")[0])
     assert late == pytest.approx(8 * dt, abs=1.01 * dt)
 

@@ -105,7 +105,7 @@ class Misled:
     """A fault of a log that hides its run, and how to correct it."""
 
     said: str
-    rerun: bool = False  # the robot did not run its candidate as it should: run it again
+    rerun: bool = False  # no setting reads this log: another one is needed, of the run or a new one
 
 
 def misled(
@@ -128,7 +128,8 @@ def misled(
         return Misled(
             f"its first row is {late:.3g} s after {own.id} began: record from before the run, and "
             "cut nothing off; without its beginning the run can't be judged. If nothing was cut "
-            "off, the program's clock began before the run"
+            "off, the program's clock began before the run",
+            rerun=True,
         )
     if swap := swapped() if swapped else exchanged_in(log, task, own):
         return swap
