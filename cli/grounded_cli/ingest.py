@@ -43,7 +43,7 @@ VERDICTS = {
     "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
-    BEGUN: ": by the model where it began explains that, and it is run once more",
+    BEGUN: ": by the model where it began explains much of that, and it is run once more",
     "probe": ", for the diagnosis: the search ignores it",
     ASIDE: ": it does not count",
     AGAIN: ": the candidate counts with the mean of its runs",

@@ -115,8 +115,14 @@ def _predicted(proposed: Proposed) -> str:
     text = f"utility {number(promised)}"
     in_log = promised - cost
     if cost > 0 and number(in_log) != number(promised):  # which `status` shows
-        share = _of_it(proposed.noise_in_log, in_log) or ", including sensor noise"
-        text += f", about {number(in_log)} in its log{share}"
+        text += f", about {number(in_log)} in its log"
+        replayed = proposed.noise_in_log - cost
+        if share := _of_it(proposed.noise_in_log, in_log):
+            text += share
+            if replayed > MUCH * -promised:
+                text += f" ({number(replayed)} is in {number(promised)} too: it replays a log)"
+        else:
+            text += ", including sensor noise"
     text += _from_usual_starts(proposed.from_starts, in_log)
     errors = "; ".join(one.summary() for one in proposed.off_target)
     return f"{text}; off target: {errors}" if errors else text

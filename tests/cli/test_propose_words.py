@@ -62,7 +62,8 @@ def test_the_noise_in_a_log_is_told_as_that_of_the_best_one():
         candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.006, off_target=()
     )
     assert _predicted(proposed).endswith(
-        "about -0.007600 in its log, 0.006000 of it by sensor noise on average"
+        "about -0.007600 in its log, 0.006000 of it by sensor noise on average (0.004000 is in "
+        "-0.005600 too: it replays a log)"
     )
     rest = SimpleNamespace(
         candidate=made, noise_cost=0.002, from_starts=None, noise_in_log=0.001, off_target=()

@@ -238,6 +238,8 @@ class Measured:
         found = []
         for i, name in enumerate(ruler.names):
             left = self.flexible[name][0] if name in self.flexible else None
+            if now[k, i] <= 2 * fine[i]:
+                left = None
             error, floor = float(now[k, i]), float(self.floor[k, i])
             if left is None and not above[short, i].any():
                 continue

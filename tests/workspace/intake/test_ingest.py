@@ -155,7 +155,7 @@ def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
             monkeypatch.setattr(initial_state, "_lost_by", lambda *_: lost * cost)
         warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
     assert not any("`discard t0003`" in one for one in warnings)
-    counts = [one for one in warnings if "starts of 2 other runs scatter" in one]
+    counts = [one for one in warnings if "starts of 2 other runs are off by" in one]
     assert len(counts) == told and all("the run counts" in one for one in counts)
 
 
@@ -182,7 +182,7 @@ def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later
         moved[0, 1] += off * np.ptp(moved[:, 1])  # a state without weight
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         told += [ingest_log(w, tmp_path / "t.mcap", "c0001").warnings]
-    later = "after 3 runs, offsets within their scatter spoil no run"
+    later = "after 3 runs, offsets that are usual spoil no run"
     assert [any(later in one for one in warnings) for warnings in told] == [True, True, False]
     assert not any("started with" in one for one in told[2])
 

@@ -21,7 +21,9 @@ from grounded_trials.logs.signals import Series, SignalSpec
 
 GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # without max_age_s a gap exceeds all of these
 STILL_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value there; how many
-WHITE, BETTER = 1.3, 0.7  # largest scatter about a line, and std of its end, by a sample's noise
+# Largest scatter about a line, by a sample's noise: as noise alone has it by chance (`_by_chance`),
+# within these. Largest std of the line's end, by a sample's noise.
+WHITE, BETTER = (1.3, 1.6), 0.7
 OFF, SURE = 4.0, 3.0  # std by which the value itself may differ, and from which a motion shows
 JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
@@ -150,7 +152,7 @@ class Samples:
         spread = float(((t - t.mean()) ** 2).sum())
         end = float(np.sqrt(1 / len(y) + t.mean() ** 2 / spread))
         there = self.y[min(int(np.searchsorted(self.t, at)), len(self.t) - 1)]
-        if scatter > WHITE * noise or end > BETTER or abs(there - level) > OFF * noise:
+        if scatter > _by_chance(len(y)) * noise or end > BETTER or abs(there - level) > OFF * noise:
             return None
         moves, mean = abs(tilt) * spread**0.5 > SURE * noise, float(y.mean())
         return Lead(float(level), mean, bool(moves), abs(mean) > SURE * noise / len(y) ** 0.5)
@@ -192,6 +194,15 @@ class Samples:
             f"{(t0 - origin) * 1e-9:.3f} s to {(t1 - origin) * 1e-9:.3f} s after the start, more "
             f"than {limit:.3f} s; end the span before it, or set max_age_s to interpolate over it"
         )
+
+
+def _by_chance(count: int) -> float:
+    """Return the largest ratio of white noise's scatter to that from its differences, by chance.
+
+    The variance of the ratio's square is (n - 2) / (n^2 - 1) (von Neumann 1941).
+    """
+    least = 1 - SURE * np.sqrt((count - 2) / (count**2 - 1))
+    return float(np.clip(max(least, 1e-9) ** -0.5, *WHITE))
 
 
 TIDIED: WeakKeyDictionary[Series, dict[tuple[str, bool], Samples]] = WeakKeyDictionary()

@@ -34,13 +34,13 @@ class Placing:
 
     Args:
         off: start states less the [task] start of each run (N, n).
-        std: their standard deviations (n,), without discarded runs that began far from all others;
-            NaN where too few runs are known.
+        rms: how far they usually begin off (n,), without discarded runs that began far from all
+            others; NaN where too few runs are known.
         runs: how many runs each of these rests on, (n,).
     """
 
     off: Array
-    std: Array
+    rms: Array
     runs: Array
 
     @property
@@ -105,8 +105,8 @@ def placing(workspace: Folder, but: str = "") -> Placing:
     for k in np.flatnonzero(aside):
         used[k] = _like(off, int(k))
     columns = [off[used[:, i], i] for i in range(n)]
-    std = [float(x.std(ddof=1)) if len(x) >= FEWEST else np.nan for x in columns]
-    return Placing(off[used.all(axis=1)], np.array(std), np.array([len(x) for x in columns]))
+    rms = [float(np.sqrt((x**2).mean())) if len(x) >= FEWEST else np.nan for x in columns]
+    return Placing(off[used.all(axis=1)], np.array(rms), np.array([len(x) for x in columns]))
 
 
 def _like(off: Array, k: int) -> Array:

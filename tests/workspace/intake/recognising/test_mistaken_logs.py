@@ -357,3 +357,28 @@ def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
     told = [one for one in found.warnings if "sent nothing but what was held" in one]
     assert len(told) == (waits > 0) == (found.then.verb == "discard")
     assert all(holds(one, "8 steps (0.4 s)", "since the run began", plan.id) for one in told)
+
+
+@pytest.mark.parametrize(
+    ("share", "names"), [(0.0, "v r psi"), (0.6, "v r psi"), (0.6, "v r"), (0.8, "psi")]
+)
+def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, names):
+    """0.7 of the last pose: commands "logged 2 steps late", or a run eight times worse, untold."""
+    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
+    which = np.array([name in names.split() for name in model.state_names])
+    runner, x, rows, smooth = Runner(plan.policy), w.task.start.copy(), [], None
+    for k in range(w.task.horizon):
+        seen = x + RNG.normal(0, 0.02, 3)
+        smooth = seen if smooth is None else share * smooth + (1 - share) * seen
+        u = runner.action(k * w.task.dt, np.where(which, smooth, seen))
+        rows.append([k * w.task.dt, *seen, *u])
+        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    found = w.ingest(path)
+    told = [one for one in found.warnings if "smoothed by" in one]
+    assert len(told) == (share > 0) == (found.then.verb == "discard")
+    listed = " and ".join(names.replace(" ", ", ", names.count(" ") - 1).rsplit(" ", 1))
+    assert all(
+        holds(one, f"{plan.id} sends on {listed}", f"by {share:.2g} of the last") for one in told
+    )
+    assert not any("logged" in one and "late" in one for one in found.warnings if one not in told)

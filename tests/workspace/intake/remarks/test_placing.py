@@ -47,10 +47,10 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
         w.forget()
     known = placing(w)
     assert known.runs.tolist() == [3, 3]
-    assert known.std[0] == pytest.approx(np.std([0.15, -0.13, 0.11], ddof=1))
+    assert known.rms[0] == pytest.approx(np.sqrt(np.mean(np.square([0.15, -0.13, 0.11]))))
     found = placed(w, tmp_path, ran, -0.14)
     (told,) = [one for one in found.warnings if "the run started with" in one]
-    assert holds(told, "starts of 3 other runs scatter (0.15 m in x", "the run counts")
+    assert holds(told, "starts of 3 other runs are off by 0.13 m in x (rms)", "the run counts")
     assert found.then.verb == "propose"
 
 
@@ -60,7 +60,37 @@ def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, 
         last = placed(w, tmp_path, ran, off).trial
     set_aside(w, "discard", [last], "")
     w.forget()
-    assert placing(w).std[0] == pytest.approx(np.std([0.01, -0.01], ddof=1))
+    assert placing(w).rms[0] == pytest.approx(0.01)
+
+
+def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_path, monkeypatch):
+    """A heading 0.030 rad off was to be discarded, after 0.019, 0.015 and 0.019 rad."""
+    ran, *_ = read_trial(run(w))
+    monkeypatch.setattr(initial_state, "_changes", lambda *_: 5 * w.task.utility(ran))
+    monkeypatch.setattr(initial_state, "_always_there", lambda *_: "")
+    monkeypatch.setattr(initial_state, "_scatter", lambda *_: 0.0)
+    for off in (0.19, 0.15, 0.20):
+        placed(w, tmp_path, ran, off)
+    told, far = (placed(w, tmp_path, ran, off) for off in (-0.30, -0.90))
+    assert any("the run counts" in one for one in told.warnings)
+    assert any("`discard t0005`" in one for one in far.warnings)
+
+
+def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
+    """`this changes its utility by -0.0202` told one of two offsets; both changed it by -0.041."""
+    ran, *_ = read_trial(run(w))
+    moved = np.array(ran.states)
+    moved[0] += [0.6, 0.3]
+    write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+    found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    (told,) = [one for one in found.warnings if "the run started with" in one]
+    policy = w.candidate("c0001")[0].policy
+    of_x, whole = (
+        worth_of_start(w.planner, policy, moved[0] * part - w.task.start * part)
+        for part in (np.array([1, 0]), np.array([1, 1]))
+    )
+    assert f"{whole:+.3g}" in told
+    assert "x changes" not in told or f"x changes its utility by {of_x:+.3g}" in told
 
 
 def test_runs_of_an_earlier_task_count_by_their_own_start(w, tmp_path):

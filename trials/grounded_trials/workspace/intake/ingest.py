@@ -47,7 +47,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
 )
 from grounded_trials.workspace.intake.recognising.recognise import best_run_again, recognised
 from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
-from grounded_trials.workspace.intake.remarks.control_loop import steps_skipped, swung
+from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import (
@@ -159,7 +159,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     odd = tuple(one.told(trial, own=read.own) for one in faults)
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
-    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
+    other = "" if read.doubted else ran_otherwise(workspace, trial)
+    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled, late=not other)
     counts = elsewhere is not None and not elsewhere.again  # as the words say
     begun = [elsewhere.told] if elsewhere and not (counts and (read.aside or odd)) else []
     warnings = (*read.warnings, *odd, *begun, *checked)
@@ -174,9 +175,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
     verdict = ASIDE if aside else _verdict(workspace, trial, tried)
-    slow = "" if read.doubted else steps_skipped(workspace, trial)
-    warnings = (*filter(None, [slow]), *warnings)
-    wrong = bool(slow or read.aside) or (elsewhere is not None and elsewhere.again)
+    warnings = (*filter(None, [other]), *warnings)
+    wrong = bool(other or read.aside) or (elsewhere is not None and elsewhere.again)
     if not (odd or wrong or aside):
         asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
         if asked:

@@ -17,6 +17,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.other_scale import other_units
+from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
@@ -67,6 +68,8 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
             plain = follows(own.policy, run, latest(task))
             if plain and not plain.beyond and (told := misused(task, own, run, plain, acts=acts)):
                 return told
+            if found := smoothed(task.model, own, run):
+                return f"they are {found.told(own)}"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Tell how well the robot's program ran its candidate: late, on old samples, or oscillating.
+"""Tell how well the robot's program ran its candidate: late, on old samples, smoothed or swinging.
 
 A policy's plan, gains and reference change from step to step, so its commands change even if no new
 states arrive. Where they stay the same to the last digit all the same, the step was not run. A loop
@@ -23,6 +23,7 @@ from grounded.result import figure, listed, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
 from grounded.search.feedback.sample_age import PROBED, different, rates, sample_age
+from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import LEAST
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -36,6 +37,24 @@ MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
 NAMED = 2  # largest number of states that are named
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
+
+
+def ran_otherwise(workspace: Folder, trial: Trial) -> str:
+    """Return the warning for a run whose program did not run its candidate as planned; or "".
+
+    Args:
+        workspace: the workspace with the task and the candidate.
+        trial: the trial as stored.
+    """
+    return steps_skipped(workspace, trial) or _smoothed(workspace, trial)
+
+
+def _smoothed(workspace: Folder, trial: Trial) -> str:
+    if not trial.candidate:
+        return ""
+    own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
+    found = smoothed(workspace.base_model, own, whole)
+    return f"its commands are {found.told(own)}, and run {own.id} again" if found else ""
 
 
 def steps_skipped(workspace: Folder, trial: Trial) -> str:

@@ -6,6 +6,7 @@ s_0. A run whose utility it changes much says nothing about its candidate, and m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +29,11 @@ from grounded_trials.workspace.user_files.config import FILE
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
 # without weight along the way, share of its range in the run
 FAR = 0.1
-SURE = 3.0  # the start must also be off by this many std of sensor noise and of earlier starts
+SURE = 3.0  # the start must also be off by this many times sensor noise, and earlier starts' rms
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much
+ALIKE = 0.05  # difference of two changes of a utility, relative, that is not told
 ALWAYS = 3  # runs that begin alike, from which on they always do
 
 
@@ -55,8 +57,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     mean step of the run (of one much worse than promised, WORSE times a promised step), the most
     costly first; another state relative to its range in the run.
     It spoils the utility if by the model it changes much of it, or by more than the run lost to the
-    best candidate. A change below the scatter of single runs spoils nothing. Offsets within the
-    scatter of other starts (`placing`) are unavoidable: a repeat would begin no nearer, and the
+    best candidate. A change below the scatter of single runs spoils nothing. Offsets as
+    other starts have them (`placing`) are unavoidable: a repeat would begin no nearer, and the
     search allows for what they cost. Of a run that left [safety],
     only the part before counts: a robot on the floor makes every start seem near.
 
@@ -86,7 +88,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    usual_off = np.abs(off) <= SURE * np.nan_to_num(placed.std)
+    usual_off = np.abs(off) <= SURE * np.nan_to_num(placed.rms)
     if not told.any():
         return None
     real = abs(task.utility(trial))
@@ -107,30 +109,32 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
     if repeats:
         does = (
-            f"By the model that explains why it lost: {trial.candidate} is to be run again. Place "
-            "the robot nearer to the start"
+            f"By the model that explains much of what it lost: {trial.candidate} is to be run "
+            "again. Place the robot nearer to the start"
         )
     elif usually_so:
-        changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), usually_so))
-        std = listed(
-            f"{with_unit(f'{placed.std[i]:.2g}', list(task.model.states.values())[i])} in "
+        usually = listed(
+            f"{with_unit(f'{placed.rms[i]:.2g}', list(task.model.states.values())[i])} in "
             f"{task.model.state_names[i]}"
             for i in usually_so
         )
         does = (
-            f"That is within how the starts of {min(placed.runs[usually_so])} other runs scatter "
-            f"({std}, one standard deviation), so the run counts; by the model its start changes "
-            f"its utility by {changes:+.3g}. Place the robot more exactly, or average runs "
-            "([search] repeats), to see smaller gains"
+            f"The starts of {min(placed.runs[usually_so])} other runs are off by {usually} (rms): "
+            "this is no unusual one, and the run counts; by the model its start changes its "
+            f"utility by {_changes(workspace, trial, off):+.3g}. Place the robot more exactly, or "
+            "average runs ([search] repeats), to see smaller gains"
         )
     elif max(placed.runs) < FEWEST:
-        does += f" (after {FEWEST + 1} runs, offsets within their scatter spoil no run)"
+        does += f" (after {FEWEST + 1} runs, offsets that are usual spoil no run)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
-        by = [task.model.state_names[i] for i in spoils] if tolerated else ["this"]
-        change = f"{listed(by)} change{'s' * (len(by) == 1)}"
+        whole = _changes(workspace, trial, off)
+        names = listed(task.model.state_names[i] for i in spoils)
+        change = f"{names} change{'s' * (len(spoils) == 1)} its utility by {changes:+.3g}"
+        if not math.isclose(changes, whole, rel_tol=ALIKE):
+            change += f", its whole start by {whole:+.3g}"
         does = (
-            f"By the model {change} its utility by {changes:+.3g}: "
+            f"By the model {change}: "
             f"`discard {trial.id}`, place the robot nearer to the start and run "
             f"{trial.candidate} again; if it can't be placed nearer, `propose` goes on with this "
             "run. If it always starts there, set it in [task] start"

@@ -29,6 +29,7 @@ def warnings_about(
     last_s: float = float("nan"),
     fell: bool = False,
     scaled: Sequence[str] = (),
+    late: bool = True,
 ) -> tuple[str, ...]:
     """Return warnings on gaps, an early end, a start far from s_0, and exceeded bounds.
 
@@ -39,6 +40,7 @@ def warnings_about(
             control grid.
         fell: whether it was already reported that the run failed where the trial ends.
         scaled: inputs for which another unit was already reported.
+        late: whether commands may be logged late; what was already reported may look like that.
     """
     task = workspace.task
     filled = interpolate_gaps(trial)
@@ -74,7 +76,7 @@ def warnings_about(
     candidate, _ = workspace.candidate(trial.candidate)
     found += _still(whole) if np.ptp(candidate.predicted_states, axis=0).any() else []
     found += [] if fell else _unsafe(task, whole, candidate)
-    ran = follows(candidate.policy, whole, max(LATEST, latest(task)))
+    ran = follows(candidate.policy, whole, max(LATEST, latest(task))) if late else None
     if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
         by = count(abs(ran.late), "step")
         found.append(

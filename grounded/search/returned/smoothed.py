@@ -1,0 +1,121 @@
+"""Find that a program smoothed the states it passed to its candidate, but logged them as measured.
+
+A first-order filter, x_f = a x_f + (1 - a) x in each step, delays the feedback by a / (1 - a)
+steps, which no plan allows for. The commands show it: with the right `a` the policy gives them
+nearly to the last digits, on states of some age it doesn't.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.places import velocities
+from grounded.policy import Policy
+from grounded.result import listed
+from grounded.search.candidate import Candidate
+from grounded.search.returned.who_drove import LEAST
+from grounded.trial import Trial
+
+OFF = 0.02  # rms difference of the commands, relative to their size, from which a filter is sought
+LEAVES, RATHER = 0.25, 0.5  # most that a filter may leave of that, and of what the best age leaves
+LATE = 3  # steps by which the run may begin later than was found: lagging commands look later
+SHARES = np.arange(1, 49) / 50  # tried for `a`
+AGES = np.arange(13) / 4  # tried, in steps
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """States that a program smoothed before it passed them on."""
+
+    names: tuple[str, ...]
+    share: float  # of the last value, a
+    off: float  # rms difference of the logged commands from the policy's, relative to their size
+    lag_s: float  # by which a steady motion is seen late [s]
+
+    def told(self, own: Candidate) -> str:
+        """Return what its commands are and the remedy, as the end of a sentence."""
+        return (
+            f"what {own.id} sends on {listed(list(self.names))} smoothed by "
+            f"{self.share:.2g} of the last value and {1 - self.share:.2g} of the new one in each "
+            f"step, which is {float(f'{1e3 * self.lag_s:.2g}'):g} ms late, but the log has them "
+            "as measured. Pass `runner.action` what is logged, or log what it is passed"
+        )
+
+
+def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:
+    """Return which states a program smoothed before its candidate acted on them, or None.
+
+    Args:
+        model: has the units of the states, which tell velocities from positions.
+        own: the candidate.
+        trial: its run, without gaps; the run may begin up to `LATE` steps after it.
+    """
+    policy, T = own.policy, min(trial.finite_steps, own.policy.horizon)
+    names = (policy.state_names, policy.input_names)
+    if policy.gain is None or T < LEAST + LATE or names != (trial.state_names, trial.input_names):
+        return None
+    off = float(_off(policy, trial, 0, trial.states[None, :T])[0])
+    if off < OFF:
+        return None
+    x = trial.states[:T]
+    at, before = np.divmod(np.arange(T) - AGES[:, None], 1)
+    now = np.clip(at.astype(int), 0, T - 1)
+    then = np.minimum(now + 1, T - 1)
+    aged = x[now] + before[..., None] * (x[then] - x[now])
+    least = min(float(_off(policy, trial, late, aged).min()) for late in range(LATE + 1))
+    best, found = min(LEAVES * off, RATHER * least), None
+    for late in range(LATE + 1):
+        filtered = _filtered(x[late:])
+        for group in _groups(model, policy):
+            which = np.isin(np.arange(x.shape[1]), group)
+            passed = np.where(which, filtered, x[late:])
+            left = _off(policy, trial, late, np.pad(passed, ((0, 0), (late, 0), (0, 0))))
+            k = int(np.argmin(left))
+            if left[k] < best:
+                best, share = float(left[k]), float(SHARES[k])
+                lag = share / (1 - share) * trial.dt
+                found = Smoothed(tuple(policy.state_names[i] for i in group), share, off, lag)
+    return found
+
+
+def _off(policy: Policy, trial: Trial, late: int, states: Array) -> Array:
+    """Return the rms difference of a run's commands from those on other states, (B,), relative.
+
+    Args:
+        policy: of the candidate.
+        trial: the run.
+        late: steps after which it begins.
+        states: (B, T, n) as they were passed in each step of the trial; those before are not used.
+    """
+    T = states.shape[1]
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    held = policy.past if trial.start_inputs is None else trial.start_inputs
+    past = trial.inputs[late - 1] if late else held
+    asked = policy.commands(states[:, late:], past, sent[None, late:])
+    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    return np.asarray(np.sqrt((((asked - sent[late:]) / size) ** 2).mean(axis=(1, 2))))
+
+
+def _filtered(x: Array) -> Array:
+    """Return states (T, n) smoothed with each of `SHARES`, (K, T, n)."""
+    a = SHARES[:, None]
+    found = np.repeat(x[None], len(SHARES), axis=0)
+    for t in range(1, len(x)):
+        found[:, t] = a * found[:, t - 1] + (1 - a) * x[t]
+    return found
+
+
+def _groups(model: Model, policy: Policy) -> Iterator[list[int]]:
+    """Yield the states that a program may smooth, the most first: one filter serves them all."""
+    assert policy.gain is not None
+    names, rates = policy.state_names, velocities(model)
+    fed = np.abs(policy.gain[..., : len(names)]).max(axis=(0, 1)) > 0
+    some = [i for i in range(len(names)) if fed[i]]
+    moving = [i for i in some if names[i] in rates]
+    groups = [some, moving, [i for i in some if i not in moving], *([i] for i in some)]
+    yield from (list(one) for one in dict.fromkeys(map(tuple, groups)) if one)
