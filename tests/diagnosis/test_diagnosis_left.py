@@ -55,6 +55,8 @@ def test_what_is_farthest_above_its_noise_is_left_over_first():
     assert found[-1].evidence == 200.0 and not found[-1].above
     fake.floor[0, 0] = 1e-9  # below what matters of a state its noise is no measure
     assert [one.channel for one in Measured.remainders(fake)] == ["th", "x", "v"]
+    fake.floor[0, 0], fake.ruler.fine[0] = 0.0046, 0.0028  # too little, whatever would lower it
+    assert [one.channel for one in Measured.remainders(fake)] == ["th", "v"]
 
 
 def test_a_gap_in_one_second_of_one_log_is_told_with_its_time():
