@@ -47,6 +47,7 @@ NUDGE = 1e-2  # finite-difference step for B, in the input's unit
 NONE = np.zeros(0)
 
 Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
+Weights = Sequence[Mapping[str, Any]]  # of velocities in the speed of each pair
 Left = tuple[Array, dict[str, Array]]  # inputs (..., m) after losses, and terms of positions
 Integrated = Mapping[str, tuple[str, float]]  # {position: (its velocity, factor)}
 Losses = tuple[Callable[..., Any], ...]
@@ -76,24 +77,35 @@ def step_with(
     return after | {q: after[q] + by for q, by in more.items()}
 
 
-def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
+def loads(
+    pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any], weights: Weights | None = None
+) -> Loads:
     """Return what the losses of a step are solved from; step(a) -> next state by name."""
     free, found = step(a), dict[str, dict[str, Any]]()
     for name in dict.fromkeys(coupled(effect.site)[0] for effect, _ in pairs):
         more = [a[n] + NUDGE if n == name else a[n] for n in a]
         reached = step(Named("input", tuple(a), more))
         found[name] = {n: (reached[n] - free[n]) / NUDGE for n in free}
-    return loads_from(pairs, s, a, free, found)
+    return loads_from(pairs, s, a, free, found, weights)
 
 
 def loads_from(
-    pairs: Pairs, s: Any, a: Mapping[str, Any], free: Any, answers: Mapping[str, Any]
+    pairs: Pairs,
+    s: Any,
+    a: Mapping[str, Any],
+    free: Any,
+    answers: Mapping[str, Any],
+    weights: Weights | None = None,
 ) -> Loads:
-    """Return the same from the state after a step without losses, and its slopes by the inputs."""
-    effects = [effect for effect, _ in pairs]
-    inputs = [coupled(effect.site)[0] for effect in effects]
-    gain = [[speed(effect, answers[tau]) for tau in inputs] for effect in effects]
-    speeds, ends = ([speed(effect, x) for effect in effects] for x in (s, free))
+    """Return the same from the state after a step without losses, and its slopes by the inputs.
+
+    weights: of the velocities in each loss' speed; None: those of its own model.
+    """
+    given: Sequence[Mapping[str, Any] | None] = weights or [None] * len(pairs)
+    effects = [(effect, own) for (effect, _), own in zip(pairs, given, strict=True)]
+    inputs = [coupled(effect.site)[0] for effect, _ in effects]
+    gain = [[speed(effect, answers[tau], own) for tau in inputs] for effect, own in effects]
+    speeds, ends = ([speed(effect, x, own) for effect, own in effects] for x in (s, free))
     taken, own = [a[tau] for tau in inputs], [answers[tau] for tau in inputs]
     return Loads(speeds, ends, gain, taken, own)
 

@@ -10,6 +10,7 @@ compared with the log. The equations are those of `grounded.effects.wrap`, evalu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -47,7 +48,7 @@ from grounded.effects import (
     SensorLagFamily,
     acting_order,
 )
-from grounded.effects.drive import speed_weights
+from grounded.effects.drive import weights_at
 from grounded.effects.family import braked, coupled
 from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solved
 from grounded.effects.medium import medium_of, through_it
@@ -61,6 +62,7 @@ from grounded.rollout import each_stepped
 MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials
 STEPS_KEPT = 16  # simulator steps in the cache
 LOADS_KEPT = 32_000  # states in the cache of `loads`
+WEIGHTS_KEPT = 1000  # parameters at which weights of a loss' speed are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,7 @@ class Predictor(SentOnce):
     _inputs: dict[str, dict[Any, Array]] = field(default_factory=dict)
     _steps: dict[bytes, Array] = field(default_factory=dict)
     _loads: dict[Any, Loads] = field(default_factory=dict)
+    _weights: dict[str, dict[bytes, Mapping[str, float]]] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
@@ -299,17 +302,59 @@ class Predictor(SentOnce):
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
 
         a = Named("input", names, [u[..., j] for j in range(len(names))])
+        weights = self.weights(h, p, x.shape[:-1])
         slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
         if slopes is None:
-            found = loads(losses_of(h), self.named(x), a, step)
+            found = loads(losses_of(h), self.named(x), a, step, weights)
         else:  # cached slopes by the inputs are accurate enough
             by_u = slopes[1].reshape(*x.shape, len(names))
             driving = {coupled(effect.site)[0] for effect, _ in losses_of(h)}
             answers = {tau: self.named(by_u[..., names.index(tau)]) for tau in driving}
-            found = loads_from(losses_of(h), self.named(x), a, step(a), answers)
+            found = loads_from(losses_of(h), self.named(x), a, step(a), answers, weights)
         if len(self._loads) > LOADS_KEPT // x.size:
             self._loads.clear()
         self._loads[key] = found
+        return found
+
+    def weights(self, h: Hypothesis, p: Array, shape: tuple[int, ...]) -> list[dict[str, Any]]:
+        """Return the weights of the velocities in each loss' speed, see `effects.drive`.
+
+        Args:
+            h: the hypothesis with the losses.
+            p: parameters (k,), or of as many rows (M, k).
+            shape: of those rows; then the weights have it too.
+        """
+        found = list[dict[str, Any]]()
+        for effect, _ in losses_of(h):
+            rows = [self._weights_at(effect, row) for row in np.atleast_2d(p)]
+            if len({tuple(row.values()) for row in rows}) == 1:
+                found.append(dict(rows[0]))
+                continue
+            each = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+            times = math.prod(shape) // len(rows)
+            found.append({name: np.repeat(w, times).reshape(shape) for name, w in each.items()})
+        return found
+
+    def _weights_at(self, effect: Effect, p: Array) -> Mapping[str, float]:
+        kept = self._weights.setdefault(effect.site.joined, {})
+        if (found := kept.get(key := p.tobytes())) is None:
+            if len(kept) >= WEIGHTS_KEPT:
+                kept.clear()
+            found = kept[key] = weights_at(effect.site.model, effect.site.joined, p)
+        return found
+
+    def _weight_slopes(self, h: Hypothesis, p: Array) -> list[dict[str, Array]]:
+        """Return how the weights of each loss' speed change with the parameters, (k,) each."""
+        found = []
+        for effect, _ in losses_of(h):
+            base = self._weights_at(effect, p)
+            slopes = {name: np.zeros(len(p)) for name in base}
+            for i, scale in enumerate(param_scale(self.data.model) if len(base) > 1 else ()):
+                if scale:
+                    more = self._weights_at(effect, p + 1e-4 * scale * (np.arange(len(p)) == i))
+                    for name in base:
+                        slopes[name][i] = (more[name] - base[name]) / (1e-4 * scale)
+            found.append(slopes)
         return found
 
     def loss_slopes(
@@ -325,9 +370,10 @@ class Predictor(SentOnce):
         if not pairs:
             return by_x, by_p
         driving, at = [coupled(effect.site)[0] for effect, _ in pairs], self.loads(h, x, u)
-        base = solved(pairs, at, self.data.dt)
-        for i, (effect, _) in enumerate(pairs):
-            weights = speed_weights(effect.site.model, effect.site.joined)
+        base, p = solved(pairs, at, self.data.dt), self.params(h)
+        tilts = self._weight_slopes(h, p) if by_p.size else [{} for _ in pairs]
+        free = self.step(x, u[..., :m], p) if any(len(one) > 1 for one in tilts) else x
+        for i, weights in enumerate(self.weights(h, p, x.shape[:-1])):
             size = 1e-6 * self.data.scales.peak(next(iter(weights)))
             more = [value + size if j == i else value for j, value in enumerate(at.w)]
             ends = [value + size if j == i else value for j, value in enumerate(at.free)]
@@ -336,10 +382,13 @@ class Predictor(SentOnce):
             for tau, was, by_w, by_end in zip(driving, base, started, ended, strict=True):
                 row, slope = names.index(tau), (by_end - was)[..., None] / size
                 for name, weight in weights.items():
-                    k = self.seen.index(name)
-                    by_x[..., row, :] += slope * (weight * f_x[..., k, :])
+                    k, by_k = self.seen.index(name), np.asarray(weight)[..., None]
+                    by_x[..., row, :] += slope * by_k * f_x[..., k, :]
                     by_x[..., row, k] += weight * (by_w - was) / size
-                    by_p[..., row, :] += slope * (weight * f_p[..., k, :])
+                    by_p[..., row, :] += slope * by_k * f_p[..., k, :]
+                    if len(tilts[i]) > 1:
+                        before = (by_w - was)[..., None] / size * x[..., k, None]
+                        by_p[..., row, :] += (before + slope * free[..., k, None]) * tilts[i][name]
         return by_x, by_p
 
     def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:
