@@ -21,6 +21,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
 LEAP = 0.3  # most that a parameter's shift moves in one step, in units of its scale
+ROUNDS = 4  # most changes of what is held at its bound, per unknown
 GAPS = 20  # most that a scanned value moves in one step, in units of `step_sizes` (two grid gaps)
 
 
@@ -71,24 +72,44 @@ def _moved(filtered: Array, delta: Array) -> Array:
 
 
 def bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
-    """Return the Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
+    """Return the Gauss-Newton step within bounds: the minimum of slope' x + x' G x / 2.
 
-    An unknown that would leave its bounds is fixed at the bound, and the step of the others is
-    solved again. One whose slope is not finite (a value at which the effect overflows) does not
-    move.
+    An active-set method (Nocedal & Wright, Numerical Optimization, 2006, 16.5): an unknown that
+    comes to its bound on the way is held there, and released if the others then pull it back. All
+    that the unbounded step takes beyond a bound must not be held at once: of correlated unknowns
+    it leads far out, and what is left at the bounds lowers the likelihood. One whose slope is not
+    finite (a value at which the effect overflows) does not move.
+
+    Args:
+        G: (K, K), positive semidefinite.
+        slope: (K,).
+        low: (K,), at most 0.
+        high: (K,), at least 0.
     """
-    delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
-    G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
+    known = np.isfinite(np.diag(G)) & np.isfinite(slope)
+    G, slope = np.where(np.outer(known, known), G, 0.0), np.where(known, slope, 0.0)
     scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
-    while free.any():
-        left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
-        scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
-        step = -scale[free] * np.linalg.lstsq(scaled, scale[free] * left, rcond=1e-10)[0]
-        delta[free] = np.clip(step, low[free], high[free])
-        stopped = delta[free] != step
-        if not stopped.any():
+    delta, free = np.zeros(len(slope)), known & (low < high)
+    for _ in range(ROUNDS * len(slope)):
+        step = np.zeros(len(slope))
+        if free.any():
+            scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
+            down = scale[free] * (slope + G @ delta)[free]
+            step[free] = -scale[free] * np.linalg.lstsq(scaled, down, rcond=1e-10)[0]
+        end = np.where(step > 0, high, low) - delta
+        with np.errstate(all="ignore"):
+            parts = np.where(step == 0, np.inf, end / step)
+        stop = int(np.argmin(parts)) if len(parts) else 0
+        if len(parts) and parts[stop] < 1:
+            delta = np.clip(delta + parts[stop] * step, low, high)
+            delta[stop], free[stop] = high[stop] if step[stop] > 0 else low[stop], False
+            continue
+        delta = delta + step
+        pull = scale * (slope + G @ delta)  # > 0: down
+        held = known & ~free & np.where(delta <= low, pull < 0, pull > 0) & (low < high)
+        if not held.any():
             break
-        free[np.flatnonzero(free)[stopped]] = False
+        free[int(np.argmax(np.where(held, np.abs(pull), 0.0)))] = True
     return delta
 
 
