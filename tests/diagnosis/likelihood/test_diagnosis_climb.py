@@ -56,10 +56,8 @@ def test_what_stops_at_its_bound_is_released_where_the_others_pull_it_back():
     low, high = np.full(2, -1.0), np.full(2, 1.0)
     step = bounded(G, slope, low, high)
     best = min(
-        (
-            float(slope @ x + 0.5 * x @ G @ x)
-            for x in np.stack(np.meshgrid(*[np.linspace(-1, 1, 401)] * 2), -1).reshape(-1, 2)
-        )
+        float(slope @ x + 0.5 * x @ G @ x)
+        for x in np.stack(np.meshgrid(*[np.linspace(-1, 1, 401)] * 2), -1).reshape(-1, 2)
     )
     found = float(slope @ step + 0.5 * step @ G @ step)
     assert found <= best + 1e-12 and found < 0
