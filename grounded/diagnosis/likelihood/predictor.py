@@ -316,7 +316,7 @@ class Predictor(SentOnce):
         self._loads[key] = found
         return found
 
-    def weights(self, h: Hypothesis, p: Array, shape: tuple[int, ...]) -> list[dict[str, Any]]:
+    def weights(self, h: Hypothesis, p: Array, shape: tuple[int, ...]) -> list[Mapping[str, Any]]:
         """Return the weights of the velocities in each loss' speed, see `effects.drive`.
 
         Args:
@@ -324,15 +324,16 @@ class Predictor(SentOnce):
             p: parameters (k,), or of as many rows (M, k).
             shape: of those rows; then the weights have it too.
         """
-        found = list[dict[str, Any]]()
+        found = list[Mapping[str, Any]]()
+        each, which = np.unique(np.atleast_2d(p), axis=0, return_inverse=True)
         for effect, _ in losses_of(h):
-            rows = [self._weights_at(effect, row) for row in np.atleast_2d(p)]
-            if len({tuple(row.values()) for row in rows}) == 1:
-                found.append(dict(rows[0]))
-                continue
-            each = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            times = math.prod(shape) // len(rows)
-            found.append({name: np.repeat(w, times).reshape(shape) for name, w in each.items()})
+            rows = [self._weights_at(effect, row) for row in each]
+            own: Mapping[str, Any] = rows[0]
+            if len(own) > 1 and len(rows) > 1:
+                times = math.prod(shape) // len(np.atleast_2d(p))
+                at = np.repeat(which.reshape(-1), times).reshape(shape)
+                own = {name: np.array([row[name] for row in rows])[at] for name in own}
+            found.append(own)
         return found
 
     def _weights_at(self, effect: Effect, p: Array) -> Mapping[str, float]:
@@ -345,7 +346,7 @@ class Predictor(SentOnce):
 
     def _weight_slopes(self, h: Hypothesis, p: Array) -> list[dict[str, Array]]:
         """Return how the weights of each loss' speed change with the parameters, (k,) each."""
-        found = []
+        found = list[dict[str, Array]]()
         for effect, _ in losses_of(h):
             base = self._weights_at(effect, p)
             slopes = {name: np.zeros(len(p)) for name in base}
