@@ -108,15 +108,20 @@ def speed_weights(model: Model, target: str) -> Mapping[str, float]:
     return combined_speeds(model)[tau] if "+" in w else {w: 1.0}
 
 
-def weights_at(model: Model, target: str, p: Array) -> Mapping[str, float]:
-    """Return `speed_weights` of a model with other parameters (k,), those of `model` in order.
+def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping[str, float]:
+    """Return `speed_weights` of a model with other parameters.
 
     They are those of the model itself where its slopes tell none at these parameters.
+
+    Args:
+        model: the model of the loss; adopted effects around it do not count.
+        target: of the loss, `tau<-w` or `tau<-w+w2`.
+        given: parameters by name, also of effects.
     """
     found = speed_weights(model, target)
     if len(found) < 2:
         return found
-    inner, given = _bare_once(model), dict(zip(model.param_names, p, strict=True))
+    inner = _bare_once(model)
     values = np.array([given[name] for name in inner.param_names], float)
     row = inner.input_names.index(target.partition("<-")[0])
     with np.errstate(all="ignore"):

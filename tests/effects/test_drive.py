@@ -160,16 +160,16 @@ def carted(seed=0, steps=400, dt=0.05, parts=25):
 
 
 def test_the_weights_of_a_wheels_speed_follow_the_track():
-    values = dict(zip(cart.param_names, cart.values, strict=True)) | {"track": 0.3, "tau_r": 0.1}
-    p = np.array([values[name] for name in cart.param_names])
+    crudely = dict(zip(cart.param_names, cart.values, strict=True))
+    values = crudely | {"track": 0.3, "tau_r": 0.1, "delay_d": 0.02}  # of an adopted effect, too
     for name, side in (("left", -1), ("right", 1)):
-        at = weights_at(cart, f"{name}<-v+r", p)
-        crude = weights_at(cart, f"{name}<-v+r", cart.values)
+        at = weights_at(cart, f"{name}<-v+r", values)
+        crude = weights_at(cart, f"{name}<-v+r", crudely)
         other = {one for one in at if one != next(iter(at))}.pop()
         ratio = {"r": 0.15, "v": 1 / 0.15}[other]
         assert at[other] == pytest.approx(side * ratio, rel=1e-6)
         assert crude[other] == pytest.approx(side * (0.125 if other == "r" else 8.0), rel=1e-6)
-    assert weights_at(arm, "tau1<-w1", arm.values) == {"w1": 1.0}
+    assert weights_at(arm, "tau1<-w1", {}) == {"w1": 1.0}
 
 
 def frictions(data, **values):

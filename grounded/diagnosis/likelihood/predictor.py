@@ -341,7 +341,8 @@ class Predictor(SentOnce):
         if (found := kept.get(key := p.tobytes())) is None:
             if len(kept) >= WEIGHTS_KEPT:
                 kept.clear()
-            found = kept[key] = weights_at(effect.site.model, effect.site.joined, p)
+            given = dict(zip(self.data.model.param_names, p.tolist(), strict=True))
+            found = kept[key] = weights_at(effect.site.model, effect.site.joined, given)
         return found
 
     def _weight_slopes(self, h: Hypothesis, p: Array) -> list[dict[str, Array]]:
