@@ -11,7 +11,7 @@ from grounded.errors import NextCommand
 from grounded.result import listed
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, number, remark, sentence, show, show_json
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace, typed
 from grounded_trials.wording import extent, misread, with_unit
 
 if TYPE_CHECKING:
@@ -181,7 +181,8 @@ def command(
         text = with_unit(span, model.states[name])
         show(field(name, text, "  "))
     if free:
-        text = _free(free, reward, velocities(model)) if resting else _free(free, reward)
+        rates = velocities(model) if resting else []
+        text = _free(free, reward, rates, path=shape in PATHS)
         if resting is not None and ended is None:
             told = names_told([*resting.columns], resting.columns)
             text += (
@@ -259,7 +260,13 @@ def command(
         )
     if limited := limits_of_log(workspace.config):
         remark("note", limited)
-    show(f"\n{next_line(NextCommand('propose'))}")
+    then = NextCommand("propose")
+    if weighed := _weighed(free, reward):
+        remove = f"remove the weight of {listed(weighed)} from [reward] in grounded.toml"
+        show("")
+        sentence(f"next: {remove}, then: {typed(then)}")
+        return
+    show(f"\n{next_line(then)}")
 
 
 def _tell_undo(
@@ -282,24 +289,37 @@ def _tell_undo(
     )
 
 
-def _free(names: list[str], reward: dict[str, dict[str, float]], rates: Sequence[str] = ()) -> str:
+def _free(
+    names: list[str],
+    reward: dict[str, dict[str, float]],
+    rates: Sequence[str] = (),
+    *,
+    path: bool = False,
+) -> str:
     """Explain what it means that the target has no column for some states.
 
     Args:
         names: the states.
         reward: the tables of [reward].
         rates: the model's velocities if the target is a line, which ends at rest.
+        path: whether it is a path in the plane, along which a single value of a rate fits nothing.
     """
-    weighed = [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
+    weighed = _weighed(names, reward)
     it = "them" if len(names) > 1 else "it"
     ends = [f"--to {n}={'0' if n in rates else 'VALUE'}" for n in weighed]
+    add = f"add a column (`{' '.join(ends)}`), or remove the weight"
     text = f"{listed(names)}: no column in the target, so a run may take {it} anywhere"
     if weighed:
         text += (
             f". [reward] weighs {listed(weighed)}, and `propose` refuses weights without a column: "
-            f"add a column (`{' '.join(ends)}`), or remove the weight"
+            f"{'remove the weight, or add a column in the table' if path else add}"
         )
     return text
+
+
+def _weighed(names: Sequence[str], reward: dict[str, dict[str, float]]) -> list[str]:
+    """Return which of some states have a weight."""
+    return [n for n in names if any(reward.get(k, {}).get(n) for k in ("state", "terminal"))]
 
 
 def _reward(workspace: Workspace) -> dict[str, dict[str, float]]:

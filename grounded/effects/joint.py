@@ -299,7 +299,8 @@ joint_spring = LossFamily(
 added_inertia = LossFamily(
     name="added_inertia",
     equation="u_eff = u - J w'   (u<-w)",
-    sentence="{driven} moves an inertia of {J} more than modelled (a rotor, a gear, a load)",
+    sentence="{driven} moves an inertia of {J} {J>more than modelled (a rotor, a gear, a load)|"
+    "less than modelled}",
     targets=pairs_of,
     quantities=lambda site: (Quantity("J", _per_acceleration(site)),),
     lookalikes=("input_gain", "rate_gain", "parameter"),

@@ -40,6 +40,7 @@ USUAL_EFFECTS = 3  # most effects searched for at first
 FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
+RIVAL = 10.0  # nats behind the chosen set within which another one's plain friction is tried, too
 NEAR = 3.0  # nats behind the likeliest of a size within which fits have to converge
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
@@ -283,7 +284,12 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         _nested(search, chosen)
         if search.chosen(most) is chosen:
             break
-    if (plain := plain_friction(search, chosen := search.chosen(most))) is not chosen:
+    chosen = search.chosen(most)
+    for rival in search.of_size(len(chosen.hypothesis.effects))[:HOPEFUL]:
+        if rival is not chosen and search.score(rival) > search.score(chosen) - RIVAL:
+            plain_friction(search, rival)
+    if (plain := plain_friction(search, chosen)) is not chosen or search.chosen(most) is not chosen:
+        plain = search.chosen(most)
         _nested(search, plain)
         chosen = search.chosen(most)
         if len(chosen.hypothesis.effects) < most and frozenset(chosen.hypothesis.names) not in done:

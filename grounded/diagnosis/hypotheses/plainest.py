@@ -1,17 +1,18 @@
 """Plain dry friction of a joint, fitted as a rival of its other frictions.
 
 A load-dependent friction, a Coulomb friction beside a stiction, and a joint friction whose viscous
-part is zero all contain the plain friction of the joint as a special case with a lower price. If
-the joint's inertia is constant, the candidate for that friction is `coulomb_friction`. It is an
-added rate and can't hold a joint at rest, so any richer friction that can would win for that reason
-alone. Therefore the joint's own friction is fitted as well, in place of a richer one (`plainer`)
-and of the Coulomb friction itself (`holding`): a motor that a knob turns to and fro is at rest
-between two turns, and without a friction that holds it there its time constant was 5 % off.
+part is zero, or is that of all joints, all contain the plain friction of the joint as a special
+case with a lower price. If the joint's inertia is constant, the candidate for that friction is
+`coulomb_friction`. It is an added rate and can't hold a joint at rest, so any richer friction that
+can would win for that reason alone. Therefore the joint's own friction is fitted as well, in place
+of a richer one (`plainer`) and of the Coulomb friction itself (`holding`): a motor that a knob
+turns to and fro is at rest between two turns, and without a friction that holds it there its time
+constant was 5 % off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +37,7 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     found = []
     for h in plain_forms(search, fit.hypothesis):
         key = _key(replace(fit, hypothesis=h))
-        if key not in search.fits or h.names == fit.hypothesis.names:
+        if key not in search.fits or {*h.names} == {*fit.hypothesis.names}:
             # the speed over which another law builds up is not that of this one
             tune(search, search.refined([(h, fit.noise, fit.track)], TO_THE_TOP))
         plain_fit = search.fits.get(key)
@@ -95,10 +96,29 @@ def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]
         if family == "coulomb_friction" and stiction is not None and joint is not None:
             rest = h.minus(effect.name).minus(stiction[0].name)
             yield rest.plus(joint, _of_rate(joint, values))
-        if family == joint_friction.name and values["b"] == 0 and "b" not in effect.fixed:
-            some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
-            dry = replace(effect, quantities=tuple(some))
-            yield h.minus(effect.name).plus(dry, values)
+        if values.get("b") == 0 and _viscous(effect):
+            yield _dry(h, [effect])
+    if len(several := [effect for effect in h.effects if _viscous(effect)]) > 1:
+        yield _dry(h, several)
+
+
+def _viscous(effect: Effect) -> bool:
+    """Return whether an effect is a joint's friction whose viscous part is free."""
+    return effect.family.name == joint_friction.name and "b" not in effect.fixed
+
+
+def _dry(h: Hypothesis, effects: Sequence[Effect]) -> Hypothesis:
+    """Return a hypothesis in which some joint frictions have no viscous part.
+
+    That of one wheel is a cause; of both wheels, it may be what the gain and the time constants of
+    the model say as well.
+    """
+    values = dict(zip(h.names, h.values, strict=True))
+    for effect in effects:
+        some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
+        dry = replace(effect, quantities=tuple(some))
+        h = h.minus(effect.name).plus(dry, {**values[effect.name], "b": 0.0})
+    return h
 
 
 def _of_rate(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
