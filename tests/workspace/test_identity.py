@@ -264,3 +264,22 @@ def test_a_candidate_of_another_model_is_told_as_that():
         predicted_states=[rover.start],
     )
     assert other_task(cart, made) == "a model with other states or inputs"
+
+
+def test_a_candidate_of_another_start_is_told_with_it():
+    """`another start` was read as wrong: the first row of a table had v = 0.00054 m/s."""
+    cart = cart_task()
+    then = np.array(cart.start)
+    then[0] += 0.25
+    made = SimpleNamespace(
+        policy=SimpleNamespace(
+            state_names=cart.model.state_names,
+            input_names=cart.model.input_names,
+            low=cart.low,
+            high=cart.high,
+            horizon=cart.horizon,
+        ),
+        predicted_states=[then],
+    )
+    name, unit = next(iter(cart.model.states.items()))
+    assert other_task(cart, made) == f"a start at {name} = {then[0]:.3g} {unit} then"

@@ -19,6 +19,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -333,6 +334,12 @@ def other_task(task: Task, made: Candidate) -> str:
     ]
     if policy.horizon != task.horizon:
         told.append(f"a horizon of {policy.horizon} steps then")
-    if not np.allclose(then, task.start):
-        told.append("another start")
+    pairs = zip(task.model.states.items(), then, task.start, strict=True)
+    other = [
+        f"{name} = {with_unit(f'{was:.3g}', unit)}"
+        for (name, unit), was, now in pairs
+        if not np.isclose(was, now)
+    ]
+    if other:
+        told.append(f"a start at {listed(other)} then")
     return "; ".join(told) or "another target, reward or feedback"
