@@ -104,7 +104,7 @@ def _judged(
     curves: Sequence[_Curve],
     weights: Array,
     where: Horizon,
-) -> Correction:
+) -> Correction | None:
     """Test a correction by the squared errors of each trial, with weights from the others."""
     data, h = predictor.data, fit.hypothesis
     of_start = data.trial_of[where.run]
@@ -119,6 +119,8 @@ def _judged(
             for one in (h, _with(h, predictor, channel, curves, own))
         )
         gains.append(1 - after / before)
+    if not gains:  # no trial is long enough to judge it
+        return None
     gain = float(np.mean(gains))
     scatter = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
     unit, shapes = per_second(data.model.states[channel]), []

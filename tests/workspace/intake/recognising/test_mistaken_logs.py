@@ -382,3 +382,31 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
         holds(one, f"{plan.id} sends on {listed}", f"by {share:.2g} of the last") for one in told
     )
     assert not any("logged" in one and "late" in one for one in found.warnings if one not in told)
+
+
+@pytest.mark.parametrize("predicts", [False, True])
+def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is_told(
+    w, tmp_path, predicts
+):
+    """80 ms ahead of a camera's, with `sensor_delay:psi` adopted: costs tripled, without a word."""
+    toml, dt = w.folder / "grounded.toml", w.task.dt
+    late = ", ".join(
+        f'{{name = "sensor_delay:{one}", d = {2 * dt}}}' for one in w.base_model.state_names
+    )
+    toml.write_text(toml.read_text().replace("[model]", f"[model]\neffects = [{late}]", 1))
+    w.forget()
+    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
+    runner, x, rows, past = Runner(plan.policy), w.task.start.copy(), [], []
+    for k in range(w.task.horizon):
+        past.append(x + RNG.normal(0, 1e-4, 3))
+        logged = past[max(0, k - 2)]
+        u = runner.action(k * dt, past[k] if predicts else logged)
+        rows.append([k * dt, *logged, *u])
+        x = model.system.step(x[None], u[None], model.values, dt)[0]
+    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    found = w.ingest(path)
+    told = [one for one in found.warnings if "predict them ahead" in one]
+    assert len(told) == predicts == (found.then.verb == "discard")
+    assert all(
+        holds(one, "sensor_delay:psi", plan.id, "newer than those in the log") for one in told
+    )

@@ -14,6 +14,7 @@ only the velocities are late shows in the commands.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ UNSENT = 5  # steps without a command that are fewer are sought where the run be
 LACKING, SENT = 0.05, 0.25  # difference of commands in these, and share of it in the later steps
 MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
+NEARLY = 0.4  # largest part of an adopted delay by which states that were predicted ahead miss it
 NAMED = 2  # largest number of states that are named
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
@@ -46,15 +48,38 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> str:
         workspace: the workspace with the task and the candidate.
         trial: the trial as stored.
     """
-    return steps_skipped(workspace, trial) or _smoothed(workspace, trial)
-
-
-def _smoothed(workspace: Folder, trial: Trial) -> str:
     if not trial.candidate:
         return ""
+    if told := steps_skipped(workspace, trial):
+        return told
     own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
-    found = smoothed(workspace.base_model, own, whole)
-    return f"its commands are {found.told(own)}, and run {own.id} again" if found else ""
+    if found := smoothed(workspace.base_model, own, whole):
+        return f"its commands are {found.told(own)}, and run {own.id} again"
+    return _predicted_ahead(workspace, own, whole)
+
+
+def _predicted_ahead(workspace: Folder, own: Candidate, trial: Trial) -> str:
+    """Return the warning for a run that acted on states as new as an adopted delay makes them."""
+    effects = _delays(workspace)
+    if not effects or own.sample_age:
+        return ""
+    delay = float(np.median([one["d"] for one in effects]))
+    age = sample_age(workspace.task, own, [trial])
+    if not abs(age + delay) < NEARLY * delay:
+        return ""
+    names = listed([str(one["name"]) for one in effects])
+    return (
+        f"its commands are what {own.id} sends on states that are {-1e3 * age:.2g} ms newer than "
+        "those in the log: does its program predict them ahead, or is only the log late? The plan "
+        f"allows for {names} already. Let it act on the samples as they are logged or, if only the "
+        f"log is late, set delay_s in [log] in place of these effects; and run {own.id} again"
+    )
+
+
+def _delays(workspace: Folder) -> list[dict[str, Any]]:
+    """Return the adopted delays of sensors."""
+    effects = workspace.config.model.effects
+    return [one for one in effects if str(one["name"]).startswith("sensor_delay:")]
 
 
 def steps_skipped(workspace: Folder, trial: Trial) -> str:
@@ -131,8 +156,7 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
     """
     from grounded.fit.prediction import rms  # a slow import
 
-    task, effects = workspace.task, workspace.config.model.effects
-    delayed = [str(e["name"]) for e in effects if str(e["name"]).startswith("sensor_delay:")]
+    task, delayed = workspace.task, [str(one["name"]) for one in _delays(workspace)]
     allowed = {n for name in delayed for n in name.partition(":")[2].split("+")}
     states = trial.states[: task.horizon + 1]
     if own.policy.gain is None or len(states) < 2:
