@@ -182,7 +182,7 @@ def command(
         show(field(name, text, "  "))
     if free:
         rates = velocities(model) if resting else []
-        text = _free(free, reward, rates, path=shape in PATHS)
+        text = _free(free, reward, rates, path=shape in PATHS and not ends)
         if resting is not None and ended is None:
             told = names_told([*resting.columns], resting.columns)
             text += (

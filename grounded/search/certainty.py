@@ -288,13 +288,9 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         )
     if error == 0:
         return f"the last gain in utility is {figure(gain, 3)}; repeated trials agree exactly"
-    began = 0.0 if after.starts is None else after.starts.owed(after, before)
-    lucky = math.isfinite(began) and began > PART * abs(gain)
     return (
         f"the last gain in utility is {with_error(gain, error)}: an improvement with probability "
         f"{chance(before, after, history):.2f}{few(Repeats(history).near(after.utility).repeats)}"
-        + f"; by the model, {began:.2g} of it is due to where their runs began"
-        * lucky
     )
 
 
@@ -365,7 +361,18 @@ def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> boo
 
 
 def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
-    """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown."""
+    """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown.
+
+    Where no model was grounded on both, it is the planning model's (`Starts`).
+    """
+    found = _of_grounded(before, after, history)
+    if (not found or math.isnan(found)) and after.starts is not None and before.trials:
+        planned = after.starts.owed(after, before)
+        return planned if math.isfinite(planned) else found
+    return found
+
+
+def _of_grounded(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     if not (before.trials and after.trials and began_apart(before, after)):
         return 0.0
 

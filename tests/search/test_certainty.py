@@ -301,8 +301,11 @@ def test_a_lead_that_lucky_starts_explain_is_told_so():
         trials = (from_to_zero(0.0),) * len(utilities)
         return Tried(candidate, trials, utilities, True, starts=starts)
 
-    first = ran("c0001", (-5.0, -6.0))
-    assert "0.9 of it is due to where" in last_improvement([first, ran("c2", (-4.9,), owed=0.9)])
+    first, led = ran("c0001", (-5.0, -6.0)), ran("c2", (-4.9,), owed=0.9)
+    fair = ran("c2", (-4.9,))
+    assert chance(first, led, [first, led]) < chance(first, fair, [first, fair])
+    assert "0.9 of it is due to where" in last_improvement([first, led])
+    assert "probability" not in last_improvement([first, led])  # which took all for a gain
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=0.01)])
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=np.nan)])
 
