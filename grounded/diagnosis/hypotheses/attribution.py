@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.joint_model import joint_model
-from grounded.diagnosis.hypotheses.plainest import plain_friction
+from grounded.diagnosis.hypotheses.plainest import drier, plain_friction
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -40,7 +40,7 @@ USUAL_EFFECTS = 3  # most effects searched for at first
 FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-RIVAL = 10.0  # nats behind the chosen set within which another one's plain friction is tried, too
+RIVAL = 10.0  # nats behind the chosen set within which another one's dry frictions are tried, too
 NEAR = 3.0  # nats behind the likeliest of a size within which fits have to converge
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
@@ -287,9 +287,9 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     chosen = search.chosen(most)
     for rival in search.of_size(len(chosen.hypothesis.effects))[:HOPEFUL]:
         if rival is not chosen and search.score(rival) > search.score(chosen) - RIVAL:
-            plain_friction(search, rival)
-    if (plain := plain_friction(search, chosen)) is not chosen or search.chosen(most) is not chosen:
-        plain = search.chosen(most)
+            drier(search, rival)
+    plain_friction(search, chosen)
+    if (plain := search.chosen(most)) is not chosen:
         _nested(search, plain)
         chosen = search.chosen(most)
         if len(chosen.hypothesis.effects) < most and frozenset(chosen.hypothesis.names) not in done:

@@ -13,7 +13,7 @@ only the velocities are late shows in the commands.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def _predicted_ahead(workspace: Folder, own: Candidate, trial: Trial) -> str:
     )
 
 
-def _delays(workspace: Folder) -> list[dict[str, Any]]:
+def _delays(workspace: Folder) -> list[Mapping[str, Any]]:
     """Return the adopted delays of sensors."""
     effects = workspace.config.model.effects
     return [one for one in effects if str(one["name"]).startswith("sensor_delay:")]
