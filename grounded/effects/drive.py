@@ -89,6 +89,7 @@ def _slopes(model: Model, values: Array) -> tuple[Array, Array]:
     return f_u[:, at] / dt, slopes
 
 
+@lru_cache(maxsize=KEPT)
 def _bare(model: Model) -> Model:
     """Return the model inside all adopted effects, with the current parameters."""
     found = model
@@ -121,7 +122,7 @@ def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping
     found = speed_weights(model, target)
     if len(found) < 2:
         return found
-    inner = _bare_once(model)
+    inner = _bare(model)
     values = np.array([given[name] for name in inner.param_names], float)
     row = inner.input_names.index(target.partition("<-")[0])
     with np.errstate(all="ignore"):
@@ -131,9 +132,6 @@ def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping
         W, names = _combinations(F, slopes)[row], _velocities(inner)
         weights = {name: W[names.index(name)] / W[names.index(next(iter(found)))] for name in found}
     return weights if np.isfinite(list(weights.values())).all() else found
-
-
-_bare_once = lru_cache(maxsize=KEPT)(_bare)
 
 
 def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None) -> Any:

@@ -18,7 +18,7 @@ from grounded.places import velocities
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import LEAST
+from grounded.search.returned.who_drove import LEAST, states_ago
 from grounded.trial import Trial
 
 OFF = 0.02  # rms difference of the commands, relative to their size, from which a filter is sought
@@ -34,7 +34,6 @@ class Smoothed:
 
     names: tuple[str, ...]
     share: float  # of the last value, a
-    off: float  # rms difference of the logged commands from the policy's, relative to their size
     lag_s: float  # by which a steady motion is seen late [s]
 
     def told(self, own: Candidate) -> str:
@@ -63,10 +62,7 @@ def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:
     if off < OFF:
         return None
     x = trial.states[:T]
-    at, before = np.divmod(np.arange(T) - AGES[:, None], 1)
-    now = np.clip(at.astype(int), 0, T - 1)
-    then = np.minimum(now + 1, T - 1)
-    aged = x[now] + before[..., None] * (x[then] - x[now])
+    aged = np.stack([states_ago(x, age, policy.angles) for age in AGES])
     least = min(float(_off(policy, trial, late, aged).min()) for late in range(LATE + 1))
     best, found = min(LEAVES * off, RATHER * least), None
     for late in range(LATE + 1):
@@ -79,7 +75,7 @@ def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:
             if left[k] < best:
                 best, share = float(left[k]), float(SHARES[k])
                 lag = share / (1 - share) * trial.dt
-                found = Smoothed(tuple(policy.state_names[i] for i in group), share, off, lag)
+                found = Smoothed(tuple(policy.state_names[i] for i in group), share, lag)
     return found
 
 

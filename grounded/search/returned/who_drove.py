@@ -75,7 +75,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         return None
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
-    earlier = [_earlier(trial.states[:T], back, policy.angles) for back in BACK]
+    earlier = [states_ago(trial.states[:T], back, policy.angles) for back in BACK]
     states = np.stack([*earlier, _noisy(policy, trial.states[:T])])
     *_, with_noise = asked = policy.commands(states, policy.past if past is None else past)
     free = asked[:-1]
@@ -257,7 +257,7 @@ def latest(task: Task) -> int:
     return 1 + int(np.ceil(task.latency.max() / task.dt))
 
 
-def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
+def states_ago(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
     """Return the states some steps ago, (T, n), linearly interpolated between samples."""
     whole, part = divmod(steps, 1)
     at, last = np.arange(len(states)) - int(whole), len(states) - 1

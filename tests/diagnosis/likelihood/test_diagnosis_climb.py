@@ -128,8 +128,10 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
 
     trials = learn(task, run, SearchOptions(max_trials=4)).trials
     found = diagnose(task, trials)
-    row = next(one for one in found.ranking if one.effect == "coulomb_friction:omega")
-    assert row.claimed
+    mass, row = found.ranking[:2]  # both are its causes, and nothing else is claimed
+    assert (mass.effect, row.effect) == ("parameter:m", "coulomb_friction:omega")
+    assert mass.claimed and row.claimed
+    assert mass.params["d"].value == pytest.approx(HEAVIER - 1, rel=0.03)  # of 1 kg
     assert row.params["c"].value == pytest.approx(FRICTION / (HEAVIER * 0.25), rel=0.1)
     # it builds up over 0.05 rad/s; from 0.05 to the likeliest, 0.061, evidence rises by 1.7 nats
     assert row.fixed["width"] == pytest.approx(0.05, abs=0.015)

@@ -342,18 +342,29 @@ def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_p
     assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)
 
 
+def driven_by(w, path, action, noise=1e-3, late=0):
+    """Write the log of a run whose program sends action(k, the states as they are logged, now)."""
+    model, x, rows, past = w.base_model, w.task.start.copy(), [], []
+    for k in range(w.task.horizon):
+        past.append(x + RNG.normal(0, noise, 3))
+        logged = past[max(0, k - late)]
+        u = action(k, logged, past[k])
+        rows.append([k * w.task.dt, *logged, *u])
+        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    return w.ingest(path)
+
+
 @pytest.mark.parametrize("waits", [0, 8])
 def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
     """It stood still for a second and skipped 20 steps: -1.704 became a run of the first policy."""
-    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
-    runner, x, rows = Runner(plan.policy), w.task.start.copy(), []
-    for k in range(w.task.horizon):
-        seen = x + RNG.normal(0, 1e-3, 3)
-        u = runner.action(k * w.task.dt, seen) if k >= waits else np.zeros(2)
-        rows.append([k * w.task.dt, *seen, *u])
-        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
-    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
-    found = w.ingest(path)
+    plan, dt = w.propose().candidate, w.task.dt
+    runner = Runner(plan.policy)
+
+    def action(k, logged, now):
+        return runner.action(k * dt, logged) if k >= waits else np.zeros(2)
+
+    found = driven_by(w, tmp_path / "run.csv", action)
     told = [one for one in found.warnings if "sent nothing but what was held" in one]
     assert len(told) == (waits > 0) == (found.then.verb == "discard")
     assert all(holds(one, "8 steps (0.4 s)", "since the run began", plan.id) for one in told)
@@ -364,17 +375,14 @@ def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
 )
 def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, names):
     """0.7 of the last pose: commands "logged 2 steps late", or a run eight times worse, untold."""
-    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
-    which = np.array([name in names.split() for name in model.state_names])
-    runner, x, rows, smooth = Runner(plan.policy), w.task.start.copy(), [], None
-    for k in range(w.task.horizon):
-        seen = x + RNG.normal(0, 0.02, 3)
-        smooth = seen if smooth is None else share * smooth + (1 - share) * seen
-        u = runner.action(k * w.task.dt, np.where(which, smooth, seen))
-        rows.append([k * w.task.dt, *seen, *u])
-        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
-    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
-    found = w.ingest(path)
+    plan, dt, smooth = w.propose().candidate, w.task.dt, []
+    which, runner = np.isin(w.base_model.state_names, names.split()), Runner(plan.policy)
+
+    def action(k, logged, now):
+        smooth.append(share * smooth[-1] + (1 - share) * logged if smooth else logged)
+        return runner.action(k * dt, np.where(which, smooth[-1], logged))
+
+    found = driven_by(w, tmp_path / "run.csv", action, noise=0.02)
     told = [one for one in found.warnings if "smoothed by" in one]
     assert len(told) == (share > 0) == (found.then.verb == "discard")
     listed = " and ".join(names.replace(" ", ", ", names.count(" ") - 1).rsplit(" ", 1))
@@ -395,16 +403,13 @@ def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is
     )
     toml.write_text(toml.read_text().replace("[model]", f"[model]\neffects = [{late}]", 1))
     w.forget()
-    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
-    runner, x, rows, past = Runner(plan.policy), w.task.start.copy(), [], []
-    for k in range(w.task.horizon):
-        past.append(x + RNG.normal(0, 1e-4, 3))
-        logged = past[max(0, k - 2)]
-        u = runner.action(k * dt, past[k] if predicts else logged)
-        rows.append([k * dt, *logged, *u])
-        x = model.system.step(x[None], u[None], model.values, dt)[0]
-    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
-    found = w.ingest(path)
+    plan = w.propose().candidate
+    runner = Runner(plan.policy)
+
+    def action(k, logged, now):
+        return runner.action(k * dt, now if predicts else logged)
+
+    found = driven_by(w, tmp_path / "run.csv", action, noise=1e-4, late=2)
     told = [one for one in found.warnings if "predict them ahead" in one]
     assert len(told) == predicts == (found.then.verb == "discard")
     assert all(
