@@ -9,6 +9,7 @@ Read `ruler`, then `decide`. The modules, from the measurement to the claims:
     visits             where an effect acts, and whether only few trials show it
     motions            in how many different motions an effect is seen
     decide             the decision between likely hypotheses, by the ruler
+    bounds             what the bounds of the model's parameters say about an effect beside them
     own_numbers        the model's own numbers in place of effects that tie with them
     measured           errors, noise floor, credit and leftover of a decision
     held_out           the noise-normalised gap and utilities, held out

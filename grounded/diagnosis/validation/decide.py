@@ -12,7 +12,8 @@ under every other noise structure, are compared by the `ruler`:
        per cent of their errors in the mean (other trials gain nothing by it). A further
        effect with very high evidence, beside white innovations only, is dropped only if predictions
        gain nothing.
-    3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both.
+    3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both. So
+       is one whose size is set by a parameter's bound.
        A likely effect stays without which the model's parameters would end at their bounds, if
        predictions gain by it at all.
     4. An effect without a mechanism that a single motion shows is dropped, however often the motion
@@ -43,6 +44,7 @@ from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, Hypothe
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.agreement import is_nowhere
+from grounded.diagnosis.validation.bounds import held_up, set_by_bound
 from grounded.diagnosis.validation.gain import BETTER, Gain
 from grounded.diagnosis.validation.motions import of_no_size, repeats
 from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbers, with_mechanism
@@ -100,7 +102,7 @@ class Decision:
     @property
     def held_up(self) -> dict[str, tuple[str, ...]]:
         """By effect, the model's parameters that would end at their bounds without it."""
-        kept = {n: _held_up(self.search, self.fit, less, n) for n, less in self.without.items()}
+        kept = {n: held_up(self.search, self.fit, less, n) for n, less in self.without.items()}
         return {n: names for n, names in kept.items() if names}
 
 
@@ -193,6 +195,8 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
     def likelier(other: Fitted) -> bool:
         nats = search.score(other) - search.score(fit)
         refused = nats <= TIE * (h.spread > 0) or {*other.hypothesis.names} == names
+        added = {*other.hypothesis.names} - names
+        refused = refused or any(set_by_bound(search, other, fit, name) for name in added)
         return not refused and not _outdone(ruler.gain(other, fit), _adopted(other, names))
 
     for other in sorted(filter(likelier, others), key=search.score, reverse=True):
@@ -353,7 +357,9 @@ def _pruned(
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
         some = search.data.count > 1  # of one log, all pieces but one may miss a rare motion
-        undone = counterparts(search.predictor, fit.hypothesis)
+        undone = counterparts(search.predictor, fit.hypothesis) or [
+            n for n in fit.hypothesis.names if set_by_bound(search, fit, without[n], n)
+        ]
         repeated = {n: repeats(search, fit, without[n], n) for n in equations(fit)}
         repeated |= {n: 0 for n, k in repeated.items() if k and _whole(search, fit, without[n], n)}
         idle = (
@@ -371,7 +377,7 @@ def _pruned(
         )
         if not undone:  # what loses nothing is not needed, whatever its evidence
             helps = {n for n in idle if gains[n].mean > 0}
-            idle = [n for n in idle if n not in helps or not _held_up(search, fit, without[n], n)]
+            idle = [n for n in idle if n not in helps or not held_up(search, fit, without[n], n)]
         if not idle:
             return fit, without, doubtful
         name = _least_needed(search, ruler, without, min(idle, key=lambda n: gains[n].mean), idle)
@@ -398,28 +404,6 @@ def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bo
     if own - search.score(less) < LARGE_GAIN or any(own - search.score(f) < SURE for f in rivals):
         return False
     return not leftovers(search.predictor, fit)
-
-
-def _held_up(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> tuple[str, ...]:
-    """Return the model's parameters that a likely effect keeps off their bounds.
-
-    Without it, they describe the data only with values that the user excludes. None if as many are
-    at their bounds with it.
-    """
-    if name not in equations(fit) or not search.score(fit) - search.score(less) > LARGE_GAIN:
-        return ()
-    with_it, without = _stopped(search, fit), _stopped(search, less)
-    if len(without) <= len(with_it):
-        return ()
-    return tuple(one for one in without if one not in with_it)
-
-
-def _stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
-    """Return the model's parameters that a fit leaves at a bound."""
-    model, shift = search.data.model, fit.hypothesis.shift
-    values = model.values if shift is None else model.values + shift
-    params = zip(model.params.items(), values, strict=True)
-    return [name for (name, param), value in params if param.stopped(float(value))]
 
 
 def _least_needed(
