@@ -83,6 +83,16 @@ def test_what_is_weighed_is_spoken_of(diagnosis):
     assert names == [["x"]]  # v has no weight
 
 
+def test_what_alone_improved_is_spoken_of_though_it_has_no_weight(diagnosis):
+    """The verdict named v; the page told of the heading "by 0.0066 rad instead of 0.0065 rad"."""
+    (row,) = diagnosis.prediction_error
+    speed = replace(row, crude={"x": 0.0065, "v": 0.31}, with_effects={"x": 0.0066, "v": 0.04})
+    found = replace(diagnosis, prediction_error=(speed,))
+    assert gained_most(found, cart_task()) == [(["v"], "v")]
+    text = gained(found, cart_task())
+    assert "v by 0.040 m/s instead of 0.31 m/s" in text and "x by" not in text
+
+
 def test_ties_are_named_and_nothing_left_is_said(diagnosis):
     tied = replace(diagnosis, indistinguishable=(("a:v", "b:v"),), leftover=())
     assert "a:v from b:v" in three_lines(tied, cart_task())[-1]

@@ -21,6 +21,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import NORMAL, averaged
 from grounded.diagnosis.validation.blame import ENOUGH, moved_parameters
+from grounded.diagnosis.validation.bounds import set_by_bound
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
@@ -299,6 +300,7 @@ class Claims:
             as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
             needed = (h.spread > 0) == free or as_likely
             beyond = other in no_limits(self.data, h) or _restated(name, other, rest)
+            beyond = beyond or set_by_bound(self.search, f, self.best, other)
             if other not in (name, *found) and needed and not beyond and self._ties(name, other, f):
                 found[other] = f
         return list(found.items())[:2]

@@ -8,7 +8,15 @@ from collections.abc import Mapping
 from grounded.diagnosis.cause_words import with_worth
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.ruler_words import COMPARABLE, in_doubt, open_noise, rest, telling, worsened
+from grounded.diagnosis.ruler_words import (
+    COMPARABLE,
+    SHOWS,
+    in_doubt,
+    open_noise,
+    rest,
+    telling,
+    worsened,
+)
 from grounded.diagnosis.verdict import OPEN, also_off, told_apart, told_of
 from grounded.result import listed, measured_alike
 from grounded.task import Task
@@ -94,7 +102,10 @@ def gained(
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
-    """The weighed states that a verdict speaks of: the position, then what improved most."""
+    """The states that a verdict speaks of: the position, then what improved most of the weighed.
+
+    If no weighed state improved so much that the verdict names it, those that did.
+    """
     row = telling(diagnosis.prediction_error)
     if row is None:
         return []
@@ -107,6 +118,11 @@ def _improved(
 ) -> list[tuple[list[str], str]]:
     groups = [g for g in weighed_groups(task) if all(before.get(n, 0.0) > 0 for n in g[0])]
     ratio = {what: _together(now, names) / _together(before, names) for names, what in groups}
+    if min(ratio.values(), default=0.0) > 1 - SHOWS:  # a speed alone, which has no weight
+        others = {n: now[n] / error for n, error in before.items() if error > 0}
+        others = {n: of for n, of in others.items() if of < 1 - SHOWS}
+        ratio = others or ratio
+        groups = [([n], n) for n in others] or groups
     best = min(ratio.values(), default=0.0)
     rates = {g[1] for g, rate in zip(groups, rates_among(task, groups), strict=True) if rate}
 
