@@ -175,6 +175,7 @@ def test_a_richer_friction_that_predictions_refused_is_not_named_as_likelier(mon
     ruler = SimpleNamespace(held_out=True, gain=lambda *fits: gain)
     monkeypatch.setattr(decide, "plainer", lambda s, f: [plain] if f is loaded else [])
     monkeypatch.setattr(decide, "_pays", lambda *given: pays)
+    monkeypatch.setattr(decide, "set_by_bound", lambda *given: False)
     named = decide._likelier(search, plain, ruler, white=False)
     assert named is (loaded if pays else other)  # what differs otherwise is still found
 
