@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from grounded import GroundedError, Model, Param, Trial
+from grounded.effects import Library, wrap
+from grounded.instruments.predictions.short_runs import predicted
 from grounded.instruments.sound_trials import sound_trials
 from grounded.instruments.units.plane_units import judge_positions, positions_off
 
@@ -133,3 +135,57 @@ def test_a_ball_in_metres_is_right_also_with_a_crude_model():
     for g in (1.0, 40.0):
         crude = BALL.with_values({"g": g})
         assert positions_off(crude, rolled(), range(3)) is None
+
+
+BOAT = Model(
+    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"},
+    inputs={"left": "1", "right": "1"},
+    params={"thrust": Param(1.1, "m/s^2", 0.3, 3.0), "c": Param(1.1, "1/s", 0.3, 3.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
+        "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
+        "psi": s.r,
+        "u": p.thrust * (a.left + a.right) - 0.3 * s.u - 0.5 * np.abs(s.u) * s.u,
+        "v": -p.c * s.v - 1.4 * np.abs(s.v) * s.v - 0.6 * s.u * s.r,
+        "r": 2.0 * (a.right - a.left) - 0.8 * s.r,
+    },
+)
+
+
+def turned(late=2, factor=1.0, steps=400, dt=0.1):
+    """A log of a boat whose speed ahead is logged some steps late, with its true values unknown."""
+    rng = np.random.default_rng(2)
+    sent = np.repeat(rng.uniform(-1, 1, (steps // 16, 2)), 16, axis=0)
+    rows = [np.zeros(6)]
+    for a in sent:
+        rows.append(BOAT.system.step(rows[-1][None], a[None], BOAT.values, dt)[0])
+    x = np.array(rows)
+    x[:, 3] = x[np.maximum(np.arange(len(x)) - late, 0), 3]
+    x += rng.normal(0, [0.01, 0.01, 0.004, 0.006, 0.006, 0.004], x.shape)
+    x[:, [0, 1, 3, 4]] *= factor
+    return Trial(x, sent, dt, BOAT.state_names, BOAT.input_names)
+
+
+@pytest.mark.parametrize("effect", ["sensor_delay", "sensor_lag"])
+@pytest.mark.parametrize("factor", [1.0, 1000.0])
+def test_a_speed_that_is_known_to_be_late_is_in_no_other_unit(effect, factor):
+    """A boat's `sensor_delay:u` was adopted; all its runs were to be discarded as logged in cm.
+
+    Its sway follows from the true speed behind that log, which was taken as 0.
+    """
+    values = {"d": 0.2} if effect == "sensor_delay" else {"tau": 0.2}
+    model = wrap(Library().effect(f"{effect}:u", BOAT), values, 0.1)
+    one = turned(factor=factor)
+    unknown = np.full((len(one.states), model.n - 6), np.nan)
+    log = Trial(
+        np.hstack([one.states, unknown]), one.inputs, 0.1, model.state_names, model.input_names
+    )
+    found = positions_off(model, log, range(6))
+    assert (found and (found.names, found.factor)) == (
+        None if factor == 1 else (("x", "y", "u", "v"), 1000.0)
+    )
+    if factor == 1:
+        start, then, logged = predicted(model, log, range(6))
+        missed = 0.3 if effect == "sensor_delay" else 0.7  # of a lag, the log stands for the start
+        assert np.std((then - logged)[:, 3]) < missed * np.std((logged - start)[:, 3])

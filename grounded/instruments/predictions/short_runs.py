@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import true_values
 from grounded.rollout import stepper
 from grounded.trial import Trial
 
@@ -41,7 +42,7 @@ def predicted(
     Args:
         model: that predicts.
         trial: of this model's states.
-        shown: indices of the states with a sensor; the others are taken as 0.
+        shown: indices of the states with a sensor.
         horizon: [s].
 
     Returns:
@@ -49,8 +50,7 @@ def predicted(
         None if too little is known.
     """
     steps = max(1, round(horizon / trial.dt))
-    logged = np.array(trial.states)
-    logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # unknown
+    logged = starts_from(model, trial, shown)
     good = np.asarray(np.isfinite(logged).all(axis=1))
     at = np.flatnonzero(good[:-steps] & good[steps:])
     if len(at) < 5:
@@ -82,6 +82,26 @@ def missed(
         return float("nan")
     _, x, logged = ahead
     return size_of(model.difference(x, logged)[:, some] / unit)
+
+
+def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
+    """Return the states that predictions start from at each sample, (T + 1, n).
+
+    States without a sensor are taken as 0, but true values behind a delayed log as what is logged
+    later. A boat's sway follows from its true speed. Predicted from 0, 98 % of it was missed, and
+    less of it with all lengths divided by 100, as if the log was in cm.
+    """
+    names, x = model.state_names, np.array(trial.states)
+    hidden = [i for i in range(model.n) if i not in shown]
+    x[:, hidden] = 0.0
+    for i, k in true_values(names, [names[i] for i in hidden]).items():
+        stem, _, steps = names[i].rpartition("_")
+        stem, ago = (stem, int(steps)) if steps.isdigit() else (names[i], 0)
+        late = sum(f"{stem}_{j + 1}" in names for j in range(model.n))  # up to one step too long
+        at = np.arange(len(x)) + late - ago
+        newer, older = (x[np.clip(at - j, 0, len(x) - 1)] for j in (0, 1 if late else 0))
+        x[:, i] = (older + 0.5 * model.difference(newer, older))[:, k]
+    return x
 
 
 def size_of(x: Array) -> float:
@@ -134,8 +154,7 @@ class Ahead:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(AHEAD / trial.dt))
         self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
-        logged = np.array(trial.states)
-        logged[:, [i for i in range(model.n) if i not in self.shown]] = 0.0  # unknown
+        logged = starts_from(model, trial, self.shown)
         good = np.asarray(np.isfinite(logged).all(axis=1))
         at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
