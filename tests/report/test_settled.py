@@ -174,6 +174,19 @@ def test_a_parameter_known_only_with_the_others_is_adopted_and_marked(cart, tmp_
     assert any("not determined alone" in clause for clause in adopted["clauses"])
 
 
+def test_a_parameter_at_its_bound_is_told_so_also_once_adopted(cart, tmp_path):
+    """`Yvd 3.000 +- 0.020 kg, was 15` was an added mass that a boat's data asked to be less."""
+    folder = written(copied(cart, tmp_path / "w"))
+    code = (folder / "model.py").read_text()
+    bounded = re.sub(r'"mass": Param\(1.0, "kg"[^)]*\)', '"mass": Param(1.0, "kg", 0.5, 1.4)', code)
+    (folder / "model.py").write_text(bounded)
+    assert bounded != code
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    assert "kg, at its bound, the data ask for more, was 1" in words(folder, "status")
+    clauses = grounded("-C", folder, "report", "--json").json["adopted"]["clauses"]
+    assert clauses[1] == "mass 1.00 -> 1.40 kg, at its bound, the data ask for more"
+
+
 def test_an_effect_that_shows_only_in_combination_is_adopted_and_marked(cart, tmp_path):
     one = {"values": ["viscous_friction:v"], "rests_on": {"mass": 0.1}}
     folder = written(copied(cart, tmp_path / "w"), combinations=[one])

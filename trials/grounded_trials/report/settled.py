@@ -13,7 +13,7 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError
-from grounded.model import Model
+from grounded.model import Model, Param
 from grounded.result import listed, number
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
@@ -296,8 +296,17 @@ def _rows(
         yield name, f"{', '.join(each)}{_given(name, rests)}{alike}"
     for name, value in table.params.items():
         if name in model.params and model.params[name].value != value:
-            first, unit = model.params[name].value, model.params[name].unit
-            yield name, f"{told(name, value, unit)}{_given(name, rests)}, was {number(first)}"
+            param = model.params[name]
+            text = f"{told(name, value, param.unit)}{_at_end(param, value)}{_given(name, rests)}"
+            yield name, f"{text}, was {number(param.value)}"
+
+
+def _at_end(param: Param, value: float) -> str:
+    """Return `, at its bound, the data ask for less` of such a value; "" for another."""
+    from grounded.diagnosis.cause_words import ended
+
+    at = Estimate(value, stopped=param.stopped(value))
+    return "".join(f", {clause}" for clause in ended(at, param.value))
 
 
 def _moved(
@@ -313,6 +322,7 @@ def _moved(
     known = {n: p for n, p in model.params.items() if n in params and params[n] != p.value}
     return [
         changed(name, p.value, params[name], p.unit)
+        + _at_end(p, params[name])
         + ALONE * (name in jointly)
         + _given(name, rests)
         for name, p in known.items()
