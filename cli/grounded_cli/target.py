@@ -106,7 +106,7 @@ def command(
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
     from grounded_trials.workspace.candidates.rest_at_end import NOISY, names_told, rest_at_end
     from grounded_trials.workspace.candidates.standstill import read_at_start
-    from grounded_trials.workspace.off_target import driven, rates_beside
+    from grounded_trials.workspace.off_target import driven, position_names, rates_beside
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import limits_of_log, without_range
 
@@ -200,9 +200,11 @@ def command(
             f"{', '.join(f'{name} = {number(value)}' for name, value in rest.items())}. If runs "
             "begin elsewhere, change it and draw the target again"
         )
+    shared = len({*position_names(model)} & {*columns}) > 1
+    alike = ", coordinates of a position alike by the smaller of their ranges" * shared
     slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))
     for kind, by in (
-        ("state", f"1 / (range in the target)^2{slower}"),
+        ("state", f"1 / (range in the target)^2{alike}{slower}"),
         ("terminal", "ten times such weights, for the end"),
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
