@@ -11,6 +11,8 @@ from grounded.result import Document, measured_alike, number, percent, with_unit
 
 ABOVE = 1.3  # times the noise floor, above which a leftover is stated
 SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
+AT_MOST = "repeats, at most"  # source of a noise floor that holds errors of the model as well
+BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
 BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
@@ -89,8 +91,9 @@ class ChannelParts(Document):
 class Split(Document):
     """The parts of the prediction error at one horizon: all states relative to noise, and each.
 
-    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise"; "at
-    most" means that only an upper bound of the noise is known. NaN: the noise is not known.
+    The irreducible part comes from "repeats" of a candidate, "repeats, at most", trials "alike", or
+    the "noise"; "at most" means that only an upper bound of the noise is known. NaN: the noise is
+    not known.
     `irreducible_unsure`: standard deviation of the logarithm of the noise, from few repeats.
     """
 
@@ -103,7 +106,7 @@ class Split(Document):
     @property
     def bound(self) -> bool:
         """Whether the irreducible part is an upper bound."""
-        return self.irreducible_from in ("at most", "alike")
+        return self.irreducible_from in ("at most", *BOUNDS)
 
     def may_be_noise(self, parts: Parts | ChannelParts) -> bool:
         """Check whether the unexplained part is within the uncertainty of the noise."""
@@ -186,8 +189,8 @@ class RulerRow(Document):
     held_out: by "trials", by "pieces" of one long log, or "no" if there are too few data.
     outset: errors of the model before anything was adopted; empty if nothing was.
     calibrated: errors with the model's own parameters fitted; empty if all are constants.
-    floor_from: "repeats" of a candidate, trials whose commands are "alike", or the "short horizon",
-        whose noise is propagated by the model.
+    floor_from: "repeats" of a candidate, "repeats, at most" beside a leftover, trials whose
+        commands are "alike", or the "short horizon", whose noise is propagated by the model.
     floor_at_most: `noise_floor` is an upper bound and the noise may be far less. No trial was
         repeated and the innovations are not white, so part of them is the model's error.
     runs_away: by column ("crude" ...), the channels whose prediction diverges far beyond the
@@ -217,8 +220,10 @@ class RulerRow(Document):
         """Whether the noise is at most `noise_floor`.
 
         The scatter of trials that are merely alike also holds the difference of their commands.
+        Beside a leftover, that of repeats holds how much the model misses in each of them, which
+        differs where they begin or move apart.
         """
-        return self.floor_at_most or self.floor_from == "alike"
+        return self.floor_at_most or self.floor_from in BOUNDS
 
     def tells(self, name: str, *columns: str) -> bool:
         """Check that the errors of a channel are meaningful: none of these columns runs away."""

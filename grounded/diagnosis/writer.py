@@ -25,6 +25,7 @@ from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
 from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked
 from grounded.diagnosis.ruler_words import objection, open_noise
@@ -47,6 +48,11 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more; of a gap
+WRONG_TERM = (  # advice beside a gap without a cause
+    "Without another trial: multiply each term of the rate of {} in the model file that may be "
+    'wrong by a parameter of its own (`Param(1.0, "1", 0.0, 2.0)`) and diagnose again; one that '
+    "comes out far from 1 is why."
+)
 MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
 
 
@@ -152,6 +158,8 @@ class Writer:
         look = off and another_look(
             self.task, self.trials, off, when, noise=noise, begins=begins, part=part
         )
+        if remainder and part is None and not simulated(data.model):
+            look += f" {WRONG_TERM.format(begins)}"
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)

@@ -19,7 +19,7 @@ from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
 from grounded.diagnosis.validation.blame import ENOUGH, Blame, fewest, loss, still
 from grounded.diagnosis.validation.claims import has_size
-from grounded.diagnosis.validation.prediction_error import _stump
+from grounded.diagnosis.validation.prediction_error import _stump, by_time
 from grounded.diagnosis.verdict import MOST_EFFECTS, _moved, sentence, verdict
 from grounded.effects import Library, wrap
 from grounded.effects.memory import shifted
@@ -541,3 +541,21 @@ def test_the_diagnosis_does_not_reach_the_simulated_truth():
         " 'grounded.experiments', 'grounded.challenge'))]; assert not bad, bad"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_small_gain_that_comes_and_goes_is_in_no_region():
+    """Of 20 nats, "100 % in the 50 % of the time in which |left| < 0.469", and as much in time."""
+    rng = np.random.default_rng(3)
+    time = np.tile(np.arange(400.0)[:, None], (1, 1))
+    noise = rng.normal(0.0, 0.5, time.shape)
+    gain = noise - noise.mean() + 20.0 / time.size  # 20 nats
+    gain += np.where(time < 200, 0.04, -0.04)  # about all of it in the first half
+    valid = np.ones_like(time, bool)
+    whole = float(gain.sum())
+    assert gain[time < 200].sum() > 0.9 * whole
+    assert _stump("t", time, gain, valid, whole) is None
+    told = by_time(gain, SimpleNamespace(time=time, dt=1.0))
+    assert sum(part.share for part in told) == pytest.approx(1.0)
+    assert min(part.share for part in told) == 0.0
+    row = _stump("t", time, gain + np.where(time < 200, 1.0, 0.0), valid, whole + 200.0)
+    assert row is not None and row.when == "t < 200"  # a gain that is clearly there

@@ -17,6 +17,8 @@ import numpy as np
 
 from grounded.diagnosis.error_report import (
     ABOVE,
+    AT_MOST,
+    BOUNDS,
     SURE,
     Credit,
     Part,
@@ -103,6 +105,8 @@ class Measured:
         scatter, source = self.ruler.scatter(self.best, repeats), "repeats"
         if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
             source = "alike"
+        elif self.left:
+            source = AT_MOST
         if scatter is not None:
             found, self.unsure = scatter[0], scatter[1][:, None]
         else:
@@ -253,7 +257,7 @@ class Measured:
                 floor=floor,
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
-                floor_at_most=self.at_most or self.source == "alike",
+                floor_at_most=self.at_most or self.source in BOUNDS,
                 part=self.part(at, ruler.shown[i], floor),
             )
             found.append((-error / max(floor, float(fine[i])), i, left, row))

@@ -28,6 +28,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 MOST_STARTS = 400
+SURE = 3.0  # standard deviations by which the share of a region exceeds that of its time
 CLEARLY = 3.0  # times as dense as outside: with less of the gap a region is not worth naming
 
 
@@ -141,16 +142,18 @@ def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:
 
 
 def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
-    """Return the shares of the gap in equal parts of the trial's duration."""
-    whole = max(float(np.maximum(gain.sum(), 1e-12)), 1e-12)
+    """Return the shares of the gap in equal parts of the trial's duration, which sum to 1.
+
+    A part in which predictions lose has none of it.
+    """
     end = float(data.time.max()) + data.dt
-    edges = np.linspace(0, end, parts + 1)
-    found = []
-    for a, b in itertools.pairwise(edges):
-        inside = (data.time >= a) & (data.time < b)
-        share = float(gain[inside].sum()) / whole
-        found.append(TimeShare(float(a), float(b), max(share, 0.0)))
-    return found
+    edges = [*itertools.pairwise(np.linspace(0, end, parts + 1))]
+    each = [float(gain[(data.time >= a) & (data.time < b)].sum()) for a, b in edges]
+    whole = max(sum(max(one, 0.0) for one in each), 1e-12)
+    return [
+        TimeShare(float(a), float(b), max(one, 0.0) / whole)
+        for (a, b), one in zip(edges, each, strict=True)
+    ]
 
 
 def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> list[Region]:
@@ -194,7 +197,18 @@ def _stump(name: str, signal: Array, gain: Array, valid: Any, whole: float) -> R
                     continue
                 if share * (1 - occupancy) < CLEARLY * (1 - share) * occupancy:
                     continue  # the gap is nearly everywhere that was driven
+                if share - occupancy < SURE * _scatter(gain, inside, min(share, 1.0), whole):
+                    continue  # it may be there by chance
                 margin = share - occupancy
                 shown = 0.0 if abs(level) < nothing else level
                 best = Region(f"{label} {sign} {shown:.3g}", min(share, 1.0), occupancy)
     return best
+
+
+def _scatter(gain: Array, inside: Any, share: float, whole: float) -> float:
+    """Return the standard deviation of a region's share, by steps that are independent.
+
+    Where a correction gains little, its steps gain and lose by turns: of 20 nats, made of 123 that
+    are won and 103 that are lost, any half of the time can hold all.
+    """
+    return float(np.sqrt(np.sum((gain * (inside - share)) ** 2))) / whole

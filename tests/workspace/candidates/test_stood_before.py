@@ -10,6 +10,7 @@ from facts import holds
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.candidates import at_rest
 from grounded_trials.workspace.folder import Folder
 
 DT, ROWS, B = 0.02, 200, -0.0173
@@ -68,6 +69,22 @@ def test_a_start_is_offered_only_to_a_robot_that_nothing_but_its_inputs_holds(ba
     """A finger held a ball "at rest" on a beam out of level: the start cost it half its utility."""
     words = ("If nothing but its inputs holds the robot before the run (no hand, no stop)",)
     assert holds(offered(ball), *words, f"start = {{ x = -0.15, beam = {B}, u = 0 }}")
+
+
+def test_an_angle_at_rest_is_told_without_whole_turns(ball, monkeypatch):
+    """Against the current a boat rests at a heading of -0.965 rad: `psi = 269.2` was offered."""
+    file = next(ball.folder.glob("*.py"))
+    file.write_text(
+        file.read_text().replace("derivative=rate)", 'derivative=rate, angles=["beam"])')
+    )
+    found = at_rest.resting
+
+    def turned(*given):
+        stands = found(*given)
+        return None if stands is None else stands + 86 * np.pi * (np.arange(len(stands)) == 2)
+
+    monkeypatch.setattr(at_rest, "resting", turned)
+    assert f"start = {{ x = -0.15, beam = {B}, u = 0 }}" in offered(ball)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.error_report import furthest
+from grounded.diagnosis.error_report import AT_MOST, furthest
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import in_doubt, open_noise, rest
 from grounded.result import listed
@@ -30,6 +30,7 @@ def held_out(found: Diagnosis) -> str:
     }
     noise = {
         "repeats": "the scatter of repeats",
+        AT_MOST: "at most the scatter of repeats, which holds what the model misses in each",
         "alike": "at most the scatter of trials whose commands agree to 2 %",
         "short horizon": "extrapolated from one-step errors",
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import give_or_take
-from grounded.diagnosis.error_report import ChannelParts, Parts, Split, doubt_of
+from grounded.diagnosis.error_report import AT_MOST, ChannelParts, Parts, Split, doubt_of
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays, of_rivals
@@ -160,6 +160,10 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     by_state = [(parts.name, *_shares(splits[main], parts)) for parts in splits[main].channels]
     known = {"repeats": "the scatter of repeated trials"}
     known["alike"] = "the scatter of trials whose commands agree to 2 %, and is at most that"
+    known[AT_MOST] = (
+        "the scatter of repeated trials, which holds how much the model misses in each as well, so "
+        "it is at most that"
+    )
     known["at most"] = (
         "one-step errors, which hold errors of the model too, so it may be far less; then as much "
         "more is unexplained. Repeat a run to know"
