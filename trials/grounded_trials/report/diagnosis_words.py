@@ -181,8 +181,8 @@ def held_sentence(diagnosis: Diagnosis, *, whole: bool = False) -> str:
         said.append(f"{one.parameter} changes by {listed(parts)} ({free} if all are free)")
     if len(said) > MOST:
         said = [
-            f"{count(len(some), 'other')} change{'s' * (len(some) == 1)} by {_between(some)} % with "
-            f"1 % more {name}"
+            f"{count(len(some), 'other')} change{'s' * (len(some) == 1)} by {_between(some)} % "
+            f"with 1 % more {name}"
             for name, some in held.items()
         ]
     told = f"these trials cannot identify {listed(held)}: the values hold for the model's own"
