@@ -90,7 +90,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
     start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
-    regions = by_region(acts[..., None], claims.predictor, one.fit, 1)
+    regions = by_region(acts, claims.predictor, one.fit, 1)
     i = one.fit.hypothesis.names.index(one.name)
     params, begin = claims.estimates(one.fit)[i], data.time[0, run]
     if not any(abs(e.value) > SURE * e.std for e in params.values()):
