@@ -221,7 +221,8 @@ def _so_far(
     if len(large) == 1 and (large[0][0] > 0) == (same > best.utility):
         return f"{apart}: {large[0][1]}{then}"
     each_part = [f"\n{'+' * (part > 0)}{number(part)}: {why}" for part, why in large]
-    sum_of = f". The {number(same - best.utility)} between the two are" * bool(each_part)
+    are = "are" if len(large) == len(parts) else "are mostly"
+    sum_of = f". The {number(same - best.utility)} between the two {are}" * bool(each_part)
     return f"{apart}{then}{sum_of}{''.join(each_part)}"
 
 

@@ -113,8 +113,7 @@ def summary(status: Status) -> str:
 
 def _gained(standing: Standing) -> str:
     """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
-    from grounded.result import percent
-    from grounded.search.certainty import owed_to_start, share_of_cost
+    from grounded.search.certainty import by_starts, share_of_cost
 
     best, own = standing.incumbent, standing.history[0]
     if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
@@ -127,7 +126,5 @@ def _gained(standing: Standing) -> str:
         return f"; {why}"
     share = share_of_cost(own, best, standing.history)
     gain = f", {share} better than the model's own policy"
-    if start := owed_to_start(own, best, standing.history):
-        part = percent(start / abs(own.utility))
-        return f"{gain}; {part} is due to different start states, by the model"
-    return gain
+    start = by_starts(own, best, standing.history)
+    return f"{gain}; {start}" if start else gain

@@ -355,6 +355,15 @@ def owed_to_start(before: Tried, after: Tried, history: Sequence[Tried]) -> floa
     return start if abs(start) > PART * abs(gain) and math.isfinite(start) else 0.0
 
 
+def by_starts(before: Tried, after: Tried, history: Sequence[Tried]) -> str:
+    """Return a clause on the share of a cost that different start states changed; "" for little."""
+    if not (start := owed_to_start(before, after, history)):
+        return ""
+    did = "reduced" if start > 0 else "raised"
+    share = percent(abs(start / before.utility))
+    return f"by the model, different start states alone {did} the cost by {share}"
+
+
 def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> bool:
     """Return whether two candidates began apart, and no model tells what that is worth."""
     return math.isnan(_of_start(before, after, history))

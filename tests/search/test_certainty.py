@@ -11,6 +11,7 @@ from facts import holds
 from grounded.search.candidate import Tried
 from grounded.search.certainty import (
     beyond_one_trial,
+    by_starts,
     chance,
     cost_of_start,
     error_between,
@@ -254,6 +255,8 @@ def test_what_a_start_is_worth_is_no_improvement():
     first = ran("c0001", "", -6.0, off=0.07)
     second = ran("c0002", "c0001", -3.9, off=0.0, as_run=-5.9)
     assert owed_to_start(first, second, [first, second]) == pytest.approx(1.9)
+    told = by_starts(first, second, [first, second])
+    assert told == "by the model, different start states alone reduced the cost by 32 %"
     found = last_improvement([first, second])
     assert holds(found, "2.1", "1.9", "0.2", "c0001") and "probability" not in found
     worse = replace(second, utilities=(-4.4, -4.3))  # the policy lost, the start made up for it
@@ -270,6 +273,7 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert holds(told, "2.1000 +- 0.0071", "start", "not known") and "probability" not in told
     little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
     assert owed_to_start(first, little, [first, little]) == 0.0
+    assert by_starts(first, little, [first, little]) == ""
 
 
 def test_starts_that_scatter_as_much_are_not_different_ones():

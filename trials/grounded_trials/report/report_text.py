@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from grounded.diagnosis.tables import WITHOUT, effect_table, error_table, of_delays
 from grounded.errors import NextCommand
 from grounded.search.candidate import Tried
-from grounded.search.certainty import explained, share_of_cost
+from grounded.search.certainty import by_starts, explained, share_of_cost
 from grounded.search.pictures import few
 from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
 from grounded_trials.report.findings import (
@@ -109,6 +109,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
             two = tried[first.candidate.id], tried[best.candidate.id]
             why = explained(*two, history)
             text += f"; {why} its lead" if why else f", {share_of_cost(*two, history)} better"
+            if start := by_starts(*two, history):
+                text += f"; {start}"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")

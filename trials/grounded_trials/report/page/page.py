@@ -47,7 +47,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
-from grounded_trials.wording import count, figure, glued, percent, placed, rendered
+from grounded_trials.wording import count, figure, glued, placed, rendered
 from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
 
@@ -241,7 +241,7 @@ def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    from grounded.search.certainty import explained, owed_to_start, share_of_cost
+    from grounded.search.certainty import by_starts, explained, share_of_cost
 
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
@@ -254,10 +254,8 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
             gain = f": cost {did} by {share_of_cost(*two, findings.history)}"
             if best.utility > first.utility and (why := explained(*two, findings.history)):
                 gain = f": {why} the difference"
-            if start := owed_to_start(*two, findings.history):
-                did = "reduced" if start > 0 else "raised"
-                by = f"{did} it by {percent(abs(start / first.utility))}"
-                gain += f"; by the model, different start states alone {by}"
+            if start := by_starts(*two, findings.history):
+                gain += f"; {start}"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
