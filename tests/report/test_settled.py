@@ -6,13 +6,16 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from cli import grounded, plain
 from facts import holds
-from grounded.diagnosis.report import Diagnosis
+from grounded import Model, Param
+from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded_trials import Workspace
+from grounded_trials.report import settled
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import settled_in, told
@@ -63,6 +66,22 @@ def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
     for text in (words(adopted, "report"), re.sub(r"<[^>]+>", "", page)):
         assert "Found and adopted: " in text and "12 mm instead of 250 mm" in text
     assert "2 trials, t0001 and t0002" in page
+
+
+def test_rows_and_clauses_of_parameters_have_one_order():
+    """The page pairs them: a boat's thrust stood beside the value of a drag."""
+    model = Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params={"m": Param(1.0, "kg", 0.5, 2.0), "c": Param(1.0, "N s/m", 0.1, 3.0)},
+        derivative=lambda s, a, p: {"v": (a.u - p.c * s.v) / p.m},
+    )
+    table = SimpleNamespace(effects=(), params={"c": 2.5, "m": 1.4})  # as `fit --apply` wrote them
+    known = SimpleNamespace(estimate=lambda name, value, unit: Estimate(value, unit=unit))
+    rows = [*settled._rows(model, table, known, {}, {})]
+    clauses = settled._moved(model, table.params, set(), {})
+    assert [name for name, _ in rows] == [text.split()[0] for text in clauses] == ["m", "c"]
+    assert "1.4" in rows[0][1] and "1.40 kg" in clauses[0]
 
 
 def test_the_status_has_one_line_for_each_adopted_effect_and_parameter(adopted):
@@ -303,6 +322,11 @@ def test_a_parameter_that_was_adopted_by_name_is_not_missing(cart, tmp_path):
     found = grounded("-C", folder, "report", "--json").json
     assert found["adopted"]["clauses"][1] == "mass 1.00 -> 1.40 kg" and found["adopted"]["gained"]
     assert "parameter:mass" in found["outdated"] and "but not" not in found["outdated"]
+    lost = {"parameter": "mass", "verdict": "not identifiable"}
+    folder = copied(cart, tmp_path / "again")
+    written(folder, verdict=verdict, ranking=ranking, identifiable=[lost])
+    done = grounded("-C", folder, "adopt", *names)  # it said "mass stays at 1.000 kg" beside that
+    assert "1.000 -> 1.400 kg" in done.out and "stays at" not in done.err
 
 
 def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):

@@ -280,7 +280,9 @@ def identifiable(
     a calibrated value states a larger standard deviation, that one is used.
 
     Parameters that are not identifiable one by one may be so together: the calibrated values differ
-    from nominal in one direction, and if that direction is identifiable, so is what is adopted.
+    from nominal in one direction, and if that direction is identifiable, so is what is adopted. So
+    is one that is identifiable if all others are as calibrated: a boat's masses, drags and thrust
+    are known but for one factor of all, and without the thrust the others were worse than nothing.
 
     Args:
         predictor: evaluates hypotheses, with all uncertain parameters free.
@@ -288,7 +290,8 @@ def identifiable(
         known: the parameters that were calibrated; the others were held at their values.
     """
     information, known = _information(predictor, fit), known or {}
-    cov = np.asarray(np.linalg.inv(information + np.eye(len(information))), float)
+    precision = information + np.eye(len(information))
+    cov = np.asarray(np.linalg.inv(precision), float)
     model, found = predictor.data.model, []
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     priors = np.array([model.params[name].spread for name in names])
@@ -305,7 +308,8 @@ def identifiable(
                     size = model.params[names[j]].value / known[name].value
                     given[names[j]] = float(slope * priors[i] / priors[j] * size)
         alone = _verdict(share)
-        joint = jointly and alone == "not identifiable" and name in known
+        with_others = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
+        joint = (jointly or with_others) and alone == "not identifiable" and name in known
         found.append(Identifiable(name, alone, float(priors[i]), share, given, joint))
     return found
 

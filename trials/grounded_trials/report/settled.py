@@ -294,9 +294,8 @@ def _rows(
         each = (f"{q} = {told(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
         alike = "".join(f", or {one}" for one in ties.get(name, ()))
         yield name, f"{', '.join(each)}{_given(name, rests)}{alike}"
-    for name, value in table.params.items():
-        if name in model.params and model.params[name].value != value:
-            param = model.params[name]
+    for name, param in model.params.items():  # in the order of `_moved`
+        if (value := table.params.get(name, param.value)) != param.value:
             text = f"{told(name, value, param.unit)}{_at_end(param, value)}{_given(name, rests)}"
             yield name, f"{text}, was {number(param.value)}"
 

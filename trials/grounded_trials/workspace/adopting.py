@@ -151,6 +151,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
+    left = left_behind(found) if parameters and physics and claimed else {}
     return Adopted(
         tuple(adopted),
         own,
@@ -158,7 +159,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         then=to_plan(workspace),
         logged=logged_target(workspace) if not workspace.candidate_ids() else "",
         beside=tuple(n for n in beside if n not in fitted),
-        left=left_behind(found) if parameters and physics and claimed else {},
+        left={n: one for n, one in left.items() if n not in own},
         jointly=(
             *(name for name in own if name in calibrated and name in found.jointly),
             *(name for name in names if name in found.combined),
