@@ -95,8 +95,9 @@ class Measured:
         """Return the rms error of noise alone, by horizon and shown state, and its source.
 
         Without repeats, the one-step noise is propagated by the model. It contains the error of the
-        model, so the floor is an upper bound (`at_most`). Coloured noise is taken as noise only in
-        channels in which a flexible regression finds no structure.
+        model, so the floor is an upper bound (`at_most`). Beside a leftover the scatter of repeats
+        does as well, and the smaller of the two is the floor of its channel. Coloured noise is
+        taken as noise only in channels in which a flexible regression finds no structure.
         """
         self.unsure = np.zeros((len(self.ruler.steps) + 1, 1))
         if self.exact and not self.is_white:  # white innovations are noise, and the repeat a copy
@@ -107,13 +108,19 @@ class Measured:
             source = "alike"
         elif self.left:
             source = AT_MOST
-        if scatter is not None:
-            found, self.unsure = scatter[0], scatter[1][:, None]
-        else:
+        off = [self.data.model.state_names.index(left.channel) for left in self.left]
+        if scatter is None:
             found, source = self.carried(self.best), "short horizon"
-            off = [self.data.model.state_names.index(left.channel) for left in self.left]
             if off:
                 found[:, off] = self.carried(plain(self.search, self.best))[:, off]
+        else:
+            found, self.unsure = scatter[0], scatter[1][:, None]
+            if off:  # both are bounds then, and the smaller one holds
+                own = self.carried(plain(self.search, self.best))[:, off]
+                less, place = own < found[:, off], [self.ruler.shown.index(i) for i in off]
+                found[:, off] = np.where(less, own, found[:, off])
+                self.unsure = np.repeat(self.unsure, len(self.units), axis=1)
+                self.unsure[:, place] *= ~less
         reached = [e.rms for _, e in self.ruler.measured]
         reached += [errors.rms for _, errors in self.flexible.values()]
         least = np.fmin.reduce(reached)
@@ -178,7 +185,7 @@ class Measured:
                     by if self.ruler.held_out else "no",
                     floor_from=self.source,
                     floor_at_most=self.at_most,
-                    floor_unsure=float(self.unsure[k, 0]),
+                    floor_unsure=float(self.unsure[k].max()),
                     runs_away={key: names for key, names in away.items() if names},
                     drowned=bool(self.drowned[k]),
                     **found,
@@ -303,7 +310,7 @@ class Measured:
         before, after = self.rms(self.decision.crude), self.rms(self.best)
         carried = "at most" if self.at_most else "noise"
         source = carried if self.source == "short horizon" else self.source
-        unsure = self.unsure[:, 0]
+        unsure = self.unsure.max(axis=1)
         return {
             key: split(
                 seconds[k], self.units, before[k], after[k], self.floor[k], source, unsure[k]

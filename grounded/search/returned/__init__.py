@@ -2,6 +2,7 @@
 
 who_drove    START HERE: compares the logged commands with what the policy sends on these states
 other_scale  finds the scale of a state with which they agree
+clipped      finds commands that were cut inside their limits
 smoothed     finds the filter of a program that logs its states as measured
 told_trial   both checks as Python's `tell` and `learn` word them
 """

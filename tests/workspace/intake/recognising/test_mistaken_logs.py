@@ -392,6 +392,26 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
     assert not any("logged" in one and "late" in one for one in found.warnings if one not in told)
 
 
+@pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
+def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, part):
+    """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""
+    plan, dt = w.propose().candidate, w.task.dt
+    runner, most = Runner(plan.policy), part * np.abs(plan.policy.feedforward).max(axis=0)
+
+    def action(k, logged, now):
+        return np.clip(runner.action(k * dt, logged), -most, most)
+
+    try:  # of a run that differs little from its candidate's, a warning
+        found = driven_by(w, tmp_path / "run.csv", action)
+        told, rests = " ".join(found.warnings), found.then.verb != "discard"
+    except GroundedError as refused:
+        told, rests = str(refused), False
+    assert ("cut inside [limits]" in told) == (part < 1) == (not rests)
+    if part < 1:
+        assert holds(told, f"those of {plan.id}", "starboard at 0.", "set [limits] to that")
+        assert holds(told, "remove the cut", f"run {plan.id} again")
+
+
 @pytest.mark.parametrize("predicts", [False, True])
 def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is_told(
     w, tmp_path, predicts

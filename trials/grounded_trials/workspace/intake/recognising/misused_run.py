@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
+from grounded.search.returned.clipped import clipped
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.smoothed import smoothed
@@ -68,6 +69,8 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
             plain = follows(own.policy, run, latest(task))
             if plain and not plain.beyond and (told := misused(task, own, run, plain, acts=acts)):
                 return told
+            if cut := clipped(own, run):
+                return f"they are {cut.told(own)}"
             if found := smoothed(task.model, own, run):
                 return f"they are {found.told(own)}"
     return ""

@@ -1,4 +1,4 @@
-"""Tell how well the robot's program ran its candidate: late, on old samples, smoothed or swinging.
+"""Tell how the robot's program ran its candidate: late, cut, on old samples, smoothed or swinging.
 
 A policy's plan, gains and reference change from step to step, so its commands change even if no new
 states arrive. Where they stay the same to the last digit all the same, the step was not run. A loop
@@ -24,6 +24,7 @@ from grounded.result import figure, listed, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
 from grounded.search.feedback.sample_age import PROBED, different, rates, sample_age
+from grounded.search.returned.clipped import clipped
 from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import LEAST
 from grounded.task import Task
@@ -50,9 +51,11 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> str:
     """
     if not trial.candidate:
         return ""
+    own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
+    if cut := clipped(own, whole):
+        return f"its commands are {cut.told(own)}, and run {own.id} again"
     if told := steps_skipped(workspace, trial):
         return told
-    own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
     if found := smoothed(workspace.base_model, own, whole):
         return f"its commands are {found.told(own)}, and run {own.id} again"
     return _predicted_ahead(workspace, own, whole)

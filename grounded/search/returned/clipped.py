@@ -1,0 +1,79 @@
+"""Find that a program, or a drive, cuts a candidate's commands inside their limits.
+
+A cut repeats one value to the last digit wherever the policy asks for more, and nowhere else. The
+plan, made for the wider limits, then promises what cannot be sent, and the log, which has the
+commands as they were sent, is right: no diagnosis of the model would find it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.result import listed, number, percent
+from grounded.search.candidate import Candidate
+from grounded.search.returned.who_drove import LEAST
+from grounded.trial import Trial
+
+SAME, INSIDE = 1e-6, 0.02  # of a command's size: at the cut, and inside the limit or beyond the cut
+PART = 0.05  # least share of the steps at a cut
+NEARLY = 0.8  # least share of them in which more is asked for, and of those in which it is
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Commands that were cut inside their limits."""
+
+    cuts: dict[str, list[float]]  # by input, lower before upper
+    share: float  # of the steps in which some command was cut
+
+    def told(self, own: Candidate) -> str:
+        """Return what its commands are and the remedy, as the end of a sentence."""
+        each = [
+            f"{name} at {listed([number(v) for v in ends])}" for name, ends in self.cuts.items()
+        ]
+        return (
+            f"those of {own.id} cut inside [limits] in {percent(self.share)} of the steps "
+            f"({'; '.join(each)}), and the log has them as cut. If the robot takes no more, set "
+            "[limits] to that and propose again; if it does, remove the cut"
+        )
+
+
+def clipped(own: Candidate, trial: Trial) -> Clipped | None:
+    """Return at which values the commands of a run were cut inside their limits, or None.
+
+    Args:
+        own: the candidate.
+        trial: its run, without gaps.
+    """
+    policy, T = own.policy, min(trial.finite_steps, own.policy.horizon)
+    if T < LEAST or (policy.state_names, policy.input_names) != (
+        trial.state_names,
+        trial.input_names,
+    ):
+        return None
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    held = policy.past if trial.start_inputs is None else trial.start_inputs
+    asked = policy.commands(trial.states[None, :T], held, sent[None])[0]
+    cuts, cut = dict[str, list[float]](), np.zeros(T, bool)
+    for j, name in enumerate(policy.input_names):
+        for sign in (-1.0, 1.0):
+            if (at := _cut(policy, sent, asked, j, sign)) is not None:
+                cuts.setdefault(name, []).append(float(sent[at, j][0]))
+                cut |= at
+    return Clipped(cuts, float(cut.mean())) if cuts else None
+
+
+def _cut(policy: Policy, sent: Array, asked: Array, j: int, sign: float) -> Array | None:
+    """Return the steps (T,) at which an input was cut at its largest value, or its smallest."""
+    u, wanted = sign * sent[:, j], sign * asked[:, j]
+    end = float(u.max())
+    limit = float(policy.high[j] if sign > 0 else -policy.low[j])
+    size = max(float(np.abs(policy.feedforward[:, j]).max()), float(np.abs(u).max())) + 1e-12
+    at, more = u >= end - SAME * size, wanted > end + INSIDE * size
+    both = float((at & more).sum())
+    enough = at.sum() >= max(LEAST, PART * len(u)) and end < limit - INSIDE * size
+    return at if enough and both >= NEARLY * max(at.sum(), more.sum()) else None
