@@ -8,6 +8,7 @@ commands as they were sent, is right: no diagnosis of the model would find it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -67,8 +68,8 @@ def clipped(own: Candidate, trial: Trial) -> Clipped | None:
     return Clipped(cuts, float(cut.mean())) if cuts else None
 
 
-def _cut(policy: Policy, sent: Array, asked: Array, j: int, sign: float) -> Array | None:
-    """Return the steps (T,) at which an input was cut at its largest value, or its smallest."""
+def _cut(policy: Policy, sent: Array, asked: Array, j: int, sign: float) -> Any:
+    """Return the steps at which an input was cut at its largest value, or smallest, (T,); or None."""
     u, wanted = sign * sent[:, j], sign * asked[:, j]
     end = float(u.max())
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
