@@ -69,7 +69,7 @@ def clipped(own: Candidate, trial: Trial) -> Clipped | None:
 
 
 def _cut(policy: Policy, sent: Array, asked: Array, j: int, sign: float) -> Any:
-    """Return the steps at which an input was cut at its largest value, or smallest, (T,); or None."""
+    """Return the steps (T,) at which an input was cut at its largest or smallest value; or None."""
     u, wanted = sign * sent[:, j], sign * asked[:, j]
     end = float(u.max())
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
