@@ -393,8 +393,9 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
 
 
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
-def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, part):
+def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
     """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""
+    monkeypatch.setitem(globals(), "RNG", np.random.default_rng(0))  # 5 % less hides in some noise
     plan, dt = w.propose().candidate, w.task.dt
     runner, most = Runner(plan.policy), part * np.abs(plan.policy.feedforward).max(axis=0)
 
