@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import listed, number, percent
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import LEAST
+from grounded.search.returned.who_drove import LEAST, Commanded, commanded
 from grounded.trial import Trial
 
 SAME, INSIDE = 1e-6, 0.02  # of a command's size: at the cut, and inside the limit or beyond the cut
@@ -56,24 +55,21 @@ def clipped(own: Candidate, trial: Trial) -> Clipped | None:
         trial.input_names,
     ):
         return None
-    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    held = policy.past if trial.start_inputs is None else trial.start_inputs
-    asked = policy.commands(trial.states[None, :T], held, sent[None])[0]
+    run = commanded(policy, trial)
     cuts, cut = dict[str, list[float]](), np.zeros(T, bool)
     for j, name in enumerate(policy.input_names):
         for sign in (-1.0, 1.0):
-            if (at := _cut(policy, sent, asked, j, sign)) is not None:
-                cuts.setdefault(name, []).append(float(sent[at, j][0]))
+            if (at := _cut(policy, run, j, sign)) is not None:
+                cuts.setdefault(name, []).append(float(run.sent[at, j][0]))
                 cut |= at
     return Clipped(cuts, float(cut.mean())) if cuts else None
 
 
-def _cut(policy: Policy, sent: Array, asked: Array, j: int, sign: float) -> Any:
+def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
     """Return the steps (T,) at which an input was cut at its largest or smallest value; or None."""
-    u, wanted = sign * sent[:, j], sign * asked[:, j]
+    u, wanted, size = sign * run.sent[:, j], sign * run.asked[:, j], float(run.size[j])
     end = float(u.max())
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
-    size = max(float(np.abs(policy.feedforward[:, j]).max()), float(np.abs(u).max())) + 1e-12
     at, more = u >= end - SAME * size, wanted > end + INSIDE * size
     both = float((at & more).sum())
     enough = at.sum() >= max(LEAST, PART * len(u)) and end < limit - INSIDE * size

@@ -127,6 +127,33 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """The commands of a run, as sent and as its policy asks for on the same states, (T, m) each."""
+
+    sent: Array
+    asked: Array
+    past: Array  # held before the run
+    size: Array  # of each command, (m,)
+
+
+def commanded(policy: Policy, trial: Trial, past: Array | None = None) -> Commanded:
+    """Return a run's commands beside its policy's, without an age of the states or of the inputs.
+
+    Args:
+        policy: of its candidate.
+        trial: of the policy's states and inputs, without gaps; what is beyond it is left out.
+        past: the commands held before the run (m,); those of the trial, or of the policy, if None.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    if past is None:
+        past = policy.past if trial.start_inputs is None else trial.start_inputs
+    asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
+    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
+    return Commanded(sent, asked, past, size)
+
+
 def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -> bool:
     """Return whether the first commands of a policy and a log, (T, m), are alike by themselves.
 

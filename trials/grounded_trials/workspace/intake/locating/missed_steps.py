@@ -16,7 +16,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import listed
-from grounded.search.returned.who_drove import LEAST, follows
+from grounded.search.returned.who_drove import LEAST, commanded, follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import count, with_unit
@@ -69,10 +69,8 @@ def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
 
 def _apart(policy: Policy, trial: Trial, past: Array) -> Array:
     """Return the rms difference of each step's commands from the policy's, in units of size."""
-    sent = np.clip(trial.inputs, policy.low, policy.high)
-    asked = policy.commands(trial.states[None, : len(sent)], past, sent[None])[0]
-    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
-    return np.asarray(np.sqrt((((asked - sent) / size) ** 2).mean(axis=1)))
+    run = commanded(policy, trial, past)
+    return np.asarray(np.sqrt((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
 
 
 def begins_late(log: Recording, policy: Policy) -> float:

@@ -26,7 +26,7 @@ from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
 from grounded.search.feedback.sample_age import PROBED, different, rates, sample_age
 from grounded.search.returned.clipped import clipped
 from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.who_drove import LEAST
+from grounded.search.returned.who_drove import LEAST, commanded
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
@@ -99,13 +99,11 @@ def steps_skipped(workspace: Folder, trial: Trial) -> str:
     T = min(trial.finite_steps, policy.horizon)
     if T < LEAST:
         return ""
-    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    past = policy.past if trial.start_inputs is None else trial.start_inputs
-    asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
+    run = commanded(policy, trial)
+    sent, asked, past, size = run.sent, run.asked, run.past, run.size
     before = asked[:-1]
     shifted = trial.states[None, np.r_[0, : T - 1]]  # no new states since the step before
     after = policy.commands(shifted, past, sent[None])[0][1:]
-    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
     if unsent := _unsent(np.abs(asked - sent) / size, np.abs(sent - past) / size):
         return (
             f"its first {unsent} steps ({unsent * task.dt:.3g} s) sent nothing but what was held "
