@@ -41,7 +41,7 @@ def measuring(left):
 
 @pytest.mark.parametrize("left", [(), ("u",), ("x", "u")])
 def test_the_smaller_bound_is_the_noise_of_a_state_with_a_gap(monkeypatch, left):
-    """Repeats of a boat began 0.1 m apart: "the model explains the data as far as ... is known"."""
+    """Repeats that begin apart scatter by what the model misses in each as well."""
     monkeypatch.setattr(measured, "repeated", lambda *_: [[0, 1]])
     monkeypatch.setattr(measured, "plain", lambda *_: None)
     found = measuring(left)
