@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import RulerRow, beside_noise, doubt_of, furthest
+from grounded.diagnosis.error_report import AT_MOST, RulerRow, beside_noise, doubt_of, furthest
 from grounded.result import listed, measured_alike, number
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ MATTERS = 0.05  # share of the crude model's error below which a remaining error
 HALF, MORE = 0.5, 0.2  # improvements: below HALF 1 s ahead and MORE of it over whole trials
 COMPARABLE = 0.2  # difference of two improvements, as shares, that hardly matters
 SHOWS = 0.1  # relative change below which a channel is not named
+REPEATED = "the scatter of the repeats holds what the model misses in each as well"
 COUNTS = 0.03  # relative change below which a loss is not compared with gains elsewhere
 
 
@@ -42,7 +43,7 @@ def improvement(rows: Sequence[RulerRow], tracked: Sequence[str] = ()) -> str:
 def unknown_noise(row: RulerRow, names: Sequence[str] = ()) -> str:
     """Return a sentence if these errors may be any part noise; "" if the noise is known.
 
-    An upper bound of the noise says something only of an error above it.
+    An upper bound of the noise from one-step errors says something only of an error above it.
 
     Args:
         row: prediction errors at one horizon.
@@ -51,6 +52,13 @@ def unknown_noise(row: RulerRow, names: Sequence[str] = ()) -> str:
     if not any(_within_bound(row, name) for name in names or [most_off(row)]):
         return ""
     return " How much of that is noise is not known: repeat one run to see."
+
+
+def unexplained_noise(row: RulerRow) -> str:
+    """Return the same sentence of a model beside which nothing is claimed, with any upper bound."""
+    if row.floor_from == AT_MOST:
+        return f" How much of that is noise is not known: {REPEATED}."
+    return unknown_noise(row)
 
 
 def _within_bound(row: RulerRow, name: str) -> bool:

@@ -23,6 +23,7 @@ from grounded.diagnosis.cause_words import (
     wider,
 )
 from grounded.diagnosis.error_report import (
+    AT_MOST,
     Combination,
     Credit,
     Identifiable,
@@ -46,7 +47,7 @@ from grounded.diagnosis.ruler_words import (
     floor,
     improvement,
     rest,
-    unknown_noise,
+    unexplained_noise,
     worsened,
 )
 from grounded.errors import GroundedError
@@ -121,11 +122,11 @@ def verdict(
             return _said("unknown", unexplained, *once, first=first)
         if above := rest(rows):
             text = f"The model explains what these trials show: {above}."
-        elif row is not None and row.floor_at_most:
+        elif row is not None and (row.floor_at_most or row.floor_from == AT_MOST):
             found = "No known effect explains what this model leaves"
             if adopted:  # in one that was just mended, that would read as an alarm
                 found = "Nothing more is found beside what was adopted"
-            what = f"{found}{floor(row)}.{unknown_noise(row)}"
+            what = f"{found}{floor(row)}.{unexplained_noise(row)}"
             return _said("none" if adopted else "unknown", what, *once, first=first)
         else:
             text = explained(rows)

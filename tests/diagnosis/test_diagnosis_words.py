@@ -10,6 +10,7 @@ from facts import holds
 from grounded import Trial
 from grounded.diagnosis.cause_words import as_large, with_worth
 from grounded.diagnosis.error_report import (
+    AT_MOST,
     Credit,
     Part,
     Region,
@@ -363,6 +364,11 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
     known, state = said(0.9, 0.89, bound=False)
     assert known.kind == "none" and "890 mm" in known.sentence and not state
     assert "9 times the most that can be noise" in said(0.9, 0.1)[0].sentence
+    repeats = row({"x": 1.0}, {"x": 0.9}, {"x": 0.7}, floor_from=AT_MOST, floor_unsure=0.3)
+    mended = verdict(_claims(), (), (), (), (repeats,), (), adopted=("viscous_friction:v",))
+    assert mended.kind == "none" and "explains the data" not in mended.sentence
+    assert holds(mended.sentence, "Nothing more is found", "900 mm (noise: at most 700 mm)")
+    assert "the scatter of the repeats holds what the model misses" in mended.sentence
     left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
     assert "at most 100 mm" in left.sentence()
 
