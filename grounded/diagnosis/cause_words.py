@@ -118,6 +118,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Fill names and values into the sentence of an effect's family; starts in lower case."""
     from grounded import places
     from grounded.effects import ParamFamily
+    from grounded.effects.medium import turning
 
     model, targets = effect.site.model, effect.site.targets
     constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
@@ -142,6 +143,8 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         "driven": called(model, driven),
         "source": called(model, source),
     }
+    if "{product}" in effect.family.sentence:
+        words["product"] = " * ".join(n for n in turning(model) if n != driven)
 
     if driven in model.inputs and len(targets) > 1:  # a wheel's: several velocities at once
         words["source"] = "its speed"
@@ -312,7 +315,7 @@ def clauses(
     kinds: dict[tuple[str, ...], list[int]] = {}
     for i, name in enumerate(names):
         own = effects.get(name)
-        alike = own is not None and not re.search(r"[%|>]", own.family.sentence)
+        alike = own is not None and not re.search(r"[%|>]|\{product\}", own.family.sentence)
         alike = alike and DISAGREE not in causes[names.index(name)]
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)

@@ -1,4 +1,4 @@
-"""Effects of a surrounding medium that moves or pushes: a current, a wind.
+"""Effects of a surrounding medium that moves, pushes or is carried along: a current, a wind.
 
 With the heading psi and the body velocities u ahead and v to the side in the plane
 (x' = u cos psi - v sin psi, y' = u sin psi + v cos psi; `places.body_velocity`), all over ground:
@@ -10,18 +10,25 @@ With the heading psi and the body velocities u ahead and v to the side in the pl
 
     push_world   u' += a cos psi + b sin psi,   v' += -a sin psi + b cos psi
 
+    coriolis     u' += k v r,   v' += k u r   or   r' += k u v,   r the rate of the heading
+
 The first is a Galilean transformation. It is exact for any model of forces that depend on
 velocities, with linear or quadratic drag, different ahead and sideways: one (a, b) in m/s, where a
 push would need a different size for each. Terms of the rotating axes (v r, -u r) are unchanged. A
 model without drag does not feel a current; what pushes it nevertheless (wind on a hull, a tilted
-floor) is the second.
+floor) is the second. The third is the water or air that a hull sets in motion: it adds unequal
+masses ahead and sideways, so the products of velocities differ from a rigid body's (-v r and u r
+times the ratio of the masses, and a moment by their difference, named after Munk). Each of the
+three rates has its own effect, since simple models leave out one or the other.
 
 T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section 8.3:
-equations of motion with ocean currents, in terms of the relative velocity.
+equations of motion with ocean currents, in terms of the relative velocity; section 6.3: added mass
+and the Coriolis and centripetal matrix.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +38,7 @@ from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
     MediumFamily,
+    Quantity,
     RateFamily,
     Scales,
     Site,
@@ -120,6 +128,35 @@ def _felt(model: Model) -> tuple[Array, Array]:
     return np.stack(felt, axis=-1), np.stack([axes[n] for n in found], axis=-1)
 
 
+@lru_cache(maxsize=8)  # asked at every step of a rate
+def turning(model: Model) -> tuple[str, ...]:
+    """Return the body velocities (u, v) and the rate r of the heading; () if one is no state."""
+    found, turned = places.body_velocity(model), places.heading(model)
+    if not found or turned is None:
+        return ()
+    rates = places.role(model, "heading_rate") or places.integrated(model).get(turned, ())[:1]
+    return (*found, *rates) if rates and rates[0] in model.state_names else ()
+
+
+def _others(site: Site) -> tuple[str, str]:
+    """Return the two velocities whose product acts on the third, the target."""
+    one, other = (n for n in turning(site.model) if n != site.target)
+    return one, other
+
+
+def _product(site: Site) -> tuple[Quantity, ...]:
+    one, other = _others(site)
+    units = [site.unit(n) for n in (site.target, one, other)]
+    known = {("m/s", "m/s", "rad/s"): "1", ("rad/s", "m/s", "m/s"): "rad/m^2"}
+    unit = f"{per_second(units[0])} per {units[1]} {units[2]}"
+    return (Quantity("k", known.get((units[0], *units[1:]), unit)),)
+
+
+def _product_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    one, other = _others(site)
+    return {site.target: c["k"] * s[one] * s[other]}
+
+
 current = MediumFamily(
     name="current",
     equation="model of (u, v) through a medium that moves by (a, b) over ground",
@@ -141,4 +178,15 @@ push_world = RateFamily(
     rate=lambda s, a, own, t, c, site: _in_its_axes(s, c, site),
 )
 
-FAMILIES = (current, push_world)
+coriolis = RateFamily(
+    name="coriolis",
+    equation="u' = model + k v r, v' = model + k u r or r' = model + k u v",
+    sentence="a Coriolis or added-mass term is missing: {k} * {product} in the rate of {driven}",
+    targets=turning,
+    quantities=_product,
+    lookalikes=("rate_gain", "quadratic_drag", "coupling", "parameter"),
+    vague=0.7,
+    rate=_product_rate,
+)
+
+FAMILIES = (current, push_world, coriolis)

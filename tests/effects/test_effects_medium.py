@@ -15,6 +15,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
+from grounded.effects.medium import turning
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.places import body_velocity
@@ -28,8 +29,13 @@ PUSH = ("push_world:u+v", {"a": 0.15, "b": -0.08})
 DRAG = ("quadratic_drag:u", {"k": 0.3})
 
 
-def rates(s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0)) -> dict[str, Any]:
-    """A boat over ground; of its drag only the velocity through the water makes one."""
+def rates(
+    s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0), added=(0.0, 0.0, 0.0)
+) -> dict[str, Any]:
+    """A boat over ground; of its drag only the velocity through the water makes one.
+
+    added: what added masses make of the products v r, u r and u v, in the rates of u, v and r.
+    """
     cos, sin = np.cos(s["psi"]), np.sin(s["psi"])
     ahead = s["u"] - water[0] * cos - water[1] * sin
     aside = s["v"] + water[0] * sin - water[1] * cos
@@ -37,9 +43,9 @@ def rates(s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0)) -> dict[str
     Y = push[1] * cos - push[0] * sin
     drag = p["X"] * ahead + p["XX"] * ahead * np.abs(ahead)
     return {
-        "u": a["thrust"] - drag + X + s["v"] * s["r"],
-        "v": -p["Y"] * aside + Y - s["u"] * s["r"],
-        "r": a["rudder"] - 1.8 * s["r"],
+        "u": a["thrust"] - drag + X + (1 + added[0]) * s["v"] * s["r"],
+        "v": -p["Y"] * aside + Y - (1 - added[1]) * s["u"] * s["r"],
+        "r": a["rudder"] - 1.8 * s["r"] + added[2] * s["u"] * s["v"],
         "x": s["u"] * cos - s["v"] * sin,
         "y": s["u"] * sin + s["v"] * cos,
         "psi": s["r"],
@@ -66,7 +72,7 @@ def boat_of(*, states=STATES, uncertain=True, **sizes: float) -> Model:
 boat = boat_of(**SIZES)
 
 
-def driven(water=(0.0, 0.0), push=(0.0, 0.0), count=3, steps=150) -> list[Trial]:
+def driven(count=3, steps=150, **truth: tuple[float, ...]) -> list[Trial]:
     """Trials of the real boat, in fine steps of other code, with noise."""
     rng, found, h = np.random.default_rng(5), [], DT / FINE
     for _ in range(count):
@@ -81,7 +87,7 @@ def driven(water=(0.0, 0.0), push=(0.0, 0.0), count=3, steps=150) -> list[Trial]
 
                 def f(z: Any, a: Mapping[str, Any] = a) -> Any:
                     s = dict(zip(STATES, z, strict=True))
-                    return np.array(list(rates(s, a, SIZES, water, push).values()))
+                    return np.array(list(rates(s, a, SIZES, **truth).values()))
 
                 x = x + h * f(x + 0.5 * h * f(x))
             x = x + np.array([4e-3, 4e-3, 4e-3, 0, 0, 0]) * rng.standard_normal(6)
@@ -143,6 +149,21 @@ def test_the_body_velocities_are_found_from_the_models_rates_not_their_names():
 
 def test_they_are_not_offered_where_one_speed_or_no_plane_is():
     assert not offered(car) and not offered(aircraft)
+    assert not turning(car) and not turning(aircraft)
+
+
+def test_a_product_of_velocities_is_added_to_each_of_the_three_rates():
+    """The boat's u' = ... + v r, v' = ... - u r: with added masses, others."""
+    assert turning(boat) == ("u", "v", "r")
+    parts = [("coriolis:u", {"k": 0.4}), ("coriolis:v", {"k": -0.3}), ("coriolis:r", {"k": 0.2})]
+    model, (x, u) = adopted(*parts), (TRIALS[0].states[10::30], TRIALS[0].inputs[10::30])
+    after = model.system.step(x, u[: len(x)], model.values, 1e-6)
+    before = boat.system.step(x, u[: len(x)], boat.values, 1e-6)
+    more = dict(zip(STATES, ((after - before) / 1e-6).T, strict=True))
+    ahead, aside, turned = x.T[:3]
+    np.testing.assert_allclose(more["u"], 0.4 * aside * turned, atol=1e-4)
+    np.testing.assert_allclose(more["v"], -0.3 * ahead * turned, atol=1e-4)
+    np.testing.assert_allclose(more["r"], 0.2 * ahead * aside, atol=1e-4)
 
 
 def test_what_has_no_drag_feels_no_current():
@@ -282,7 +303,26 @@ def test_the_cause_is_found_with_its_size(truth, name):
         assert first.params[q].value == pytest.approx(value, abs=0.012)
 
 
+ADDED = [
+    ((1.5, 0.0, 0.0), "u", "v * r", "1"),  # this boat hardly slides
+    ((0.0, 0.5, 0.0), "v", "u * r", "1"),
+    ((0.0, 0.0, 0.5), "r", "u * v", "rad/m^2"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("added", "rate", "product", "unit"), ADDED)
+def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, product, unit):
+    """A `rate_gain` would change the drag and the thrust as well."""
+    found = gr.diagnose(boat, driven(added=added, steps=100))
+    assert found.verdict.effects == (f"coriolis:{rate}",)
+    size = found.ranking[0].params["k"]
+    assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
+    assert f"{product} in the rate of" in found.sentence
+
+
 @pytest.mark.slow
 def test_none_is_claimed_in_still_water():
     found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(steps=100))
-    assert not {n for n in found.verdict.effects if n.startswith(("current", "push_world"))}
+    told = ("current", "push_world", "coriolis")
+    assert not {n for n in found.verdict.effects if n.startswith(told)}
