@@ -85,6 +85,24 @@ def missed(
     return np.where(seen, error, np.nan)
 
 
+def unseen(predictor: Predictor, h: Hypothesis) -> Any:
+    """Return how many steps after a moment each log first shows what the start there has not used.
+
+    (n,) of int. A filter uses a log that is late by k whole steps with the state that it shows. So
+    the log of k steps later is no prediction from there, but a part of the start.
+    """
+    found, delays = np.ones(predictor.data.model.n, int), delays_of(h, predictor.data)
+    if delays is not None:
+        found[list(delays.channel)] += np.array(delays.whole)
+    return found
+
+
+def at_steps(error: Array, steps: int, first: Any) -> Array:
+    """Return errors (S, M, n) at a number of steps, of late logs not before `first` (n,), (M, n)."""
+    at = np.maximum(steps, first)
+    return np.asarray(error[at, :, np.arange(len(at))].T)
+
+
 def _marched(
     predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array
 ) -> Array | None:

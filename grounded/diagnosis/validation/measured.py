@@ -30,6 +30,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.validation.ahead import unseen
 from grounded.diagnosis.validation.credit import losses, ordered, shares
 from grounded.diagnosis.validation.decide import Decision, plain
 from grounded.diagnosis.validation.gain import Errors
@@ -137,12 +138,14 @@ class Measured:
 
     def carried(self, fit: Fitted) -> Array:
         """Return the one-step noise propagated to each horizon, (K, n); NaN for whole trials."""
-        rows = []
-        for steps in self.ruler.steps:
+        first, of = unseen(self.predictor, fit.hypothesis), {}
+        for steps in {*self.ruler.steps, *first.tolist()}:
             w = horizon(self.predictor, fit, steps * self.data.dt)
             seen = self.data.seen[w.at + w.steps, w.run] > 0
-            rows.append(root_mean_square(np.where(seen, w.spread, np.nan)))
-        return np.array([*rows, np.full_like(rows[0], np.nan)])
+            of[steps] = root_mean_square(np.where(seen, w.spread, np.nan))
+        each = [np.maximum(steps, first) for steps in self.ruler.steps]
+        rows = [[of[int(k)][i] for i, k in enumerate(at)] for at in each]
+        return np.array([*rows, np.full(len(first), np.nan)])
 
     def corrections(self) -> dict[str, tuple[Leftover, Errors]]:
         """Return, by channel, the leftovers whose correction improves predictions."""

@@ -7,6 +7,9 @@ trials, or from the other pieces of one long log. The errors do not depend on th
 diagnosis estimates, so they can be compared between hypotheses, models and diagnoses. Two
 hypotheses are compared by `gain`.
 
+Of a log that is late, no value counts that the start has used (`unseen`): it counts as soon as there
+is a new one.
+
 No model predicts better than the noise floor. If a manoeuvre was repeated (same candidate or same
 commands), predictions of the repeats share the model's error and differ in noise, so the scatter
 among their errors is the floor. Otherwise the one-step residual is taken as white noise and
@@ -27,7 +30,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.validation.ahead import missed
+from grounded.diagnosis.validation.ahead import at_steps, missed, unseen
 from grounded.diagnosis.validation.gain import Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
@@ -164,7 +167,7 @@ class Ruler:
             shifts, _ = leave_one_out(fit, self.folds)
             each = [moved(data, h, shift) for shift in shifts]
             of_run = np.unique(self.folds, return_inverse=True)[1]
-        self._add(found, each, of_run, fit.states)
+        self._add(found, each, of_run, fit.states, unseen(self.predictor, h))
         return found
 
     def _none(self) -> Errors:
@@ -177,18 +180,21 @@ class Ruler:
         each: Sequence[Hypothesis],
         of_run: Any,
         track: Array,
+        first: Any,
         added: Array | None = None,
         whole: bool = True,
     ) -> None:
         """Add the errors of all runs, each with its hypothesis, to `found`.
 
-        `added` (L, B, n) is added to every step within a run.
+        `first` (n,): steps after which a log shows what the track has not used (`unseen`). `added`
+        (L, B, n) is added to every step within a run.
         """
         at, run = self.starts
         piece = self.piece0[run] + (at - 1) // self.steps[-1]
-        error = missed(self.predictor, each, of_run[run], track, at, run, self.steps[-1], added)
+        most = max(self.steps[-1], int(first.max()))
+        error = missed(self.predictor, each, of_run[run], track, at, run, most, added)
         for k, steps in enumerate(self.steps):
-            square = error[steps] ** 2
+            square = at_steps(error, steps, first) ** 2
             np.add.at(found.total[k], piece, np.nan_to_num(square))
             np.add.at(found.count[k], piece, np.isfinite(square))
         lengths = self.data.lengths[self.data.trial_of[self.wholes]]
@@ -217,8 +223,9 @@ class Ruler:
     def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
         """Return the gain of adding a rate (L, B, n) [unit/s] along the log, and the new errors."""
         plain, other, of_run = self._none(), self._none(), np.zeros(len(self.data.valid), int)
+        first = unseen(self.predictor, fit.hypothesis)
         for found, added in ((plain, None), (other, rate * self.data.dt)):
-            self._add(found, [fit.hypothesis], of_run, fit.states, added, whole=False)
+            self._add(found, [fit.hypothesis], of_run, fit.states, first, added, whole=False)
         return self.compared(plain, other), other
 
     def compared(self, before: Errors, after: Errors) -> Gain:
@@ -289,8 +296,9 @@ class Ruler:
             standard deviation of its logarithm (K,). None without repeats.
         """
         data, h = self.data, fit.hypothesis
-        first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
-        of_trial = dict(zip(data.trial_of[first].tolist(), first.tolist(), strict=True))
+        first = unseen(self.predictor, h)
+        begun = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
+        of_trial = dict(zip(data.trial_of[begun].tolist(), begun.tolist(), strict=True))
         total = np.zeros((len(self.steps) + 1, data.model.n))
         count, often = np.zeros_like(total), np.zeros(len(total))
         cells: list[list[tuple[float, Array, Array]]] = [[] for _ in total]
@@ -313,8 +321,10 @@ class Ruler:
                 moments = np.unique(np.linspace(begin, last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
-                error = missed(self.predictor, [h], 0 * at, fit.states, at, run, steps)
-                error = error[1:] if k == len(self.steps) else error[-1:]
+                whole = k == len(self.steps)
+                most = steps if whole else max(steps, int(first.max()))
+                error = missed(self.predictor, [h], 0 * at, fit.states, at, run, most)
+                error = error[1:] if whole else at_steps(error, steps, first)[None]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
                 there = np.asarray(np.isfinite(error).all(axis=1))
                 spread = np.where(there, np.nan_to_num(error).var(axis=1, ddof=1), 0.0)

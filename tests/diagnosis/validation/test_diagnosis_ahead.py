@@ -10,7 +10,8 @@ from grounded.diagnosis.likelihood import marching
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ahead import missed
+from grounded.diagnosis.validation.ahead import missed, unseen
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library, wrap
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -110,3 +111,27 @@ def test_a_compiled_hypothesis_joins_what_was_adopted_before(monkeypatch):
     found = marching.marched(predictor, h, x, u)
     assert found is not None
     np.testing.assert_allclose(found[1], predictor.advance(h, x, u[0], np.zeros(len(x))))
+
+
+def test_a_late_log_is_predicted_only_from_where_the_start_has_not_used_it():
+    """A hypothesis whose filter follows a late log told that log 0.1 s ahead "to 0.2 mm/s"."""
+    rng, noise = np.random.default_rng(3), 0.01
+    y = noise * rng.standard_normal((STEPS + 1, car.n))
+    trial = Trial(y, np.zeros((STEPS, car.m)), DT, tuple(car.states), tuple(car.inputs))
+    data = prepare(car, [trial])
+    predictor, i = Predictor(data), car.state_names.index("v")
+    late = Library().effect("sensor_delay:v", car, data.scales)
+    h = Hypothesis().plus(late, {"d": 2 * DT})
+    first = unseen(predictor, h)
+    assert first[i] == 3 and np.delete(first, i).max() == 1
+    assert unseen(predictor, Hypothesis()).max() == 1
+    track = data.y.copy()
+    track[:-2, :, i] = data.y[2:, :, i]  # a filter that follows the log, two steps late
+    ruler = Ruler(predictor)
+    found, seen = ruler._none(), ruler._none()
+    for errors, at in ((found, first), (seen, np.ones_like(first))):
+        ruler._add(errors, [h], np.zeros(len(data.valid), int), track, at)
+    assert seen.rms[0, i] < 1e-6 < 0.7 * noise < found.rms[0, i]
+    others = np.delete(found.rms[0], i)
+    np.testing.assert_array_equal(others, np.delete(seen.rms[0], i))
+    assert found.rms[-2, i] == seen.rms[-2, i]  # a second ahead, nothing was used
