@@ -62,7 +62,7 @@ Ending = Literal[
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
 AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
-WILD = 100.0  # a first trial worse than predicted by this factor suggests a diagnosis
+WILD = 100.0  # a trial worse than predicted, and than the best, by this factor: diagnose
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
 
@@ -414,14 +414,23 @@ def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
             f"its trial gave {incumbent.utility:.4g}, but the model promised "
             f"{made.predicted_utility:.4g}: a diagnosis may show what the model lacks"
         )
+    last = history[-1]
+    if last.lost and _far_below(last, min(last.promised, incumbent.utility)):
+        return (
+            f"{last.candidate.id} gave {last.utility:.4g}, but {last.promised:.4g} was predicted: "
+            "a diagnosis may show what the model lacks"
+        )
     return ""
 
 
 def wild(tried: Tried) -> bool:
     """Return whether a first policy did so much worse than predicted that its bias is useless."""
-    predicted = tried.promised
-    worse = predicted - tried.utility > WILD * max(abs(predicted), 1e-9)
-    return bool(tried.utilities) and not tried.candidate.base and worse
+    return not tried.candidate.base and _far_below(tried, tried.promised)
+
+
+def _far_below(tried: Tried, utility: float) -> bool:
+    """Return whether a candidate's runs cost more by WILD times than a utility."""
+    return bool(tried.utilities) and utility - tried.utility > WILD * max(abs(utility), 1e-9)
 
 
 def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:

@@ -189,6 +189,18 @@ def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
     )
 
 
+@pytest.mark.parametrize(("off", "asks"), [(0.5, False), (50.0, True)])
+def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnosis(off, asks):
+    """A boat's step cost 4,021 for 23: `adopt` had left out its thrust, and half a step was next."""
+    story = Story().add().add(lambda trial: bad(trial, off))
+    now = story.now
+    assert now.phase == "propose" and now.step is not None
+    assert (now.then == NextCommand("diagnose")) is asks
+    lost = now.history[-1]
+    told = (lost.candidate.id, "was predicted", f"{lost.utility:.4g}", "diagnosis")
+    assert holds(now.sentence, *told) is asks
+
+
 def test_a_small_promise_that_is_not_kept_asks_for_nothing():
     story = Story(tolerance=0.0).add().add().add().add()
     while story.propose().candidate is not None:
