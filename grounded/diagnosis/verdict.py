@@ -267,7 +267,7 @@ def _causes(
             text = f"{_moved(claims, adopted)}{GIVEN.format(listed(held)) * bool(held)}"
             text += OPEN * open_gap + _others(claims, identified, adopted)
             vague = [n for n in named if n in lost]
-            text += f", but these trials do not determine {listed(vague)}" * bool(vague)
+            text += f"; these trials do not determine {listed(vague)}" * bool(vague)
             joined = [n for n in named if n in joint]
             are = "is" if len(joined) == 1 else "are"
             text += f" ({listed(joined)} {are} known only with the others)" * bool(joined)
