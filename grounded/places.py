@@ -86,7 +86,7 @@ def body_velocity(model: Model) -> tuple[str, ...]:
 
     They are found from the model's rates: x' = u cos psi - v sin psi, y' = u sin psi + v cos psi.
     """
-    where, turned = position(model), heading(model)
+    where, turned, model = position(model), heading(model), motion(model)
     if len(where) < 2 or turned is None:
         return ()
     (x, u), dt, names = samples(model, 8), probe(model, SHORT), model.state_names
@@ -175,6 +175,21 @@ def direct(model: Model) -> Model:
     if not isinstance(found, Model):
         return model
     return replace(found, params={name: model.params[name] for name in found.params})
+
+
+def motion(model: Model) -> Model:
+    """Return the model as written, without any adopted effect, with the current parameters.
+
+    Which velocities move a position is a matter of its geometry: a drift over the ground or a late
+    log that was adopted would hide it.
+    """
+    while True:
+        shell, step = getattr(model.step, "shell", None), model.step
+        joined = getattr(step, "joined", None) or getattr(step, "losing", None)
+        inner = shell.effect.site.model if shell else joined[0] if joined else None
+        if inner is None:
+            return model
+        model = replace(inner, params={name: model.params[name] for name in inner.params})
 
 
 def integrated(model: Model) -> dict[str, tuple[str, float]]:

@@ -134,8 +134,9 @@ def turning(model: Model) -> tuple[str, ...]:
     found, turned = places.body_velocity(model), places.heading(model)
     if not found or turned is None:
         return ()
-    rates = places.role(model, "heading_rate") or places.integrated(model).get(turned, ())[:1]
-    return (*found, *rates) if rates and rates[0] in model.state_names else ()
+    own = places.motion(model)
+    rates = places.role(model, "heading_rate") or places.integrated(own).get(turned, ())[:1]
+    return (*found, *rates) if rates and rates[0] in own.state_names else ()
 
 
 def _others(site: Site) -> tuple[str, str]:

@@ -177,6 +177,32 @@ def test_a_linear_drag_that_is_alike_both_ways_leaves_one_name():
     assert len(offered(boat)) == len(offered(boat_of(X=0.7, XX=0.0, Y=0.8))) == 2
 
 
+LATER = [("coriolis:u", {"k": -0.9}), PUSH, CURRENT]
+BEFORE = [
+    ("drift_world:x+y", {"a": 0.03, "b": -0.05}),
+    ("sensor_delay:u", {"d": 0.12}),
+    ("delay:thrust", {"d": 0.15}),
+    ("drift_body:x+y", {"a": 0.03, "b": -0.05}),
+]
+
+
+@pytest.mark.parametrize("later", LATER, ids=lambda part: part[0])
+@pytest.mark.parametrize("before", BEFORE, ids=lambda part: part[0])
+def test_they_are_adopted_in_any_order(before, later):
+    """`adopt` wrote coriolis:u after drift_world:x+y, and no command could read the workspace."""
+    models = [adopted(before, later), adopted(later, before)]
+    assert {*models[0].params} == {*models[1].params}
+    assert body_velocity(models[0]) == ("u", "v") and turning(models[0]) == ("u", "v", "r")
+    names = models[0].state_names
+    x = np.concatenate([TRIALS[0].states[40], np.full(len(names) - 6, 0.3)])[None]
+    order = [names.index(n) for n in models[1].state_names]
+    u = TRIALS[0].inputs[40:41]
+    values = [np.array([m.params[n].value for n in m.params]) for m in models]
+    one = models[0].system.step(x, u, values[0], DT)[:, order]
+    other = models[1].system.step(x[:, order], u, values[1], DT)
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("parts", "truth"),
     [
