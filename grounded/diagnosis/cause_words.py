@@ -315,7 +315,7 @@ def clauses(
     kinds: dict[tuple[str, ...], list[int]] = {}
     for i, name in enumerate(names):
         own = effects.get(name)
-        alike = own is not None and not re.search(r"[%|>]|\{product\}", own.family.sentence)
+        alike = own is not None and not re.search(r"[%|>]", own.family.sentence)
         alike = alike and DISAGREE not in causes[names.index(name)]
         key = (own.family.name, *_told(values[name])) if own is not None and alike else (name,)
         kinds.setdefault(key, []).append(i)

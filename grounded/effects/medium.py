@@ -182,7 +182,8 @@ push_world = RateFamily(
 coriolis = RateFamily(
     name="coriolis",
     equation="u' = model + k v r, v' = model + k u r or r' = model + k u v",
-    sentence="a Coriolis or added-mass term is missing: {k} * {product} in the rate of {driven}",
+    sentence="the rate of {driven} should have {k} * {product} {k>more|less} (Coriolis forces, "
+    "added mass)",
     targets=turning,
     quantities=_product,
     lookalikes=("rate_gain", "quadratic_drag", "coupling", "parameter"),

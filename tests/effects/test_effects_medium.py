@@ -344,7 +344,7 @@ def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]
     assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
-    assert f"{product} in the rate of" in found.sentence
+    assert f"* {product} more (Coriolis" in found.sentence
 
 
 @pytest.mark.slow

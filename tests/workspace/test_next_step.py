@@ -949,13 +949,13 @@ def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart
 
 def test_an_adoption_under_later_changes_is_not_undone(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    set_in_model(folder / "grounded.toml", effects=[{"name": "offset:v", "b": 0.5}])
+    set_in_model(folder / "grounded.toml", effects=[{"name": "offset:v", "c": 0.5}])
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     set_in_model(folder / "grounded.toml", params={"mass": 3.25})
     changed = (folder / "grounded.toml").read_text()
     done = grounded("-C", folder, "adopt", "--undo")
     assert done.code == 1 and holds(
-        done.err, "changed", "viscous_friction:v", 'effects = [{name = "offset:v", b = 0.5}]'
+        done.err, "changed", "viscous_friction:v", 'effects = [{name = "offset:v", c = 0.5}]'
     )
     assert (folder / "grounded.toml").read_text() == changed
     assert grounded("-C", folder, "adopt").code == 2

@@ -32,6 +32,7 @@ PIECES, SHORTEST_PIECE = 5, 50  # a single log is held out in pieces of at least
 MOST_NUMBERS = 1.2e6  # size of one (L, B, N, N) array above which only informative runs are kept
 SIMULATED = 800  # total steps kept for a simulator, since each is evaluated thousands of times
 SESSION, ROOMY = 16, 2.5  # runs of a session at the robot, all kept up to ROOMY times that size
+UNKNOWN = 10  # samples of a run until a state is known that no sensor shows
 BEGINNINGS = 8  # most runs kept only because a trial begins with them
 
 
@@ -72,6 +73,18 @@ class Data:
         """Hidden true values, unknown even at the start: {its index: the state that logs it}."""
         names = self.model.state_names
         return true_values(names, [names[i] for i in self.hidden])
+
+    @cached_property
+    def begin(self) -> Any:
+        """First step of each run that predictions start from, (B,).
+
+        What no sensor shows (a speed, or the true value behind a late log) is not known at the first
+        samples of a run. Predictions from there would miss by that and not by the model.
+        """
+        lengths = self.valid.sum(axis=1).astype(int)
+        shown = [i for i in range(self.model.n) if i not in self.hidden]
+        blind = bool(self.behind) or not all(self.seen[..., i].any() for i in shown)
+        return np.clip(lengths // 4, 1, UNKNOWN) if blind else np.ones_like(lengths)
 
     @cached_property
     def now(self) -> Mapping[int, int]:

@@ -58,7 +58,7 @@ def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
     lengths = data.valid.sum(axis=1).astype(int)
     longest = max(int(np.median(lengths)) - 2, 1)
     steps = max(1, round(min(seconds / data.dt, longest)))
-    pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)]
+    pairs = [(t, b) for b in range(B) for t in range(data.begin[b], lengths[b] - steps + 1)]
     if not pairs:
         steps = max(1, int(lengths.max()) - 2)
         pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)] or [(0, 0)]

@@ -45,7 +45,6 @@ LEAST_WHOLE = 3
 FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
 SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
 ODD = 10.0  # a trial that misses more than this times the best repeat is not a repeat
-UNKNOWN = 10  # samples of a run until an unmeasured state is known
 MOMENTS = 20  # most moments at which repeats are compared
 AS_LONG = 1.25  # whole trials up to this times as long as the repeats have their floor
 ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
@@ -93,17 +92,12 @@ class Ruler:
 
     @cached_property
     def starts(self) -> tuple[Any, Any]:
-        """Step within the run, and run, of each moment that predictions start from, (M,) each.
-
-        Where a state is not measured, a speed for instance, the first samples of a run do not tell
-        it yet: predictions from there would miss by that and not by the model.
-        """
+        """Step within the run, and run, of each moment that predictions start from, (M,) each."""
         data, least = self.data, self.steps[0]
         lengths = data.valid.sum(axis=1).astype(int)
         first = data.step_at[:, 0] - self.step0[data.trial_of]
         room = data.lengths[data.trial_of] - least - first
-        blind = len(self._watched) < len(self.shown)
-        begin = np.clip(lengths // 4, 1, UNKNOWN) if blind else np.ones_like(lengths)
+        begin = data.begin
         pairs = [
             (t, b)
             for b in range(len(lengths))

@@ -135,3 +135,22 @@ def test_a_late_log_is_predicted_only_from_where_the_start_has_not_used_it():
     others = np.delete(found.rms[0], i)
     np.testing.assert_array_equal(others, np.delete(seen.rms[0], i))
     assert found.rms[-2, i] == seen.rms[-2, i]  # a second ahead, nothing was used
+
+
+def test_predictions_start_where_what_is_behind_a_late_log_is_known():
+    """An adopted late sensor made a boat's speed, known to 6 mm/s, miss by 12 a second ahead."""
+    from grounded.places import true_values
+
+    data = data_of(car)
+    late = wrap(Library().effect("sensor_delay:v", car), {"d": 2.5 * DT}, DT)
+    hidden = late.state_names[car.n :]
+    assert true_values(late.state_names, hidden)
+    run = data.states[: STEPS + 1]
+    start = {name: run[0, car.state_names.index("v")] for name in hidden}
+    states = np.column_stack([run, *(np.full(len(run), value) for value in start.values())])
+    names = late.state_names, late.input_names
+    trial = Trial(states, np.zeros((STEPS, car.m)), DT, *names)
+    behind = prepare(late, [trial], hidden=hidden)
+    assert data.begin.max() == 1 and behind.begin.min() > 1
+    ruler = Ruler(Predictor(behind))
+    assert (ruler.starts[0] >= behind.begin[ruler.starts[1]]).all()

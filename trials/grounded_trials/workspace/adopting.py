@@ -115,7 +115,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     these parameters are adopted too, since the effects' values are only valid with them. An effect
     that it does not claim was fitted instead of those, without parameters.
     """
-    from grounded_trials.workspace.adopted import in_order
+    from grounded_trials.workspace.adopted import in_order, planner_of
 
     found = read_diagnosis(workspace.reports)
     if found is None:
@@ -133,7 +133,8 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     own, both = joined(found, names, old, nominal, calibrated)
     adopted = in_order(both[: len(old)], both[len(old) :])
     whole = dict(workspace.config.model.params) | own
-    earlier, _ = adoptions(workspace)  # raises before anything is written
+    earlier, _ = adoptions(workspace)  # raises before anything is written, as does
+    planner_of(workspace.task, adopted)  # a model that can't be built from these effects
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}

@@ -177,7 +177,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:
-        raise GroundedError("there is no best candidate yet: no trial was ingested")
+        raise GroundedError("no run of this task's candidates was ingested yet, so none is the best")
     return best.candidate.id
 
 
