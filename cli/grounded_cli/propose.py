@@ -362,7 +362,8 @@ def _trust(
     if not logs:
         return "unknown: the crude model was never compared with the real system"
     config = workspace.config.model
-    done = " and ".join(["calibrated"] * bool(config.params) + ["given effects"] * bool(config.effects))
+    parts = ["calibrated"] * bool(config.params) + ["given effects"] * bool(config.effects)
+    done = " and ".join(parts)
     by = f"was {done} with" if done else "can be checked against"
     return (
         f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` shows how well it "

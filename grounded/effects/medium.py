@@ -147,10 +147,10 @@ def _others(site: Site) -> tuple[str, str]:
 
 def _product(site: Site) -> tuple[Quantity, ...]:
     one, other = _others(site)
-    units = [site.unit(n) for n in (site.target, one, other)]
+    units = site.unit(site.target), site.unit(one), site.unit(other)
     known = {("m/s", "m/s", "rad/s"): "1", ("rad/s", "m/s", "m/s"): "rad/m^2"}
     unit = f"{per_second(units[0])} per {units[1]} {units[2]}"
-    return (Quantity("k", known.get((units[0], *units[1:]), unit)),)
+    return (Quantity("k", known.get(units, unit)),)
 
 
 def _product_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:

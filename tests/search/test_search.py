@@ -191,7 +191,7 @@ def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
 
 @pytest.mark.parametrize(("off", "asks"), [(0.5, False), (50.0, True)])
 def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnosis(off, asks):
-    """A boat's step cost 4,021 for 23: `adopt` had left out its thrust, and half a step was next."""
+    """A boat's step cost 4,021 for 23, as `adopt` had left out its thrust; half a step was next."""
     story = Story().add().add(lambda trial: bad(trial, off))
     now = story.now
     assert now.phase == "propose" and now.step is not None

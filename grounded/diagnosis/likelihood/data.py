@@ -78,8 +78,8 @@ class Data:
     def begin(self) -> Any:
         """First step of each run that predictions start from, (B,).
 
-        What no sensor shows (a speed, or the true value behind a late log) is not known at the first
-        samples of a run. Predictions from there would miss by that and not by the model.
+        What no sensor shows (a speed, or the true value behind a late log) is not known at the
+        first samples of a run. Predictions from there would miss by that and not by the model.
         """
         lengths = self.valid.sum(axis=1).astype(int)
         shown = [i for i in range(self.model.n) if i not in self.hidden]

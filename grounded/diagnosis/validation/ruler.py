@@ -7,8 +7,7 @@ trials, or from the other pieces of one long log. The errors do not depend on th
 diagnosis estimates, so they can be compared between hypotheses, models and diagnoses. Two
 hypotheses are compared by `gain`.
 
-Of a log that is late, no value counts that the start has used (`unseen`): it counts as soon as there
-is a new one.
+Of a log that is late, no value counts that the start has used (`unseen`): the first new one does.
 
 No model predicts better than the noise floor. If a manoeuvre was repeated (same candidate or same
 commands), predictions of the repeats share the model's error and differ in noise, so the scatter

@@ -177,7 +177,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:
-        raise GroundedError("no run of this task's candidates was ingested yet, so none is the best")
+        raise GroundedError("no run of this task was ingested yet, so no candidate is the best")
     return best.candidate.id
 
 
