@@ -98,7 +98,7 @@ def unseen(predictor: Predictor, h: Hypothesis) -> Any:
 
 
 def at_steps(error: Array, steps: int, first: Any) -> Array:
-    """Return those of errors (S, M, n) after some steps, of late logs not before `first`, (M, n)."""
+    """Return errors (S, M, n) after some steps, of late logs not before `first` (n,), (M, n)."""
     at = np.maximum(steps, first)
     return np.asarray(error[at, :, np.arange(len(at))].T)
 
