@@ -181,13 +181,18 @@ def test_a_gain_that_scatter_may_explain_is_headed_perhaps(car):
     findings = gather(Folder(car))
     now = findings.standing
     two = [now.history[0], next(t for t in now.history if t is now.incumbent)]
-    pairs = (-10.0, -11.0), (-9.9, -10.7)
-    unsure = tuple(
-        replace(one, utilities=each, pieces=None, trials=one.trials * 2)
-        for one, each in zip(two, pairs, strict=True)
-    )
-    found = replace(findings, standing=replace(now, history=unsure, incumbent=unsure[1]))
-    text = page(found)
+
+    def page_of(*pairs):
+        unsure = tuple(
+            replace(one, utilities=each, pieces=None, trials=one.trials * 2)
+            for one, each in zip(two, pairs, strict=True)
+        )
+        return page(replace(findings, standing=replace(now, history=unsure, incumbent=unsure[1])))
+
+    likelier_worse = page_of((-9.9, -10.7), (-10.0, -11.0))
+    told = r"<h2>What the runs changed \(an improvement with probability 0\.[34]\d\)</h2>"
+    assert re.search(told, likelier_worse)
+    text = page_of((-10.0, -11.0), (-9.9, -10.7))
     assert re.search(r"<h2>What perhaps improved \(probability 0\.[67]\d\)</h2>", text)
     assert ": the scatter of repeats may explain the difference" in text
     assert "cost reduced" not in text and "cost raised" not in text

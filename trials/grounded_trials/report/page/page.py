@@ -226,6 +226,8 @@ def _heading(findings: Findings) -> str:
     if (two := _first_and_best(findings)) is None or not explained(*two, findings.history):
         return "What improved"
     sure = chance(*two, findings.history)
+    if sure < 0.5:
+        return f"What the runs changed (an improvement with probability {sure:.2f})"
     why = "not repeated" if math.isnan(sure) else f"probability {sure:.2f}"
     return f"What perhaps improved ({why})"
 
