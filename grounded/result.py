@@ -105,6 +105,12 @@ def shown(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
+def begun(text: str) -> str:
+    """Return a text with a capital letter, unless it begins with a name: `delay:u`, `t_end`."""
+    first = text.partition(" ")[0]
+    return text if ":" in first or "_" in first else f"{text[:1].upper()}{text[1:]}"
+
+
 def per_second(unit: str) -> str:
     """Return the unit of a rate of change: rad/s for rad, m/s^2 for m/s, 1/s for 1."""
     if found := re.fullmatch(r"(.*)/ ?s(?:\^(\d+))?", unit):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.result import listed, measured_alike, with_error
+from grounded.result import begun, listed, measured_alike, with_error
 from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE, run_or_stop
 from grounded.search.step.step_size import Step
 from grounded_cli.console.options import as_json
@@ -182,7 +182,7 @@ def _so_far(
     text = f"{number(best.utility)} by {best.candidate.id}{noise_share(best)}"
     if not _otherwise(candidate, best):
         less = candidate.less_in_log(best, missed)
-        return f"{text}. {less[:1].upper()}{less[1:]}" if less else text
+        return f"{text}. {begun(less)}" if less else text
     same, told = candidate.expected_of_base, UNLIKE * abs(candidate.predicted_gain)
     own = f"{text}. For {best.candidate.id} itself the model predicts {number(same)}"
     if same < ASTRAY * best.utility:

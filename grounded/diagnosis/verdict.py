@@ -53,7 +53,7 @@ from grounded.diagnosis.ruler_words import (
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
-from grounded.result import listed, number, percent, with_unit
+from grounded.result import begun, listed, number, percent, with_unit
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -451,7 +451,7 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
 def sentence(clauses: Iterable[str]) -> str:
     """Join clauses to a sentence (`called` keeps names from being its first word)."""
     text = "; ".join(clauses)
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{begun(text)}."
 
 
 def told_apart(

@@ -8,7 +8,7 @@ import pytest
 
 from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.report import Estimate
-from grounded.result import measured_alike
+from grounded.result import begun, measured_alike
 from grounded_trials.report.findings import by_state
 from grounded_trials.wording import (
     count,
@@ -114,3 +114,10 @@ def test_trials_are_named_without_hiding_those_between():
 )
 def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
+
+
+def test_a_sentence_that_begins_with_an_effect_keeps_its_name():
+    """The page said "Coriolis:v and rate_gain:v are equivalent", a name that `adopt` refuses."""
+    assert begun("coriolis:v and rate_gain:v are") == "coriolis:v and rate_gain:v are"
+    assert begun("t_end is") == "t_end is"
+    assert begun("the state v: 3 m") == "The state v: 3 m"

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from grounded.diagnosis.cause_words import ended, furthest_apart, give_or_take, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
 from grounded.diagnosis.report import Changed, Diagnosis, Estimate
-from grounded.result import listed
+from grounded.result import begun, listed
 from grounded_trials.wording import (
     ALONE,
     changed,
@@ -225,5 +225,5 @@ def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
     each = zip(causes, diagnosis.credit, strict=True)
     clauses = diagnosis.verdict.clauses or tuple(with_worth(c, [one]) for c, one in each)
     first = [text for text in [diagnosis.verdict.comparison] if text]
-    first += [f"{clause[:1].upper()}{clause[1:]}" for clause in clauses]
+    first += [begun(clause) for clause in clauses]
     return first, told[1 + bool(diagnosis.verdict.comparison) :]

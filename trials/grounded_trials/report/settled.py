@@ -14,7 +14,7 @@ from typing import Any
 from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
-from grounded.result import listed, number
+from grounded.result import begun, listed, number
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
@@ -163,7 +163,7 @@ def so_far(
     if settled is not None and settled.left and not since.changed:
         lines = lines[:-1]  # the diagnosis itself follows
     if text := since.sentence:
-        lines.append(f"{text[:1].upper()}{text[1:]}.")
+        lines.append(f"{begun(text)}.")
     return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
 
 

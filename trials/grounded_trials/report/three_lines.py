@@ -18,7 +18,7 @@ from grounded.diagnosis.ruler_words import (
     worsened,
 )
 from grounded.diagnosis.verdict import OPEN, also_off, told_apart, told_of
-from grounded.result import listed, measured_alike
+from grounded.result import begun, listed, measured_alike
 from grounded.task import Task
 from grounded_trials.wording import shown
 from grounded_trials.workspace.off_target import rates_among, weighed_groups
@@ -50,7 +50,7 @@ def three_lines(diagnosis: Diagnosis, task: Task, *, causes_below: bool = False)
 def _wrong(diagnosis: Diagnosis) -> str:
     """The causes, largest first, without what they are worth, which the bars show."""
     text = "; ".join(diagnosis.verdict.causes)
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{begun(text)}."
 
 
 def _largest(diagnosis: Diagnosis) -> str:
@@ -63,7 +63,7 @@ def _largest(diagnosis: Diagnosis) -> str:
         first = f"{first.partition(': ')[0]}{OPEN * (OPEN in first)}"
     more = "one smaller cause is" if len(causes) == 2 else f"{len(causes) - 1} smaller causes are"
     text = f"{with_worth(first, credit[:1])}; {more} listed below"
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{begun(text)}."
 
 
 def gained(
@@ -163,4 +163,4 @@ def still_open(diagnosis: Diagnosis, *, ties: bool = True, repeated: bool = Fals
     if not diagnosis.leftover and (small := rest(rows)):
         found.append(small)
     text = "; ".join(found) or nothing
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{begun(text)}."

@@ -16,6 +16,7 @@ from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
+from grounded.result import begun
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import ROWS
@@ -329,7 +330,7 @@ def _probe(
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
         said = made.sentence
         if found.contested or not (worth or ties):  # it is the trial that is asked for, if one
-            said = f"{found.next_trial} {said[:1].upper()}{said[1:]}"
+            said = f"{found.next_trial} {begun(said)}"
         if not worth:
             return "", f"{said.rstrip('.')}.{' No probe is written.' * write}"
         if not offer:

@@ -8,7 +8,7 @@ from grounded.diagnosis.cause_words import OWN, give_or_take, with_worth
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import values_of
-from grounded.result import listed
+from grounded.result import begun, listed
 from grounded_trials.report.settled import Settled
 
 
@@ -31,7 +31,7 @@ def causes(diagnosis: Diagnosis) -> list[Cause]:
         return []  # the latter: a document of an older version
     found, several = [], len(diagnosis.credit) > 1
     for text, one in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
-        said = with_worth(f"{text[:1].upper()}{text[1:]}", [one]) if several else ""
+        said = with_worth(begun(text), [one]) if several else ""
         if one.of == CALIBRATION:
             found.append(Cause(said, OWN, _calibrated(diagnosis)))
         elif (row := diagnosis.ranked(one.of)) is not None:
@@ -52,7 +52,7 @@ def adopted(settled: Settled | None) -> list[Cause]:
         return []
     both = zip(settled.adopted, settled.rows, strict=True)
     return [
-        Cause("" if text.startswith(f"{name} ") else f"{text[:1].upper()}{text[1:]}", name, values)
+        Cause("" if text.startswith(f"{name} ") else begun(text), name, values)
         for text, (name, values) in both
     ]
 

@@ -10,6 +10,7 @@ from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_fi
 from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
 from grounded.diagnosis.tables import of_delays, of_rivals
 from grounded.diagnosis.verdict import told_apart
+from grounded.result import begun
 from grounded_trials.report.diagnosis_notes import WHITE, left_patterns, pattern_line
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
@@ -249,4 +250,4 @@ def _rest(diagnosis: Diagnosis) -> list[Block]:
 
 
 def _begun(sentence: str) -> str:
-    return sentence[:1].upper() + sentence[1:]
+    return begun(sentence)

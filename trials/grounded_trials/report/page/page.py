@@ -24,6 +24,7 @@ from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
+from grounded.result import begun
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_notes import note_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -314,12 +315,11 @@ def _utility(findings: Findings) -> list[Block]:
     from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)
-    begun = sure[:1].upper() + sure[1:]
     few = len(findings.history) <= OPEN
     rows, header = utility_terms(findings)
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),
-        *([Block("text", f"{begun}.")] if sure else []),
+        *([Block("text", f"{begun(sure)}.")] if sure else []),
         *([table("terms", header, rows)] if len(rows) > 2 else []),
         Block("folded", "All candidates", blocks=candidate_table(findings), wide=few),
     ]

@@ -17,7 +17,7 @@ from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import listed
+from grounded.result import begun, listed
 from grounded.search.pictures import MOST, few
 from grounded_trials.report.findings import (
     Findings,
@@ -115,11 +115,7 @@ def candidate_table(findings: Findings) -> list[Block]:
         Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
     ]
     why = legend("", [t.candidate.iteration for t in kept])
-    told = [
-        f"{words[:1].upper()}{words[1:]}."
-        for words in (why, findings.standing.less_in_log)
-        if words
-    ]
+    told = [f"{begun(words)}." for words in (why, findings.standing.less_in_log) if words]
     return [made, *(Block("soft", words) for words in told), *more * bool(left)]
 
 
