@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.verdict import parameters_off, tied, told_apart
 from grounded.model import all_at_bounds
-from grounded.result import number
+from grounded.result import listed, number
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims
@@ -78,6 +78,12 @@ def next_trial(
         one = seen[0]
         if one.repeats:
             return f"Run a different motion: all trials that show {one.effect} move alike."
+        logs = {trial for trial, why in (unrepeatable or {}).items() if why == LOG}
+        if len(one.trials) > 1 and {*one.trials} <= logs:
+            return (
+                f"None is needed for this task: logs that no candidate made ({listed(one.trials)}) "
+                f"show {one.effect}, and runs of candidates hardly do."
+            )
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
             return f"Repeat trial {one.trial}: few others show {one.effect}."

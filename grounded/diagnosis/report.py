@@ -113,7 +113,8 @@ class Likeness(Document):
 class Unconfirmed(Document):
     """A likely effect that few trials show, mostly `trial` from `start` to `end` [s].
 
-    seen: number of trials that hold most of its action, and of all trials. region: where it acts.
+    seen: number of trials that hold most of its action, and of all trials; `trials`: these, those
+    that show it best first. region: where it acts.
     repeats: these trials all make nearly the same motion, so it can't be distinguished from
     anything else that repeats with the motion.
     """
@@ -128,6 +129,7 @@ class Unconfirmed(Document):
     seen: tuple[int, int] = (1, 1)
     region: Region | None = None
     repeats: bool = False
+    trials: tuple[str, ...] = field(metadata=BRIEF, default=())
 
     def sentence(self) -> str:
         """Return it as one clause."""

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import places
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import Part, RulerRow
 from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
@@ -26,6 +27,7 @@ from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
 from grounded.diagnosis.validation.visits import acting, few_trials
+from grounded.effects import Effect, RateFamily
 from grounded.frozen import Array
 from grounded.result import listed, number, with_unit
 from grounded.task import Task
@@ -90,8 +92,10 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
     start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
-    regions = by_region(acts, claims.predictor, one.fit, 1)
     i = one.fit.hypothesis.names.index(one.name)
+    anywhere = _anywhere(one.fit.hypothesis.effects[i])
+    regions = by_region(acts, claims.predictor, one.fit, 1, but=anywhere)
+    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
     params, begin = claims.estimates(one.fit)[i], data.time[0, run]
     if not any(abs(e.value) > SURE * e.std for e in params.values()):
         return None  # its size is unknown
@@ -106,7 +110,17 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         (few, data.count),
         regions[0] if regions else None,
         one.repeats > 0,
+        tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few]),
     )
+
+
+def _anywhere(effect: Effect) -> Sequence[str]:
+    """Return the coordinates on the ground if an effect acts alike at all places.
+
+    A motor's delay showed "where y < -3.95 m": only the drive by hand went there.
+    """
+    where = places.position(effect.site.model)
+    return () if len(where) < 2 or isinstance(effect.family, RateFamily) else where
 
 
 def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:

@@ -34,7 +34,7 @@ from grounded.diagnosis.ruler_words import (
     worsened,
 )
 from grounded.diagnosis.tables import effect_table, error_table, larger
-from grounded.diagnosis.unconfirmed import another_look, unrepeatable
+from grounded.diagnosis.unconfirmed import _anywhere, another_look, unrepeatable
 from grounded.diagnosis.verdict import _unneeded, verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
@@ -300,6 +300,23 @@ def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():
     said = {why: next_trial(_claims(), "", (), (seen,), (), {"t0001": why}) for why in (LOG, LOST)}
     assert all("Repeat" not in text and "v > 2" in text for text in said.values())
     assert "gentler" in said[LOST] and "gentler" not in said[LOG]
+
+
+def test_what_two_logs_by_hand_show_needs_no_third():
+    """Another log was asked for, recorded and asked for again: a delay showed in both."""
+    seen = Unconfirmed("delay:v", trial="t1", seen=(2, 8), trials=("t1", "t9"))
+    by_hand = next_trial(_claims(), "", (), (seen,), (), {"t1": LOG, "t9": LOG})
+    assert holds(by_hand, "None is needed", "t1 and t9", "delay:v") and "record" not in by_hand
+    for other in ({"t1": LOG}, {"t1": LOG, "t9": LOST}):
+        assert "record another" in next_trial(_claims(), "", (), (seen,), (), other)
+    once = replace(seen, seen=(1, 8), trials=("t1",))
+    assert "record another" in next_trial(_claims(), "", (), (once,), (), {"t1": LOG, "t9": LOG})
+
+
+def test_a_delay_acts_at_every_place():
+    """It showed "where y < -3.95 m", where only the drive by hand went."""
+    late, patch = (Library().effect(name, car.model) for name in ("delay:throttle", "patch:v"))
+    assert _anywhere(late) == ("x", "y") and _anywhere(patch) == ()
 
 
 def test_no_robot_is_sent_to_a_place_in_time():

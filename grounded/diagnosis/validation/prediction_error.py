@@ -10,7 +10,7 @@ region is a half-space of one state or input with a large share of the gain in l
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -156,14 +156,25 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
     ]
 
 
-def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> list[Region]:
-    """Return the half-spaces of a state or an input with most of the gap in little of the time."""
+def by_region(
+    gain: Array, predictor: Predictor, fit: Fitted, most: int = 3, but: Collection[str] = ()
+) -> list[Region]:
+    """Return the half-spaces of a state or an input with most of the gap in little of the time.
+
+    Args:
+        gain: what is left in each step, (L, B).
+        predictor: has the data.
+        fit: its states.
+        most: number of regions, at most one a signal.
+        but: states that are left out.
+    """
     data = predictor.data
     model = data.model
     signals: list[tuple[str, Array]] = []
     u = data.runs(data.commands)
     signals += [(n, u[..., j]) for j, n in enumerate(model.input_names)]
-    shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
+    hidden = {*but, *(model.state_names[i] for i in data.hidden)}
+    shown = [(i, n) for i, n in enumerate(model.state_names) if n not in hidden]
     signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
     signals.append(("t", data.time))
     units = {**model.states, **model.inputs, "t": "s"}
