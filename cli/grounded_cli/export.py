@@ -89,8 +89,8 @@ def command(
                 again = typed(then)
                 show("")
                 sentence(
-                    f"the search has ended: {done.candidate} is its result, and no further run "
-                    "is needed. Copy both to the robot to use it; a log of another run can be "
+                    f"the search has ended with {done.candidate}; `grounded status` says how sure "
+                    "that is. Copy both to the robot to use it; a log of another run can be "
                     f"added with `{again}`"
                 )
                 show(next_line(NextCommand("report", ("--html",))))

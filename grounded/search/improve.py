@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 LATEST = 100  # iterations of a plan whose progress is told if it is not optimal
+ABSURD = 10.0  # of the best cost: likely error from which its figure says nothing
 RISKY = 0.2  # of the best cost: likely loss of a step above which the own derivatives are asked
 
 
@@ -360,11 +361,12 @@ def _ended(
         )
     elif ruinous is not None:
         ending, asked = "too doubtful", "; diagnose the model"
+        told = f" of {figure(ruinous.likely_off)}" * (ruinous.likely_off < -ABSURD * incumbent.utility)
         if len(incumbent.trials) < AGAIN:
             asked = f"; run {own} again or diagnose the model"
         sentence = (
-            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but its "
-            f"likely error is larger than the whole cost of {own}: no trial is spent on it"
+            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but with a "
+            f"likely error{told}, more than the whole cost of {own}: no trial is spent on it"
         )
     elif promised and not finite:
         ending, asked = "model diverges", "; a diagnosis may show what it lacks"

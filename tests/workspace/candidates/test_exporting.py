@@ -138,7 +138,7 @@ def test_after_the_search_an_export_asks_for_no_further_run(tmp_path):
     assert not grounded(*export, "--json").json["search_ended"]
     assert grounded("-C", w, "learn").code == 0
     said = " ".join(grounded(*export).out.replace("\\", "").split())
-    assert holds(said, "the search has ended", "no further run is needed")
+    assert holds(said, "the search has ended", "says how sure")
     assert said.endswith(f"next: grounded -C {w} report --html")
     assert grounded(*export, "--json").json["search_ended"]
 
