@@ -361,7 +361,9 @@ def _ended(
         )
     elif ruinous is not None:
         ending, asked = "too doubtful", "; diagnose the model"
-        told = f" of {figure(ruinous.likely_off)}" * (ruinous.likely_off < -ABSURD * incumbent.utility)
+        told = f" of {figure(ruinous.likely_off)}" * (
+            ruinous.likely_off < -ABSURD * incumbent.utility
+        )
         if len(incumbent.trials) < AGAIN:
             asked = f"; run {own} again or diagnose the model"
         sentence = (
