@@ -361,14 +361,13 @@ def _ended(
         )
     elif ruinous is not None:
         ending, asked = "too doubtful", "; diagnose the model"
-        told = f" of {figure(ruinous.likely_off)}" * (
-            ruinous.likely_off < -ABSURD * incumbent.utility
-        )
+        off = ruinous.likely_off
+        told = f" of {figure(off)}" * (off < -ABSURD * incumbent.utility)
         if len(incumbent.trials) < AGAIN:
             asked = f"; run {own} again or diagnose the model"
         sentence = (
-            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but with a "
-            f"likely error{told}, more than the whole cost of {own}: no trial is spent on it"
+            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but with "
+            f"a likely error{told}, more than the whole cost of {own}: no trial is spent on it"
         )
     elif promised and not finite:
         ending, asked = "model diverges", "; a diagnosis may show what it lacks"
