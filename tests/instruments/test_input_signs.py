@@ -8,6 +8,7 @@ import pytest
 
 from facts import holds
 from grounded import Model, Param
+from grounded.effects import Library, wrap
 from grounded.errors import GroundedError
 from grounded.instruments.predictions.input_signs import how_inputs_act, judge_signs
 from grounded.instruments.sound_trials import sound_trials
@@ -131,3 +132,21 @@ def test_an_input_that_acts_late_is_never_said_to_act_the_other_way_round(plant,
         model, trial = swinging(plant, late, seed, strong, dt, seconds)
         acts = how_inputs_act(model, trial, range(model.n))
         assert min(one.sign for one in acts) >= 0, (late, seed, dt, seconds, acts)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_adopted_lags_begin_where_the_commands_before_left_them(seed):
+    """Begun at 0, a boat's thruster, 0.16 s late with a lag of 0.26 s, acted by 388 or -365 %."""
+    dt, rng = 0.1, np.random.default_rng(seed)
+    model = AXIS
+    for name, values in (("first_order_lag:torque", {"tau": 0.26}), ("delay:torque", {"d": 0.16})):
+        model = wrap(Library().effect(name, model), values, dt)
+    sent = np.repeat(rng.uniform(-0.3, 0.5, 30), 8)[:, None]
+    states = [np.zeros(model.n)]
+    for u in sent:
+        states.append(model.system.step(states[-1][None], u[None], model.values, dt)[0])
+    x = np.array(states)
+    x[:, :2] += [2e-3, 2e-2] * rng.standard_normal((len(x), 2))
+    trial = Trial(x, sent, dt, model.state_names, model.input_names)
+    (acts,) = how_inputs_act(model, trial, range(2))
+    assert acts.sign == 1 and acts.share == pytest.approx(1.0, abs=0.2)

@@ -476,6 +476,20 @@ def test_noise_in_both_brackets_the_scale():
     assert abs(lag.delay) < 5 * lag.std < 0.02
 
 
+@pytest.mark.parametrize("size", [1.0, 0.9])
+def test_noise_is_no_scale_where_a_motion_hardly_changes(size):
+    """In a half circle, what little a boat's turn rate changed was 5 % smaller in its gyro."""
+    rng, t = np.random.default_rng(2), np.arange(400) * DT
+    true = 0.7 + 0.06 * np.sin(1.3 * t)
+    a = true + 0.001 * rng.standard_normal(400)
+    b = size * true - 0.1 * size * (true - 0.7)  # it shows less of the changes
+    lag = lag_between([(a, b + 0.001 * rng.standard_normal(400))], DT)
+    assert lag.steady == pytest.approx(size, abs=0.01) and lag.scale < 0.95
+    assert lag.off(0.05) == (size < 0.95)
+    around_zero = lag_between([(a - 0.7, b - 0.7 * size)], DT)
+    assert np.isnan(around_zero.steady) and around_zero.off(0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("filtered", [True, False])
 def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):

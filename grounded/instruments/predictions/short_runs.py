@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import true_values
+from grounded.places import motion, true_values
 from grounded.rollout import stepper
 from grounded.trial import Trial
 
@@ -87,13 +87,16 @@ def missed(
 def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
     """Return the states that predictions start from at each sample, (T + 1, n).
 
-    States without a sensor are taken as 0, but true values behind a delayed log as what is logged
-    later. A boat's sway follows from its true speed. Predicted from 0, 98 % of it was missed, and
-    less of it with all lengths divided by 100, as if the log was in cm.
+    States without a sensor are taken as 0, but the memory of adopted inputs' effects as the trial
+    has it, where it follows the commands: without it, an input that lags by 0.26 s after 0.16 s
+    seemed to act by 388 % and -365 % in two drives. True values behind a delayed log are taken as
+    what is logged later. A boat's sway follows from its true speed. Predicted from 0, 98 % of it
+    was missed, and less of it with all lengths divided by 100, as if the log was in cm.
     """
     names, x = model.state_names, np.array(trial.states)
-    hidden = [i for i in range(model.n) if i not in shown]
-    x[:, hidden] = 0.0
+    hidden, own = [i for i in range(model.n) if i not in shown], motion(model).state_names
+    known = np.isfinite(x) & np.array([name not in own for name in names])
+    x[:, hidden] = np.where(known, x, 0.0)[:, hidden]
     for i, k in true_values(names, [names[i] for i in hidden]).items():
         stem, _, steps = names[i].rpartition("_")
         stem, ago = (stem, int(steps)) if steps.isdigit() else (names[i], 0)
