@@ -15,16 +15,16 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 
 LOG, LOST = "is a log that no candidate made", "failed"  # why a trial can't be repeated
 CHANGED = (  # advice on the next trial if two groups differ
-    "None is needed yet: the robot changed between the two groups, so adopt no value of both. "
+    "No trial is needed yet: the robot changed between the two groups, so adopt no value of both. "
     "Diagnose the newer trials alone, or discard the older ones."
 )
 AT_BOUNDS = (  # the same if every parameter that moved is at its bound
-    "None helps yet: parameters stopped at their bounds and the data ask to go further. Widen the "
-    "bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
+    "No trial helps yet: parameters stopped at their bounds and the data ask to go further. Widen "
+    "the bounds in the model file if the true value may lie beyond; otherwise a parameter that the "
     "model holds constant may be off, so give it bounds. Then diagnose again."
 )
 AS_A_RATIO = (  # the same if an input acts the other way round as well
-    "None is needed yet: {flip} acts the other way round. Its strength and the parameters that "
+    "No trial is needed yet: {flip} acts the other way round. Its strength and the parameters that "
     "stopped at their bounds are known as a ratio only: flip its sign in model.py, or, if only the "
     "log has it so, multiply the scale in [log.input.{flip}] by -1 (a missing one is 1), and "
     "[limits] if they were taken from the log, discard the trials and ingest their logs again. "
@@ -69,7 +69,7 @@ def next_trial(
         return "Run two or more trials in which every input changes."
     if groups and groups[0] in same and not (worse or ended or flip):
         own = next((name for name in groups[0] if name in claims.names), groups[0][0])
-        return f"None helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
+        return f"No trial helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
     if groups and groups[0] not in same:
         made = f"A trial designed for it may tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
@@ -81,8 +81,8 @@ def next_trial(
         logs = {trial for trial, why in (unrepeatable or {}).items() if why == LOG}
         if len(one.trials) > 1 and {*one.trials} <= logs:
             return (
-                f"None is needed for this task: logs that no candidate made ({listed(one.trials)}) "
-                f"show {one.effect}, and runs of candidates hardly do."
+                "No trial is needed for this task: logs that no candidate made "
+                f"({listed(one.trials)}) show {one.effect}, and runs of candidates hardly do."
             )
         why = (unrepeatable or {}).get(one.trial)
         if why is None:
@@ -98,19 +98,19 @@ def next_trial(
         return look
     if not claims.names and not claims.blamed:
         if adopted:  # in the diagnosis that they are from, some may have tied with others
-            return "None is needed: nothing more is found beside what was adopted."
-        return "None is needed: nothing is found, so nothing is tied or to be adopted."
+            return "No trial is needed: nothing more is found beside what was adopted."
+        return "No trial is needed: nothing is found, so nothing is tied or to be adopted."
     if worse:
         return f"Adopt nothing yet: {worse}. To settle that, run another trial and diagnose again."
     if len(claims.names) > 1 and like_a_load(claims.data.model, claims.names):
-        return "None is needed yet: give the model a parameter for a load and diagnose again."
+        return "No trial is needed yet: give the model a parameter for a load and diagnose again."
     if ended:
         return AS_A_RATIO.format(flip=flip) if flip else AT_BOUNDS
     if flip:
-        return f"None is needed yet: flip the sign of {flip}, as said above, and diagnose again."
+        return f"No trial is needed yet: flip the sign of {flip}, as said, and diagnose again."
     fit = _own_numbers(claims, adopted)
     do = "fit the model's parameters" if fit else "adopt the claimed effects"
-    said = f"None is needed to tell causes apart: {do}"
+    said = f"No trial is needed to tell causes apart: {do}"
     if not look:
         return f"{said}."
     look = f"{look[:1].lower()}{look[1:]}"

@@ -132,7 +132,7 @@ def test_what_is_one_thing_beside_a_parameter_is_named_together():
     assert "tau" in found.parameters or "parameter:tau" in found.effects
     assert pair in [set(group) for group in found.indistinguishable]
     assert pair in [set(group) for group in found.equivalent]
-    assert found.next_trial.startswith("None helps")
+    assert found.next_trial.startswith("No trial helps")
     assert all(name in found.sentence for name in pair)
     rows = {row.effect: row for row in found.ranking}
     assert pair <= set(rows) and sum(rows[name].claimed for name in pair) == 1

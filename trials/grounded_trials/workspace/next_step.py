@@ -241,7 +241,7 @@ def nothing_to_do(found: Diagnosis, best: str) -> str:
         best: the candidate that the search ended with.
     """
     return (
-        f"None is needed for the manoeuvre: the search has ended, with {best}. "
+        f"No trial is needed for the manoeuvre: the search has ended, with {best}. "
         + "To learn more: " * (not found.contested)
         + (found.next_trial if found.contested else _inside(found.next_trial))
     )
