@@ -37,6 +37,7 @@ from grounded.diagnosis.report import (
     Changed,
     Estimate,
     Kind,
+    Likeness,
     Ranked,
     TrialValue,
     Unconfirmed,
@@ -61,6 +62,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 UNEXPLAINED = "A gap remains that no known effect explains: "
 BOTH = "A gap remains if both groups get the same values: "  # groups of trials that differ
 MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
+NEARLY = 0.95  # share of a claimed effect's signal from which another makes nearly the same
 NAMED = 3  # parameters, channels or leftovers named in one sentence
 
 
@@ -82,6 +84,7 @@ def verdict(
     changed: Sequence[Changed] | None = None,
     adopted: Collection[str] = (),
     tracked: Sequence[str] = (),
+    alike: Sequence[Likeness] = (),
 ) -> Verdict:
     """Return the verdict (effect, several, none or unknown) with its sentences.
 
@@ -103,6 +106,7 @@ def verdict(
         changed: the values that differ between two groups of trials; None for one group.
         adopted: adopted effects, whose values are parameters of the model.
         tracked: the states that the task follows, the most important first.
+        alike: effects that make nearly the signal of a claimed one.
     """
     from grounded.effects import like_a_load
 
@@ -146,6 +150,7 @@ def verdict(
     words += [LOAD] * like_a_load(claims.data.model, [row.effect for row in claimed])
     words += [_combined(claims.data.model, one) for one in combinations]
     words += [f"{told_apart(group, same, [r.effect for r in claimed])}." for group in groups]
+    words += _late_or_filtered(alike, [row.effect for row in claimed])
     words += [one.sentence() for one in claims.one_clock[:1]]
     words += _geared(claims.data.model, [row.effect for row in claimed])[:1]
     words += _level(claims.data.model, [row.effect for row in claimed])
@@ -304,6 +309,27 @@ def _unneeded(known: Mapping[str, Estimate], adopted: Collection[str]) -> list[s
         "from [model] effects, then diagnose again to see whether it is missed."
         for effect, (name, *more) in sorted(owned.items())
         if not more and abs(known[name].value) < KNOWN * known[name].std
+    ]
+
+
+def _late_or_filtered(alike: Sequence[Likeness], claimed: Sequence[str]) -> list[str]:
+    """Return a sentence on sensors that are called late and may as well be filtered, or reversed.
+
+    A sensor that was 0.12 s late, with steps of 0.1 s, was told as a filter of 0.124 s, as if sure.
+    """
+    pairs = {(one.effect, one.like) for one in alike if one.share > NEARLY}
+    found = []
+    for name in claimed:
+        family, _, state = name.partition(":")
+        other = {"sensor_delay": "sensor_lag", "sensor_lag": "sensor_delay"}.get(family)
+        if other and (name, f"{other}:{state}") in pairs:
+            found.append(state)
+    if not found:
+        return []
+    whose = f"those of {listed(found)} are" if len(found) > 1 else f"that of {found[0]} is"
+    return [
+        "A sensor's delay and a filter in it make nearly the same log: which of the two "
+        f"{whose}, these trials hardly tell."
     ]
 
 

@@ -199,6 +199,7 @@ class Writer:
             changed=apart.changed if apart else None,
             adopted=self.adopted,
             tracked=() if self.task is None else _tracked(self.task),
+            alike=alike,
         )
         differ = bool(apart and apart.changed) and not self.known.no_cause
         return Diagnosis(

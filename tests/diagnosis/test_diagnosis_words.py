@@ -20,7 +20,14 @@ from grounded.diagnosis.error_report import (
     runaway,
 )
 from grounded.diagnosis.next_trial import LOG, LOST, next_trial
-from grounded.diagnosis.report import Agreement, Diagnosis, Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.report import (
+    Agreement,
+    Diagnosis,
+    Estimate,
+    Likeness,
+    Ranked,
+    Unconfirmed,
+)
 from grounded.diagnosis.ruler_words import (
     contested,
     explained,
@@ -35,7 +42,7 @@ from grounded.diagnosis.ruler_words import (
 )
 from grounded.diagnosis.tables import effect_table, error_table, larger
 from grounded.diagnosis.unconfirmed import _anywhere, another_look, unrepeatable
-from grounded.diagnosis.verdict import _unneeded, verdict
+from grounded.diagnosis.verdict import _late_or_filtered, _unneeded, verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from small_tasks import cart_task
@@ -312,6 +319,21 @@ def test_what_two_logs_by_hand_show_needs_no_third():
         assert "record another" in next_trial(_claims(), "", (), (seen,), (), other)
     once = replace(seen, seen=(1, 8), trials=("t1",))
     assert "record another" in next_trial(_claims(), "", (), (once,), (), {"t1": LOG, "t9": LOG})
+
+
+def test_a_sensor_that_may_be_late_or_filtered_is_told_as_both():
+    """One that was 0.12 s late was told as a filter of 0.124 s, as if that was sure."""
+    alike = (
+        Likeness("sensor_lag:v", "sensor_delay:v", 0.995),
+        Likeness("sensor_delay:u", "sensor_lag:u", 0.991),
+        Likeness("sensor_delay:x", "sensor_lag:x", 0.9),
+        Likeness("delay:a", "first_order_lag:a", 0.99),
+    )
+    names = ["sensor_lag:v", "sensor_delay:u", "sensor_delay:x", "delay:a"]
+    (both,) = _late_or_filtered(alike, names)
+    assert holds(both, "those of v and u are", "hardly tell")
+    assert holds(*_late_or_filtered(alike, names[:1]), "that of v is")
+    assert not _late_or_filtered(alike, names[2:])
 
 
 def test_a_delay_acts_at_every_place():

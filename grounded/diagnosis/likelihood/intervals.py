@@ -20,11 +20,14 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.filter import kalman
 from grounded.frozen import Array
 
+NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
+DELAYS, LAGS = ("delay", "sensor_delay"), ("first_order_lag", "sensor_lag")
 STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
 LONG = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
@@ -48,14 +51,35 @@ def standard_deviations(
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
     std = fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
-    half = 1.96 * std
+    half = NORMAL * std
     shifts, _ = leave_one_out(fit, trial_of)
     for some in (shifts, *_by_stretch(predictor, fit)):
         if len(some) >= 3:
             scatter = np.sqrt((len(some) - 1) * some.var(axis=0))
             std = np.maximum(std, scatter)
             half = np.maximum(half, _student(len(some) - 1) * scatter)
-    return std, half
+    smeared = between_steps(fit.hypothesis, predictor.data.dt, len(std))
+    return np.hypot(std, smeared), np.hypot(half, NORMAL * smeared)
+
+
+def between_steps(h: Hypothesis, dt: float, count: int) -> Array:
+    """Return how far off lags and delays may be as a delay ends between two steps, (count,) [s].
+
+    A delay by a part p of a step is a mean of two steps, which spreads a signal by p (1 - p) dt^2
+    as a lag spreads it by tau^2. Beside it the lag is short by p (1 - p) dt^2 / (2 tau), and the
+    delay longer by as much. A lag of 0.28 s after 0.14 s, with steps of 0.1 s, was 0.274 +- 0.001 s
+    after 0.145 +- 0.0006 s.
+    """
+    found, owners = np.zeros(count), [(e, v, q) for e, v in h.pairs for q in e.free]
+    values = [(k, e.family.name, v[q.name]) for k, (e, v, q) in enumerate(owners)]
+    late = {k: value / dt % 1.0 for k, name, value in values if name in DELAYS}
+    lags = {k: value for k, name, value in values if name in LAGS and value > 0}
+    spread = {k: p * (1 - p) * dt**2 for k, p in late.items()}
+    for k, tau in lags.items():
+        found[k] = max(spread.values(), default=0.0) / (2 * max(tau, dt))
+    for k, own in spread.items():
+        found[k] = max((own / (2 * max(tau, dt)) for tau in lags.values()), default=0.0)
+    return found
 
 
 def _student(freedom: int) -> float:

@@ -21,12 +21,12 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
 SLIGHT = 0.01  # smallest weight of another fit, relative to the claim's
-NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
 MOST = 50.0  # most nats by which another fit counts as likelier
 
 Sure = tuple[Array, Array]

@@ -16,10 +16,10 @@ from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.likelihood.intervals import standard_deviations
+from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.averaged import NORMAL, averaged
+from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.blame import ENOUGH, moved_parameters
 from grounded.diagnosis.validation.bounds import set_by_bound
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors

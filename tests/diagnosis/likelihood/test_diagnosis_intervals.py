@@ -5,13 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
+from grounded import Model, Param, Trial, diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.intervals import between_steps, fisher, standard_deviations
 from grounded.diagnosis.validation.blame import moved_parameters
 from grounded.diagnosis.validation.limits import counted_once
 from grounded.diagnosis.validation.ruler import folds
+from grounded.effects import Library
+from grounded.models.car import model as car
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -104,3 +107,47 @@ def test_a_trial_that_differs_by_rounding_counts_once():
         kept, said = counted(factor)
         assert len(kept) == 1 and words in said[0]
     assert len(counted(1 + 1e-6)[0]) == 2
+
+
+def test_a_delay_between_two_steps_makes_a_lag_beside_it_uncertain():
+    """The mean of two steps spreads a signal by p (1 - p) dt^2, which the lag lacks then."""
+    one = Hypothesis()
+    for name, values in (("first_order_lag:throttle", 0.28), ("delay:throttle", 0.14)):
+        effect = Library().effect(name, car)
+        one = one.plus(effect, {effect.free[0].name: values})
+    both = between_steps(one, 0.1, 4)
+    assert both.tolist() == pytest.approx([0.24 * 0.01 / 0.56] * 2 + [0.0] * 2)
+    assert not between_steps(one, 0.07, 2).any()  # two whole steps
+    assert not between_steps(one.minus("first_order_lag:throttle"), 0.1, 1).any()
+    assert not between_steps(one.minus("delay:throttle"), 0.1, 1).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_lag_and_a_delay_are_within_their_intervals_though_steps_are_long(seed):
+    """Commands of a 70 s drive, 0.14 s late with a lag of 0.28 s, in exact steps of 1 ms."""
+    late, tau, dt, fine = 0.14, 0.28, 0.1, 100
+    rng, h = np.random.default_rng(seed), dt / fine
+    u = np.repeat(rng.uniform(-1, 1, 47), 15)[:700]
+    sent = np.concatenate([np.zeros(round(late / h)), np.repeat(u, fine)])[: 700 * fine]
+    z, v, rows = 0.0, 0.0, [0.0]
+    for k, now in enumerate(sent):
+        z = now + (z - now) * np.exp(-h / tau)
+        v += h * (1.5 * z - 0.6 * v - 0.5 * v * abs(v))
+        if (k + 1) % fine == 0:
+            rows.append(v)
+    y = np.array(rows)[:, None] + 0.005 * rng.standard_normal((701, 1))
+    model = Model(
+        states={"v": "m/s"},
+        inputs={"u": "1"},
+        params={"k": Param(1.2, "m/s^2", 0.5, 3), "b": Param(0.5, "1/s", 0, 3)},
+        derivative=lambda s, a, p: {"v": p.k * a.u - p.b * s.v - 0.5 * s.v * np.abs(s.v)},
+    )
+    found = diagnose(model, [Trial(y, u[:, None], dt, ("v",), ("u",))])
+    truth = {"first_order_lag:u": ("tau", tau), "delay:u": ("d", late)}
+    truth |= {"sensor_delay:v": ("d", late)}  # the same thing in this log
+    assert len(found.verdict.effects) == 2 and {*found.verdict.effects} <= {*truth}
+    for row in found.ranking[:2]:
+        name, value = truth[row.effect]
+        low, high = row.params[name].interval
+        assert low < value < high < value + 0.02

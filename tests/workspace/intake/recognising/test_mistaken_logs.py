@@ -392,6 +392,29 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
     assert not any("logged" in one and "late" in one for one in found.warnings if one not in told)
 
 
+@pytest.mark.parametrize("fault", ["program", "log"])
+def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, fault):
+    """`multiply the scale in [log.input.right] by -1`: obeyed, that spoilt every later log."""
+    plan, dt, wrong = w.propose().candidate, w.task.dt, np.array([1.0, -1.0])
+    runner, path = Runner(plan.policy), tmp_path / "run.csv"
+    if fault == "program":
+        with pytest.raises(GroundedError) as refused:
+            driven_by(w, path, lambda k, logged, now: wrong * runner.action(k * dt, logged))
+        assert "scale" not in str(refused.value)
+        assert refused.value.then == NextCommand("next", ("LOG",))
+        told = "the robot moved as the log says", "its program sends starboard times -1"
+        assert holds(str(refused.value), *told, f"run {plan.id} again")
+        return
+    driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged))
+    w.discard("t0001")
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 5] *= -1
+    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "starboard", "multiply the scale in [log.input.starboard]")
+
+
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
 def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
     """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""

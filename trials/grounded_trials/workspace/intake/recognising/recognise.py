@@ -73,6 +73,7 @@ WHOLE = 0.9  # share of a run that a log must last to be one, or else the error 
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
 ENDED = ("stopped", "converged")  # phases of a search
+MOST_ASKED = 3  # latest trials whose signs of inputs are compared
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
@@ -222,6 +223,12 @@ def recognised(
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):
             raise _misused(path, own, how)
+        if by == -1 and (told := sent_reversed(workspace, whole, units)):
+            raise GroundedError(
+                f"{path}: only with {listed(units)} of the other sign are its commands those of "
+                f"{ran}, {told}. Mend that and run {ran} again",
+                NextCommand("next", ("LOG",)),
+            )
         other_unit = units_told(task, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}", again)
     if pace:
@@ -328,6 +335,38 @@ def turned_in(workspace: Folder, log: Recording, ran: str) -> str:
         f"the feedback reversed this was not its run. If only the log has the other sign, set "
         f"scale = -1 in [log.input.{found.input}] and ingest it again"
     )
+
+
+def sent_reversed(workspace: Folder, trial: Trial, names: Sequence[str]) -> str:
+    """Return that a program sent inputs with the other sign, which the log shows as they were sent.
+
+    Args:
+        workspace: the workspace with the model.
+        trial: the log, as it is read.
+        names: signals of which only the opposite is what the candidate sends.
+
+    Returns:
+        What shows it: the end of a sentence; "" if it may be the log that has the other sign.
+    """
+    from grounded.search.returned.reversed_input import signs_of
+
+    planner = workspace.planner
+    if not {*names} <= {*planner.task.model.input_names}:
+        return ""
+
+    def as_modelled(one: Trial) -> list[int]:
+        signs = signs_of(planner, one)
+        return [signs[name] for name in names]
+
+    moved, program = as_modelled(trial), f"so its program sends {listed(names)} times -1"
+    if all(sign > 0 for sign in moved):
+        return f"but the robot moved as the log says, {program}"
+    earlier = workspace.task_trials(measured=True)[-MOST_ASKED:]
+    if any(sign < 0 for sign in moved) or not earlier:
+        return ""
+    if all(min(as_modelled(one)) > 0 for one in earlier):
+        return f"but earlier logs, read in the same way, have the right one, {program}"
+    return ""
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
