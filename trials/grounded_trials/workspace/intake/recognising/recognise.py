@@ -223,10 +223,10 @@ def recognised(
         its = log and _in_programs_unit(task.model, units, by)
         if log and its and (how := misused_in(log, task, own)):
             raise _misused(path, own, how)
-        if by == -1 and (told := sent_reversed(workspace, whole, units)):
+        if by == -1 and (shown := sent_reversed(workspace, whole, units)):
             raise GroundedError(
                 f"{path}: only with {listed(units)} of the other sign are its commands those of "
-                f"{ran}, {told}. Mend that and run {ran} again",
+                f"{ran}, {shown}. Mend that and run {ran} again",
                 NextCommand("next", ("LOG",)),
             )
         other_unit = units_told(task, units, by, read.log is not None)
