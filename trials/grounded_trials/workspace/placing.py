@@ -130,7 +130,9 @@ def _like(off: Array, k: int) -> Array:
 def _off(workspace: Folder, one: StoredTrial, but: str) -> Iterator[Array]:
     """Yield how far a run began off the start that its candidate was planned for; nothing of data.
 
-    Runs of a model with other states are left out.
+    Where [task] start was moved since to where the robot does begin, it is how far the run began
+    off the new one. Four starts that scattered by 26 mm were "off by 0.072 m", two of them by the
+    old start. Runs of a model with other states are left out.
     """
     trial, model = one.trial, workspace.base_model
     same = trial.state_names == model.state_names
@@ -143,4 +145,5 @@ def _off(workspace: Folder, one: StoredTrial, but: str) -> Iterator[Array]:
         name = trial.candidate.split("~")[0]
         data = one.policy or workspace.candidate_bytes(name)
         planned = candidate_of(data, name)[0].predicted_states[0]
-        yield model.difference(trial.began, planned)
+        then, now = (model.difference(trial.began, x) for x in (planned, workspace.task.start))
+        yield np.where(np.abs(now) < np.abs(then), now, then)

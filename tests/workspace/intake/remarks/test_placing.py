@@ -104,6 +104,18 @@ def test_runs_of_an_earlier_task_count_by_their_own_start(w, tmp_path):
     assert np.allclose(np.sort(known.off[:, 0]), [-0.05, 0.05]) and known.known
 
 
+def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
+    """As advised, [task] start became what four runs had within 26 mm: "off by 0.072 m (rms)"."""
+    ran, *_ = read_trial(run(w))
+    for off in (-0.09, -0.1, -0.08):
+        placed(w, tmp_path, ran, off)
+    assert placing(w).rms[0] == pytest.approx(0.09, rel=0.01)
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text().replace("[task]", "[task]\nstart = { x = -0.09 }"))
+    w.forget()
+    assert np.allclose(np.sort(placing(w).off[:, 0]), [-0.01, 0.0, 0.01], atol=1e-6)
+
+
 def test_next_names_the_way_on_that_status_names(w, tmp_path):
     """`status` said "or go on with it: `propose`", `next` only to discard the run."""
     ran, *_ = read_trial(run(w))
