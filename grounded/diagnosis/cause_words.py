@@ -118,7 +118,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Fill names and values into the sentence of an effect's family; starts in lower case."""
     from grounded import places
     from grounded.effects import ParamFamily
-    from grounded.effects.medium import turning
+    from grounded.effects.medium import factors
 
     model, targets = effect.site.model, effect.site.targets
     constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
@@ -144,7 +144,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         "source": called(model, source),
     }
     if "{product}" in effect.family.sentence:
-        words["product"] = " * ".join(n for n in turning(model) if n != driven)
+        words["product"] = " * ".join(factors(effect.site))
 
     if driven in model.inputs and len(targets) > 1:  # a wheel's: several velocities at once
         words["source"] = "its speed"

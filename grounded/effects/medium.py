@@ -17,7 +17,7 @@ velocities, with linear or quadratic drag, different ahead and sideways: one (a,
 push would need a different size for each. Terms of the rotating axes (v r, -u r) are unchanged. A
 model without drag does not feel a current; what pushes it nevertheless (wind on a hull, a tilted
 floor) is the second. The third is the water or air that a hull sets in motion: it adds unequal
-masses ahead and sideways, so the products of velocities differ from a rigid body's (-v r and u r
+masses ahead and sideways, so the products of velocities differ from a rigid body's (v r and -u r
 times the ratio of the masses, and a moment by their difference, named after Munk). Each of the
 three rates has its own effect, since simple models leave out one or the other.
 
@@ -139,14 +139,14 @@ def turning(model: Model) -> tuple[str, ...]:
     return (*found, *rates) if rates and rates[0] in own.state_names else ()
 
 
-def _others(site: Site) -> tuple[str, str]:
+def factors(site: Site) -> tuple[str, str]:
     """Return the two velocities whose product acts on the third, the target."""
     one, other = (n for n in turning(site.model) if n != site.target)
     return one, other
 
 
 def _product(site: Site) -> tuple[Quantity, ...]:
-    one, other = _others(site)
+    one, other = factors(site)
     units = site.unit(site.target), site.unit(one), site.unit(other)
     known = {("m/s", "m/s", "rad/s"): "1", ("rad/s", "m/s", "m/s"): "rad/m^2"}
     unit = f"{per_second(units[0])} per {units[1]} {units[2]}"
@@ -154,7 +154,7 @@ def _product(site: Site) -> tuple[Quantity, ...]:
 
 
 def _product_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    one, other = _others(site)
+    one, other = factors(site)
     return {site.target: c["k"] * s[one] * s[other]}
 
 

@@ -73,12 +73,12 @@ def between_steps(h: Hypothesis, dt: float, count: int) -> Array:
     found, owners = np.zeros(count), [(e, v, q) for e, v in h.pairs for q in e.free]
     values = [(k, e.family.name, v[q.name]) for k, (e, v, q) in enumerate(owners)]
     late = {k: value / dt % 1.0 for k, name, value in values if name in DELAYS}
-    lags = {k: value for k, name, value in values if name in LAGS and value > 0}
+    lags = {k: max(value, dt) for k, name, value in values if name in LAGS and value > 0}
     spread = {k: p * (1 - p) * dt**2 for k, p in late.items()}
-    for k, tau in lags.items():
-        found[k] = max(spread.values(), default=0.0) / (2 * max(tau, dt))
-    for k, own in spread.items():
-        found[k] = max((own / (2 * max(tau, dt)) for tau in lags.values()), default=0.0)
+    if lags and spread:
+        most, shortest = max(spread.values()), min(lags.values())
+        found[[*lags]] = [most / (2 * tau) for tau in lags.values()]
+        found[[*spread]] = [own / (2 * shortest) for own in spread.values()]
     return found
 
 
