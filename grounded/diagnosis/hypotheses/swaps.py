@@ -7,6 +7,8 @@ fits what that one leaves. So the likeliest set of each size is changed in three
     one for several effects of single inputs are replaced by one of several inputs (`delay:a+b`)
     other orders    effects act on a command in another order: a gain before or after a rate limit
 
+And the set that is to be claimed is rivalled by those that blame fewer inputs (`parted`).
+
 Changed sets are compared only once they have converged, with constants of their own. A friction
 with the constant of another law, or a rate limit before a gain that it really follows, can lack
 hundreds of nats.
@@ -14,7 +16,7 @@ hundreds of nats.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -23,8 +25,10 @@ from grounded.diagnosis.hypotheses.orders import orders
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, Start
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.effects import InputFamily, MemoryFamily
+from grounded.effects import Effect, InputFamily, MemoryFamily
+from grounded.effects.actuator import delay
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
 TUNED = 2  # best larger sets whose constants are optimised
@@ -77,6 +81,45 @@ def merged(search: HypothesisSearch, fit: Fitted) -> Iterator[Start]:
             h = h.minus(other.name)
         values = {q.name: float(np.mean([v[q.name] for v in same])) for q in effect.free}
         yield h.plus(effect, values), fit.noise, fit.track
+
+
+def parted(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
+    """Return the fits of the sets that blame fewer inputs, or treat all of them alike.
+
+    An effect of several inputs is replaced by the same effect of some of them; that of a car's
+    steering had become one of its throttle too, at the price of one. A delay of all inputs, with
+    something else that makes some of them later still, is replaced by a delay of each.
+    """
+    own, found = {e.name: e for e in search.candidates}, list[Fitted]()
+    for h in _of_fewer_inputs(own, fit.hypothesis):
+        key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
+        known = search.fits.get(key)
+        starts = [(h, fit.noise, fit.track), *([known] if known else [])]
+        search.refined(starts, TO_THE_TOP)
+        found += [search.fits[key]] if key in search.fits else []
+    return found
+
+
+def _of_fewer_inputs(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Hypothesis]:
+    for effect, values in h.pairs:
+        family, targets, rest = effect.family, {*effect.site.targets}, h.minus(effect.name)
+        if len(targets) < 2 or not isinstance(family, InputFamily | MemoryFamily):
+            continue
+        groups = {
+            frozenset(e.site.targets): e
+            for e in own.values()
+            if e.family.name == family.name and {*e.site.targets} < targets
+        }
+        if family.name != delay.name:
+            for part in groups.values():
+                yield rest.plus(part, {q.name: values[q.name] for q in part.free})
+            continue
+        for later, more in h.pairs:
+            those = frozenset(later.site.targets)
+            one, other = groups.get(frozenset(targets - those)), groups.get(those)
+            if later.family.name in LATE and one is not None and other is not None:
+                longer = values["d"] + more.get("d", more.get("tau", 0.0))
+                yield rest.minus(later.name).plus(one, values).plus(other, {"d": longer})
 
 
 def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:

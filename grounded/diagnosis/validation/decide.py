@@ -41,6 +41,7 @@ from grounded.diagnosis.hypotheses.joint_model import split
 from grounded.diagnosis.hypotheses.leftover import leftovers
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.swaps import parted
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.agreement import is_nowhere
@@ -128,6 +129,7 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     if apart is not proposed and not ruler.gain(apart, proposed).beyond(*BETTER):
         proposed = apart
     proposed = _by_mechanism(search, _plainest(search, proposed, ruler, white), ruler, white)
+    proposed = _of_fewer_inputs(search, proposed, ruler, white)
     proposed = own_numbers(search, proposed, ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler, white)):
@@ -161,6 +163,18 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
         tied = tied and not ruler.gain(plain_form, fit).beyond(*BETTER)
         if tied or not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
+    return fit
+
+
+def _of_fewer_inputs(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted:
+    """Replace effects of several inputs by those of fewer, while these tie (`parted`).
+
+    If the innovations are not white, the model lacks something else, and a few nats are that.
+    """
+    for other in parted(search, fit) if ruler.held_out else ():
+        tied = search.score(other) > search.score(fit) - (TIE if white else LIKELY)
+        if tied and not ruler.gain(other, fit).beyond(*BETTER):
+            return _of_fewer_inputs(search, other, ruler, white)
     return fit
 
 
