@@ -36,6 +36,7 @@ _GLUE = re.compile(
     r"| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
     r"|(?<=\d) (?=(?:[mµc]?(?:m|s|rad)|deg|kg|N|Nm|V|A|Hz|nats)\b)| (?=[+-]\d[\d.]* %)"
     r"| (?== -?\d)|(?<= =) (?=-?\d)|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
+    r"|(?<=\d) (?=times\b)"
 )  # blanks at which a line must not be broken
 
 
