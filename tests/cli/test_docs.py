@@ -10,9 +10,11 @@ An HTML comment just above a block says what is special about it:
 
     <!-- not run: WHY -->         it is not; WHY must be a reason
     <!-- file: NAME -->           it is written to NAME in the page's folder
+    <!-- in: FOLDER -->           it starts in this folder of the page's
     <!-- workspace: EXAMPLE -->   from here on the page works in a fresh workspace of an example
     <!-- trial: NAME -->          a trial with states x, y, psi is written to NAME before
     <!-- needs: shared -->        skipped where ../shared (or an importable module) is missing
+    <!-- figures: 0.1 -->         numbers may differ by this part only, and line breaks
     <!-- exit: 1 -->              the last command must end with this code
     <!-- slow -->                 only with GROUNDED_DOCS=all (above ten seconds)
     <!-- demo-command -->         the README's set-up commands: checked, and run by .ci/run
@@ -48,10 +50,11 @@ PAGES = [p for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) 
 NOTES = [p for p in (ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md") if p.is_file()]
 FENCE = re.compile(r"^( *)```+ *(\S*).*?\n(.*?)^\1```+ *$", re.M | re.S)
 MARK = re.compile(
-    r"<!--\s*(not run|file|trial|workspace|needs|exit|slow|demo-command|test-command)"
+    r"<!--\s*(not run|file|in|trial|workspace|needs|figures|exit|slow|demo-command|test-command)"
     r"\s*:?\s*(.*?)\s*-->",
     re.S,
 )
+NUMBER = re.compile(r"[-+]?\d[\d,]*(\.\d+)?(e[-+]?\d+)?")
 RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
 SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
 ALL = os.environ.get("GROUNDED_DOCS") == "all"
@@ -95,12 +98,24 @@ def sessions(text: str) -> list[tuple[str, list[str]]]:
     return found
 
 
+def told_otherwise(shown: str, out: str, part: float) -> str:
+    """What the page shows otherwise than the output, whose numbers may differ by a part of them."""
+    words = [" ".join(NUMBER.sub("\0", text).split()) for text in (shown, out)]
+    if (at := words[1].find(words[0])) < 0:
+        like = os.path.commonprefix(words)
+        return " instead of ".join(text[len(like) :][:100].replace("\0", "N") for text in words)
+    here, there = ([float(m[0].replace(",", "")) for m in NUMBER.finditer(t)] for t in (shown, out))
+    there = there[words[1][:at].count("\0") :]
+    unlike = [(a, b) for a, b in zip(here, there, strict=False) if abs(a - b) > part * abs(b)]
+    return ", ".join(f"{a} instead of {b}" for a, b in unlike)
+
+
 def loosely(line: str) -> str:
     """A line with what may differ from run to run left out: numbers, blanks, bars, paths."""
     line = re.sub(r"\x1b\[[0-9;]*m", "", line)
     line = re.sub(r"[▁▂▃▄▅▆▇█x]{2,}", "BAR", line)
     line = re.sub(r"[0-9a-f]{12,}", "HASH", line)
-    line = re.sub(r"[-+]?\d[\d,]*(\.\d+)?(e[-+]?\d+)?", "N", line)
+    line = NUMBER.sub("N", line)
     return re.sub(r"\s+", " ", line).strip()
 
 
@@ -172,7 +187,7 @@ class Page:
         if block.language != "console" and not steps:
             steps = [(line, []) for line in block.text.splitlines() if line.strip()]
         assert steps, f"line {block.line}: a console block needs lines that start with '$ '"
-        folder = self.folder
+        folder = self.folder / block.marks.get("in", "")
         for k, (command, shown) in enumerate(steps):
             if command.startswith("cd "):
                 folder = (folder / command[3:].split("&&")[0].strip()).resolve()
@@ -192,6 +207,10 @@ class Page:
             wanted = int(block.marks.get("exit", "0")) if last else 0
             said = f"line {block.line}: $ {command}\n{done.stdout}{done.stderr}"
             assert done.returncode == wanted, said
+            if part := float(block.marks.get("figures", "0")):
+                otherwise = told_otherwise("\n".join(shown), done.stdout, part)
+                assert not otherwise, f"{said}\nthe page shows {otherwise}"
+                continue
             lost = missing_lines(shown, done.stdout + done.stderr)
             lost = missing_lines(shown, done.stderr + done.stdout) if lost else lost
             assert not lost, f"{said}\nshown in the page, not in the output: {lost}"
@@ -323,6 +342,13 @@ def test_the_harness_compares_loosely_but_does_compare():
     assert not missing_lines(["best c0003, utility -1.5, 3 % better", "...", "phase: ..."], out)
     assert missing_lines(["phase: stopped"], out) == ["phase: stopped"]
     assert missing_lines(["phase: converged", "best c0001, utility 1, 2 % better"], out)
+
+
+def test_the_harness_compares_figures_where_a_block_asks_for_it():
+    out = "verdict: off by\n 0.0180 +- 0.002 s, 30 % more"
+    assert not told_otherwise("off by 0.0183 +- 0.002\ns, 30 %", out, 0.1)
+    assert told_otherwise("off by 0.03 +- 0.002 s", out, 0.1) == "0.03 instead of 0.018"
+    assert "late by" in told_otherwise("verdict: late by 0.018", out, 0.1)
 
 
 def test_the_harness_runs_and_fails(tmp_path):

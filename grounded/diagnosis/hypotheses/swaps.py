@@ -17,6 +17,7 @@ hundreds of nats.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def parted(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
 
 def _of_fewer_inputs(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Hypothesis]:
     for effect, values in h.pairs:
-        family, targets, rest = effect.family, {*effect.site.targets}, h.minus(effect.name)
+        family, targets = effect.family, {*effect.site.targets}
         if len(targets) < 2 or not isinstance(family, InputFamily | MemoryFamily):
             continue
         groups = {
@@ -112,14 +113,25 @@ def _of_fewer_inputs(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Hypot
         }
         if family.name != delay.name:
             for part in groups.values():
-                yield rest.plus(part, {q.name: values[q.name] for q in part.free})
+                same = {q.name: values[q.name] for q in part.free}
+                yield _in_place(h, {effect.name: (part, same)})
             continue
         for later, more in h.pairs:
             those = frozenset(later.site.targets)
             one, other = groups.get(frozenset(targets - those)), groups.get(those)
             if later.family.name in LATE and one is not None and other is not None:
-                longer = values["d"] + more.get("d", more.get("tau", 0.0))
-                yield rest.minus(later.name).plus(one, values).plus(other, {"d": longer})
+                longer = {"d": values["d"] + more.get("d", more.get("tau", 0.0))}
+                yield _in_place(h, {effect.name: (one, values), later.name: (other, longer)})
+
+
+def _in_place(
+    h: Hypothesis, others: Mapping[str, tuple[Effect, Mapping[str, float]]]
+) -> Hypothesis:
+    """Replace effects, by name, by others that act in the same order."""
+    found = replace(h, effects=(), values=())
+    for effect, values in h.pairs:
+        found = found.plus(*others.get(effect.name, (effect, values)))
+    return found
 
 
 def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:

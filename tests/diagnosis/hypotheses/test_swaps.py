@@ -7,7 +7,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.orders import first, orders
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.hypotheses.swaps import merged, reordered
+from grounded.diagnosis.hypotheses.swaps import merged, parted, reordered
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
@@ -94,6 +94,26 @@ def test_one_effect_of_all_inputs_replaces_one_for_each(search):
     assert min(own) <= late <= max(own)
     (alone,) = search.refined([search.fresh(h.minus("delay:b"))], 1)
     assert not list(merged(search, alone))
+
+
+def test_a_set_is_rivalled_by_those_that_blame_fewer_inputs(search):
+    both, fade = ("rate_limit:a+b", {"r": RATE}), (WEAKER, {"k": FADE})
+    (fit,) = search.refined([search.fresh(hypothesis(search, both, fade))], 25)
+    found = {f.hypothesis.names: search.score(f) for f in parted(search, fit)}
+    assert set(found) == {(LIMIT, WEAKER), ("rate_limit:b", WEAKER)}  # in the same order
+    assert found[LIMIT, WEAKER] > search.score(fit) - 1  # only one of the valves is slow
+    assert found["rate_limit:b", WEAKER] < search.score(fit) - 10
+
+
+@pytest.mark.parametrize("more", [("first_order_lag:b", "tau"), ("delay:b", "d")])
+def test_a_delay_of_each_input_replaces_one_of_all_and_more_of_some(search, more):
+    later, name = more
+    h = hypothesis(search, ("delay:a+b", {"d": 0.04}), (later, {name: 0.01}), (LIMIT, {"r": RATE}))
+    (fit,) = search.refined([search.fresh(h)], 1)
+    found = [f for f in parted(search, fit) if set(f.hypothesis.names) == {DELAY, "delay:b", LIMIT}]
+    assert len(found) == 1
+    (alone,) = search.refined([search.fresh(hypothesis(search, ("delay:a+b", {"d": 0.04})))], 1)
+    assert not parted(search, alone)  # a delay of all commands is one cause
 
 
 AXES = Model(

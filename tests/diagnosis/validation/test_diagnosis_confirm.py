@@ -205,18 +205,26 @@ def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
     structure, name = plain.noise.structure, other.hypothesis.names[0]
     bare = {k: f for k, f in search.fits.items() if not k[2]}
 
-    def rivals(nats):
+    def rivals(nats, beside=None):
         tied = replace(other, hypothesis=free)
         search.fits = bare | {(structure, 0.0, plain.hypothesis.names): plain}
         off = search.score(plain) + nats - search.score(tied)
         tied = replace(tied, evidence=tied.evidence + off / search.tempering.factor)
         search.fits[structure, 0.1, (name,)] = tied
+        if beside is not None:
+            h = plain.hypothesis.plus(other.hypothesis.effects[0], other.hypothesis.values[0])
+            own = plain.evidence + beside / search.tempering.factor
+            both = replace(plain, hypothesis=h, evidence=own)
+            search.fits[structure, 0.0, tuple(sorted(h.names))] = both
         decision = Decision(search, search, plain, search.exact_null(), {})
         claims = Claims(decision, {plain.hypothesis.names[0]: 1.0}, limits(search.data), ruler)
         return [found for found, _ in claims.rivals(plain.hypothesis.names[0])]
 
     assert rivals(1.0) == [name]
     assert not rivals(-4.0) and not rivals(4.0)
+    worth = search.score(plain) - max(map(search.score, bare.values()))
+    assert rivals(1.0, beside=0.2 * worth) == [name]
+    assert not rivals(1.0, beside=worth + 100)  # it is another cause, not another name of this one
 
 
 def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
