@@ -102,8 +102,9 @@ def told_otherwise(shown: str, out: str, part: float) -> str:
     """What the page shows otherwise than the output, whose numbers may differ by a part of them."""
     words = [" ".join(NUMBER.sub("\0", text).split()) for text in (shown, out)]
     if (at := words[1].find(words[0])) < 0:
-        like = os.path.commonprefix(words)
-        return " instead of ".join(text[len(like) :][:100].replace("\0", "N") for text in words)
+        pairs = enumerate(zip(*words, strict=False))
+        first = next((i for i, (a, b) in pairs if a != b), len(words[1]))
+        return " instead of ".join(text[first : first + 100].replace("\0", "N") for text in words)
     here, there = ([float(m[0].replace(",", "")) for m in NUMBER.finditer(t)] for t in (shown, out))
     there = there[words[1][:at].count("\0") :]
     unlike = [(a, b) for a, b in zip(here, there, strict=False) if abs(a - b) > part * abs(b)]
