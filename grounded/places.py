@@ -21,6 +21,7 @@ POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
 SHORT = 1e-5  # step for instantaneous rates [s]
 STRAIGHT = 1e-3  # error of velocities of about 1 from such a step
+LITTLE = 1e-3  # part of what an input moves most below which it does not move a state
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
 
@@ -58,6 +59,24 @@ def speed(model: Model) -> str | None:
     """Return the state of the speed along the heading, or None."""
     named = (*role(model, "speed"), *(s for s in SPEEDS if s in model.state_names))
     return next(iter(named), None)
+
+
+@lru_cache(maxsize=8)  # asked by several families of effects
+def of_a_kind(model: Model) -> tuple[tuple[str, ...], ...]:
+    """Return the groups of inputs with drives of one kind, as far as the model tells.
+
+    Their unit is the same. If that is 1, which says nothing, so are the units of the states that
+    they move: two thrusters are alike, a car's steering and its throttle are not.
+    """
+    bare = direct(model)
+    _, f_u = bare.system.linearise(*samples(bare, 8), bare.values, probe(bare, SHORT))
+    by, units = np.abs(f_u).max(axis=0), list(bare.states.values())
+    kinds: dict[tuple[str, ...], list[str]] = {}
+    for j, name in enumerate(model.input_names):
+        moved = {units[i] for i in np.flatnonzero(by[:, j] > LITTLE * by[:, j].max())}
+        unit = model.inputs[name]
+        kinds.setdefault((unit, *(sorted(moved) if unit == "1" else ())), []).append(name)
+    return tuple(tuple(found) for found in kinds.values() if len(found) > 1)
 
 
 def speed_input(model: Model) -> str | None:

@@ -69,12 +69,11 @@ def _one_or_all(model: Model) -> list[str]:
 
 
 def _one_or_alike(model: Model) -> list[str]:
-    """Return each input, all of one unit together, and pairs of these: drives of one kind."""
+    """Return each input, all of one kind together, and pairs of these (`places.of_a_kind`)."""
     found = list(model.input_names)
-    for unit in dict.fromkeys(model.inputs.values()):
-        alike = [n for n in model.input_names if model.inputs[n] == unit]
+    for alike in places.of_a_kind(model):
         groups = [alike, *(itertools.combinations(alike, 2) if 2 < len(alike) <= 4 else ())]
-        found += ["+".join(group) for group in groups if len(group) > 1]
+        found += ["+".join(group) for group in groups]
     return found
 
 

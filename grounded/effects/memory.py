@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,28 +21,56 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
 
 def shifted(signal: Array, held: Array, steps: float) -> Array:
     """Delay a zero-order-hold signal (S, T) by any number of steps; return its mean over each."""
-    whole = int(np.floor(steps + 1e-9))
-    part = max(0.0, steps - whole)
-    T = signal.shape[1]
-    line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
-    return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
+    now, before, part = _both(signal, held, steps)
+    return (1 - part) * now + part * before
 
 
-def lead_of_shift(signal: Array, held: Array, steps: float, lead: Array) -> Array:
-    """Return how much more of a delayed signal (S, T) arrives early in each step than late.
+class Sent(NamedTuple):
+    """A signal that may change within its steps.
 
-    That is the mean of (1/2 - t/dt) u(t) over a step, 0 for one that is constant.
+    A lead is how much more arrives early in a step than late, the mean of (1/2 - t/dt) u(t) over
+    it; 0 for what is constant.
 
-    Args:
-        signal: zero-order-hold means of each step (S, T).
-        held: the value before them (S,).
-        steps: the delay, in steps.
-        lead: the same of the signal itself (S, T).
+    Attributes:
+        mean: over each step (S, T).
+        held: the value before the first step (S,).
+        lead: of each step (S, T).
+        early: mean over the first part of each step (S, T).
+        early_lead: lead within this part (S, T).
     """
-    part = max(0.0, steps - int(np.floor(steps + 1e-9)))
-    whole = np.floor(steps + 1e-9)
-    now, before = (shifted(signal, held, whole + more) for more in (0, 1))
-    return 0.5 * part * (1 - part) * (before - now) + shifted(lead, 0 * held, steps)
+
+    mean: Array
+    held: Array
+    lead: Array
+    early: Array
+    early_lead: Array
+
+
+def shifted_within(sent: Sent, steps: float) -> tuple[Array, Array]:
+    """Delay a signal by any number of steps; return its mean and its lead in each (S, T).
+
+    A part p of a step brings the last part p of the step before, and the first part 1 - p of this
+    one, which `sent.early` has. With means of whole steps instead, the delay of a lag's output acts
+    as a further lag, and the lag itself was estimated short by p (1 - p) dt^2 / (2 tau).
+    """
+    p = steps - np.floor(steps + 1e-9)
+    q = 1 - p
+    first, own = q * sent.early, 0.5 * p * q * sent.held  # integrals, in steps
+    moment = q * q * sent.early_lead + 0.5 * p * first
+    now, before, _ = _both(first, q * sent.held, steps)
+    moment_now, moment_before, _ = _both(moment, own, steps)
+    _, mean_before, _ = _both(sent.mean, sent.held, steps)
+    _, lead_before, _ = _both(sent.lead, 0 * sent.held, steps)
+    rest = mean_before - before
+    return now + rest, moment_now - p * now + lead_before - moment_before + q * rest
+
+
+def _both(signal: Array, held: Array, steps: float) -> tuple[Array, Array, float]:
+    """Return a signal (S, T) after the whole steps of a delay, after one more, and the rest."""
+    whole = int(np.floor(steps + 1e-9))
+    line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
+    T = signal.shape[1]
+    return line[:, 1 : T + 1], line[:, :T], max(0.0, steps - whole)
 
 
 def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:

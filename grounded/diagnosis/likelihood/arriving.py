@@ -13,7 +13,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
-from grounded.effects.memory import lead_of_shift, settled, shifted
+from grounded.effects.memory import Sent, settled, shifted, shifted_within
 from grounded.frozen import Array
 
 WHOLE = 1e-9  # steps by which a latency may differ from a whole number
@@ -25,9 +25,11 @@ def arriving(acting: Acting, data: Data, j: int) -> Array:
 
     Effects on one input do not depend on the others, so each is computed and cached by itself.
     """
-    late = _late(acting, data, j)
-    sent, held, _ = _sent_on(acting, data, j)
-    return shifted(sent, held, late / data.dt) if late > 0 else sent
+    steps = _late(acting, data, j) / data.dt
+    sent = _sent_on(acting, data, j, steps)
+    if not sent.lead.any():
+        return shifted(sent.mean, sent.held, steps) if steps > 0 else sent.mean
+    return shifted_within(sent, steps)[0]
 
 
 def leading(acting: Acting, data: Data, j: int) -> Array:
@@ -35,9 +37,8 @@ def leading(acting: Acting, data: Data, j: int) -> Array:
 
     Shape (S, T), of the trials in use.
     """
-    late = _late(acting, data, j)
-    sent, held, lead = _sent_on(acting, data, j)
-    return lead_of_shift(sent, held, late / data.dt, lead) if late > 0 else lead
+    steps = _late(acting, data, j) / data.dt
+    return shifted_within(_sent_on(acting, data, j, steps), steps)[1]
 
 
 def within_steps(acting: Acting, data: Data) -> bool:
@@ -45,6 +46,19 @@ def within_steps(acting: Acting, data: Data) -> bool:
     parts = np.abs(data.latency / data.dt - np.round(data.latency / data.dt))
     moving = (e.family for e, _ in acting if isinstance(e.family, MemoryFamily))
     return bool((parts > WHOLE).any()) or any(f.transport or f.lead is not None for f in moving)
+
+
+def delayed(acting: Acting, data: Data) -> Array | None:
+    """Return the part of a step, 0 to 1, by which each input is late beyond whole steps.
+
+    Shape (m,), or (M, m) if values are given by row. None if something else changes inputs within a
+    step.
+    """
+    if any(getattr(effect.family, "lead", None) is not None for effect, _ in acting):
+        return None
+    late = [np.asarray(_late(acting, data, j)) / data.dt for j in range(data.model.m)]
+    steps = np.stack(np.broadcast_arrays(*late), axis=-1)
+    return np.maximum(steps - np.floor(steps + WHOLE), 0.0)
 
 
 def _late(acting: Acting, data: Data, j: int) -> float:
@@ -56,18 +70,18 @@ def _late(acting: Acting, data: Data, j: int) -> float:
     return late
 
 
-def _sent_on(acting: Acting, data: Data, j: int) -> tuple[Array, Array, Array]:
-    """Return input j (S, T) after all effects on it but delays, and that held before (S,).
+def _sent_on(acting: Acting, data: Data, j: int, steps: float = 0.0) -> Sent:
+    """Return input j after all effects on it but delays.
 
-    The third is its lead within each step (S, T), see `MemoryFamily`.
+    steps: the delay to come, which the first part of each step (`Sent.early`) leaves in this step.
     """
-    name = data.model.input_names[j]
+    name, part = data.model.input_names[j], 1 - (steps - np.floor(steps + WHOLE))
     u, held = data.commands[data.used, :, j], data.held[data.used, j]
-    lead = np.zeros_like(u)
+    sent = Sent(u, held, np.zeros_like(u), u, np.zeros_like(u))
     for effect, values in acting:
         if effect.family.name != "delay" and name in effect.site.targets:
-            u, held, lead = _transformed(effect, values, (u, held, lead), data.dt)
-    return u, held, lead
+            sent = _transformed(effect, values, sent, data.dt, float(part))
+    return sent
 
 
 def memories_moved(acting: Acting, data: Data) -> Array:
@@ -79,7 +93,7 @@ def memories_moved(acting: Acting, data: Data) -> Array:
     model, found = data.model, np.zeros((len(data.valid), data.model.n))
     held = data.held.copy()
     for j in range(model.m):
-        held[data.used, j] = _sent_on(acting, data, j)[1]
+        held[data.used, j] = _sent_on(acting, data, j).held
     p = Named("parameter", model.param_names, list(model.values))
     before, after = (
         settled(model, Named("input", model.input_names, list(one.T)), p)
@@ -95,21 +109,33 @@ def memories_moved(acting: Acting, data: Data) -> Array:
 
 
 def _transformed(
-    effect: Effect, values: Mapping[str, float], sent: tuple[Array, Array, Array], dt: float
-) -> tuple[Array, Array, Array]:
-    """Apply an input or memory effect to commands (S, T), the input held before (S,), and leads.
+    effect: Effect, values: Mapping[str, float], sent: Sent, dt: float, part: float
+) -> Sent:
+    """Apply an input or memory effect to a signal, whose early part is `part` of each step.
 
     A memory starts settled at the held input.
     """
-    family, (u, held, lead) = effect.family, sent
+    family, u = effect.family, sent.mean
     if isinstance(family, InputFamily):
-        t = np.arange(u.shape[1]) * dt
-        now = np.asarray(family.effect(u, t[None, :], values), float)
-        before = np.asarray(family.effect(held, 0.0, values), float)
-        more = np.asarray(family.effect(u + lead, t[None, :], values), float) if lead.any() else now
-        return np.broadcast_to(now, u.shape), np.broadcast_to(before, held.shape), more - now
+        t = np.arange(u.shape[1])[None] * dt
+
+        def through(u: Array, lead: Array) -> tuple[Array, Array]:
+            now = np.broadcast_to(np.asarray(family.effect(u, t, values), float), u.shape)
+            return now, (family.effect(u + lead, t, values) - now if lead.any() else lead)
+
+        before = np.asarray(family.effect(sent.held, 0.0, values), float)
+        held = np.broadcast_to(before, sent.held.shape)
+        mean, lead = through(u, sent.lead)
+        early = through(sent.early, sent.early_lead) if part < 1 else (mean, lead)
+        return Sent(mean, held, lead, *early)
     if isinstance(family, MemoryFamily):
-        z = family.along(u, held, values, dt)
-        lead = np.zeros_like(u) if family.lead is None else family.lead(u, z, values, dt)
-        u, _ = family.advance(u, (z,), values, dt)
-    return u, held, lead
+        z = family.along(u, sent.held, values, dt)
+
+        def over(u: Array, dt: float) -> tuple[Array, Array]:
+            lead = np.zeros_like(u) if family.lead is None else family.lead(u, z, values, dt)
+            return family.advance(u, (z,), values, dt)[0], lead
+
+        mean, lead = over(u, dt)
+        early = over(sent.early, part * dt) if part < 1 else (mean, lead)
+        return Sent(mean, sent.held, lead, *early)
+    return sent

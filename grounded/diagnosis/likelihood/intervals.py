@@ -27,7 +27,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
-DELAYS, LAGS = ("delay", "sensor_delay"), ("first_order_lag", "sensor_lag")
+DELAY, LAGS = "sensor_delay", ("first_order_lag", "sensor_lag")
 STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
 LONG = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
@@ -63,16 +63,15 @@ def standard_deviations(
 
 
 def between_steps(h: Hypothesis, dt: float, count: int) -> Array:
-    """Return how far off lags and delays may be as a delay ends between two steps, (count,) [s].
+    """Return how far off lags and sensors' delays that end between two steps may be, (count,) [s].
 
-    A delay by a part p of a step is a mean of two steps, which spreads a signal by p (1 - p) dt^2
-    as a lag spreads it by tau^2. Beside it the lag is short by p (1 - p) dt^2 / (2 tau), and the
-    delay longer by as much. A lag of 0.28 s after 0.14 s, with steps of 0.1 s, was 0.274 +- 0.001 s
-    after 0.145 +- 0.0006 s.
+    A log that is late by a part p of a step shows a mean of two steps, which spreads a signal by
+    p (1 - p) dt^2 as a lag spreads it by tau^2. Beside it the lag is short by p (1 - p) dt^2 /
+    (2 tau), and the delay longer by as much.
     """
     found, owners = np.zeros(count), [(e, v, q) for e, v in h.pairs for q in e.free]
     values = [(k, e.family.name, v[q.name]) for k, (e, v, q) in enumerate(owners)]
-    late = {k: value / dt % 1.0 for k, name, value in values if name in DELAYS}
+    late = {k: value / dt % 1.0 for k, name, value in values if name == DELAY}
     lags = {k: max(value, dt) for k, name, value in values if name in LAGS and value > 0}
     spread = {k: p * (1 - p) * dt**2 for k, p in late.items()}
     if lags and spread:

@@ -23,6 +23,7 @@ from grounded.compile import Named
 from grounded.diagnosis.likelihood.arriving import (
     Acting,
     arriving,
+    delayed,
     leading,
     memories_moved,
     within_steps,
@@ -74,6 +75,7 @@ class Predictor(SentOnce):
     _steps: dict[bytes, Array] = field(default_factory=dict)
     _loads: dict[Any, Loads] = field(default_factory=dict)
     _weights: dict[str, dict[bytes, Mapping[str, float]]] = field(default_factory=dict)
+    _alike: dict[Any, list[tuple[Array, Array, Array]]] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
@@ -94,8 +96,8 @@ class Predictor(SentOnce):
     def inputs(self, h: Hypothesis) -> Array:
         """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m).
 
-        If they may change within a step, in a model with positions, m more columns say by how much
-        they lead (`MemoryFamily.lead`); single steps then add what that changes (`_led`).
+        If they may change within a step, m more columns say by how much they lead
+        (`MemoryFamily.lead`); single steps then add what that changes (`_within`).
         """
         acting, each = self.acting(h), range(self.data.model.m)
         found = [self._input(acting, j, "input", arriving) for j in each]
@@ -129,8 +131,9 @@ class Predictor(SentOnce):
         return self._kept(f"trials {len(makers)}", acting, make)
 
     def _led_by(self, acting: Acting) -> bool:
-        """Check whether inputs may change within a step, in a model with positions."""
-        return within_steps(acting, self.data) and bool(self.positions)
+        """Check whether inputs may change within a step; of a simulator, if it has positions."""
+        matters = bool(self.positions) or not simulated(self.data.model)
+        return matters and within_steps(acting, self.data)
 
     def begun(self, h: Hypothesis) -> Array | None:
         """Return what effects on inputs add to the initial memory states, by run (B, n).
@@ -261,23 +264,65 @@ class Predictor(SentOnce):
             x = medium.through(x)
             return medium.over(self.moved(medium.still, x, u, dt), dt or self.data.dt)
         left, more = self.left(h, x, u, dt)
-        after = self.step(x, left, self.params(h), dt)
-        if dt is None and u.shape[-1] > self.data.model.m:
-            self._led(after, x, left, self.params(h))
+        if dt is None and left[..., self.data.model.m :].any():
+            after = self._within(h, x, left)
+        else:
+            after = self.step(x, left, self.params(h), dt)
         for q in more:
             after[..., self.seen.index(q)] += more[q]
         return after
 
-    def _led(self, after: Array, x: Array, u: Array, p: Array) -> None:
-        """Add to the states after a step what inputs that arrive early in it change.
+    def _within(self, h: Hypothesis, x: Array, u: Array) -> Array:
+        """Return the model's step from x (..., n) with inputs that change within it.
 
-        It is (F - 1) B l, with B l what the leads l, held over a step, add: dt B l of a position.
+        Delays alone change an input once, a part of a step after it began, from the value that was
+        sent one step before; so the step is made in parts. Of lags, and in a simulator's step, only
+        the first moment is known: by how much u (..., 2 m) arrives early, the leads l. With F the
+        step's slope and B l what these, held over a step, would add to its states, they add
+
+            (F - 1) (1 - (F - 1) / 2) B l
+
+        to third order in dt: dt B l of a position, -dt / tau B l of a servo's angle. A simulator is
+        not asked for the second factor.
         """
-        m = self.data.model.m
-        lead = u[..., m:]
-        if lead.any():
-            by = self.step(x, u[..., :m] + lead, p) - after
-            after[...] = self.step(x + by, u, p) - by
+        p, m, slow = self.params(h), self.data.model.m, simulated(self.data.model)
+        parts = None if slow else delayed(self.acting(h), self.data)
+        if parts is None:
+            mean, lead = u[..., :m], u[..., m:]
+            after = self.step(x, mean, p)
+            by = self.step(x, mean + lead, p) - after
+            by = self.step(x + by, mean, p) - after - by
+            less = by if slow else self.step(x + by, mean, p) - after  # F by
+            return np.asarray(after + by + 0.5 * (by - less))
+        if parts.ndim == p.ndim == 1:
+            return self._in_parts(x, u, p, parts)
+        found = np.empty_like(x)
+        for own, its_p, its_parts in self._groups(p, parts, len(x)):
+            found[own] = self._in_parts(x[own], u[own], its_p, its_parts)
+        return found
+
+    def _groups(self, p: Array, parts: Array, rows: int) -> list[tuple[Array, Array, Array]]:
+        """Return the rows with the same parameters and parts of a step, with these; cached."""
+        key = (rows, p.tobytes(), parts.tobytes())
+        if key not in self._alike:
+            self._alike.clear()
+            both = np.hstack([np.broadcast_to(one, (rows, one.shape[-1])) for one in (p, parts)])
+            each, which = np.unique(both, axis=0, return_inverse=True)
+            k = p.shape[-1]
+            self._alike[key] = [
+                (np.flatnonzero(which == i), row[:k], row[k:]) for i, row in enumerate(each)
+            ]
+        return self._alike[key]
+
+    def _in_parts(self, x: Array, u: Array, p: Array, parts: Array) -> Array:
+        """Step with inputs u (..., 2 m) that change once within it, after `parts` of it (m,)."""
+        dt, m, within = self.data.dt, self.data.model.m, parts * (1 - parts)
+        change = u[..., m:] * np.divide(2, within, out=np.zeros(m), where=within > 0)
+        now, at = u[..., :m] - parts * change, 0.0  # the change is what it was before, less now
+        for end in (*sorted({part for part in parts.tolist() if part > 0}), 1.0):
+            x = self.step(x, now + change * (parts >= end), p, (end - at) * dt)
+            at = end
+        return x
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""

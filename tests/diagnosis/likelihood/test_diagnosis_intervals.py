@@ -112,14 +112,14 @@ def test_a_trial_that_differs_by_rounding_counts_once():
 def test_a_delay_between_two_steps_makes_a_lag_beside_it_uncertain():
     """The mean of two steps spreads a signal by p (1 - p) dt^2, which the lag lacks then."""
     one = Hypothesis()
-    for name, values in (("first_order_lag:throttle", 0.28), ("delay:throttle", 0.14)):
+    for name, values in (("first_order_lag:throttle", 0.28), ("sensor_delay:v", 0.14)):
         effect = Library().effect(name, car)
         one = one.plus(effect, {effect.free[0].name: values})
     both = between_steps(one, 0.1, 4)
     assert both.tolist() == pytest.approx([0.24 * 0.01 / 0.56] * 2 + [0.0] * 2)
     assert not between_steps(one, 0.07, 2).any()  # two whole steps
     assert not between_steps(one.minus("first_order_lag:throttle"), 0.1, 1).any()
-    assert not between_steps(one.minus("delay:throttle"), 0.1, 1).any()
+    assert not between_steps(one.minus("sensor_delay:v"), 0.1, 1).any()
 
 
 @pytest.mark.slow
