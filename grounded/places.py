@@ -68,6 +68,8 @@ def of_a_kind(model: Model) -> tuple[tuple[str, ...], ...]:
     Their unit is the same. If that is 1, which says nothing, so are the units of the states that
     they move: two thrusters are alike, a car's steering and its throttle are not.
     """
+    if model.m < 2:
+        return ()
     bare = direct(model)
     _, f_u = bare.system.linearise(*samples(bare, 8), bare.values, probe(bare, SHORT))
     by, units = np.abs(f_u).max(axis=0), list(bare.states.values())

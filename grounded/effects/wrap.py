@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.names import Named
+from grounded.effects.actuator import delay
 from grounded.effects.family import (
     Effect,
     InputFamily,
@@ -39,9 +40,11 @@ from grounded.effects.family import (
     ParamFamily,
     Quantity,
     RateFamily,
+    Scales,
     SensorDelayFamily,
     SensorFamily,
     SensorLagFamily,
+    Site,
     Values,
     braked,
 )
@@ -92,6 +95,9 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
+    vars(step)["queued"] = getattr(family, "transport", False) or getattr(
+        model.step, "queued", False
+    )
     vars(step)["settled"] = _settled(effect)
     if not isinstance(family, LossFamily | RateFamily):
         vars(step)["shell"] = _Shell(effect, whole, dt)
@@ -111,6 +117,24 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         step=step,
         name=f"{model.name} with {effect.name}",
     )
+
+
+def late_by(model: Model, late: Mapping[str, float], dt: float) -> Model:
+    """Return a model whose inputs arrive a part of a step late.
+
+    The step is made in parts, before and after each of them arrives. So what bends an input (a dead
+    zone) or has a memory (a lag) gets what was sent, not a mean of two commands.
+
+    Args:
+        model: with the effects on its inputs.
+        late: by input, more than 0 and less than `dt` [s].
+        dt: control step [s].
+    """
+    if not late:
+        return model
+    one = replace(delay, depth=lambda values, dt: 1)
+    each = tuple(Quantity(name, "s", fixed=True, start=by) for name, by in late.items())
+    return wrap(Effect(one, Site(model, tuple(late), Scales()), each), dict(late), dt)
 
 
 @dataclass(frozen=True)
@@ -185,9 +209,35 @@ def _input_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[st
     return step, {clock: "s"} if timed else {}
 
 
+def _in_parts(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """Return a step made in parts, since each input arrives a part of it late (`late_by`)."""
+    model, late = effect.site.model, behind_logs(effect.site.model)
+    base, names = plain_step(model), effect.site.targets
+    by = {n: whole[n] / dt for n in names}
+    memory = {n: f"{n}_{effect.family.name}_1" for n in names}
+    slow = getattr(model.step, "timestep", 0.0)  # a simulator makes whole steps only
+    ends = (*(() if slow else sorted(set(by.values()))), 1.0)
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        start, at = own_state(model, s), 0.0
+        now: Any = start
+        for end in ends:
+            u = {n: s[memory[n]] if end <= by[n] else a[n] for n in names}
+            if slow:
+                u = {n: (1 - by[n]) * a[n] + by[n] * s[memory[n]] for n in names}
+            after = base(now, _replaced(model, a, u), p, (end - at) * dt)
+            now, at = Named("state", model.state_names, [after[n] for n in model.state_names]), end
+        after = dict(late.log(start, now, p, dt)) if late else after
+        return {**after, **{memory[n]: a[n] for n in names}}
+
+    return step, {memory[n]: model.inputs[n] for n in names}
+
+
 def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     model, family = effect.site.model, effect.family
     assert isinstance(family, MemoryFamily)
+    if {*whole} == {*effect.site.targets}:
+        return _in_parts(effect, whole, dt)
     base, depth, lead = plain_step(model), family.depth(whole, dt), family.lead
     # a rate limit's lead has kinks that would hinder plans, and changes its estimate by 1e-4
     positions = integrated(model) if lead is not None and family.linear else {}

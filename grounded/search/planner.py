@@ -255,9 +255,9 @@ def planner_with(
 
     A pure delay becomes latency of the task, a queue of inputs that the robot's runner keeps. Every
     other effect wraps the model, with memory states if it has memory. If an input also has a
-    nonlinear effect (a dead zone, a rate limit), its latency has whole steps only. The remaining
-    fraction of a step is applied after the nonlinearity, since a nonlinear function of the mean of
-    two commands is not the mean of the function's values.
+    nonlinear effect (a dead zone, a rate limit), its latency has whole steps only, since a nonlinear
+    function of the mean of two commands is not the mean of the function's values. For the remaining
+    fraction, the model's step is made in parts.
 
     Args:
         task: the manoeuvre, with the original model.
@@ -272,6 +272,7 @@ def planner_with(
     from grounded.effects import Library, param_name, wrap
     from grounded.effects.family import Effect, InputFamily, MemoryFamily, Scales, Site
     from grounded.effects.order import wrapping_order
+    from grounded.effects.wrap import late_by
 
     library, checked = library or Library(), checked or Effect.complete
     assert task.latency is not None
@@ -289,16 +290,14 @@ def planner_with(
             bent[reached] |= not family.linear
     part = np.where(bent, latency - task.dt * np.floor(latency / task.dt + WHOLE), 0.0)
     part[part < WHOLE * task.dt] = 0.0
-    order = wrapping_order(families)
-    inputs = [i for i in order if isinstance(families[i], InputFamily | MemoryFamily)]
-    for i in order:
-        if i in inputs[:1]:
-            model = _late_by(model, part, task.dt)
+    for i in wrapping_order(families):
         if families[i].name == "delay":
             continue
         name, values = effects[i]
         effect = library.effect(name, model)
         model = wrap(effect, checked(effect, values), task.dt)
+    rest = zip(model.input_names, part.tolist(), strict=True)
+    model = late_by(model, {name: by for name, by in rest if by > 0}, task.dt)
     latency -= part
     widths = tuple(param_name(name, "width") for name, values in effects if "width" in values)
     plays = tuple(
@@ -311,22 +310,6 @@ def planner_with(
 
 
 WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps
-
-
-def _late_by(model: Model, late: Array, dt: float) -> Model:
-    """Return the model with inputs delayed by fixed fractions of a step `late` (m,) [s]."""
-    from grounded.effects import Library, wrap
-    from grounded.effects.family import MemoryFamily
-
-    for name, by in zip(model.input_names, late.tolist(), strict=True):
-        if by > 0:
-            effect = Library().effect(f"delay:{name}", model)
-            assert isinstance(effect.family, MemoryFamily)
-            once = dataclasses.replace(effect.family, depth=lambda values, dt: 1)
-            fixed = tuple(dataclasses.replace(q, fixed=True, start=by) for q in effect.quantities)
-            effect = dataclasses.replace(effect, family=once, quantities=fixed)
-            model = wrap(effect, {"d": by}, dt)
-    return model
 
 
 def _input(task: Task, name: str, target: str) -> int:

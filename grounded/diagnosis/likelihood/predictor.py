@@ -57,7 +57,7 @@ from grounded.effects.plain_step import quantities_of
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
-from grounded.places import integrated, partner
+from grounded.places import integrated, outright_states, partner
 from grounded.rollout import each_stepped
 
 MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials
@@ -131,9 +131,19 @@ class Predictor(SentOnce):
         return self._kept(f"trials {len(makers)}", acting, make)
 
     def _led_by(self, acting: Acting) -> bool:
-        """Check whether inputs may change within a step; of a simulator, if it has positions."""
-        matters = bool(self.positions) or not simulated(self.data.model)
-        return matters and within_steps(acting, self.data)
+        """Check whether inputs may change within a step, and whether that matters."""
+        return (self.divisible or bool(self.positions)) and within_steps(acting, self.data)
+
+    @cached_property
+    def divisible(self) -> bool:
+        """Whether a step of the model may be made in parts.
+
+        Not a simulator's, nor if it moves a queue of late inputs on by one, nor if states are set
+        outright: those would show the last part alone.
+        """
+        model = self.data.model
+        queued = getattr(model.step, "queued", False)
+        return not (simulated(model) or queued or outright_states(model))
 
     def begun(self, h: Hypothesis) -> Array | None:
         """Return what effects on inputs add to the initial memory states, by run (B, n).
@@ -276,30 +286,30 @@ class Predictor(SentOnce):
         """Return the model's step from x (..., n) with inputs that change within it.
 
         Delays alone change an input once, a part of a step after it began, from the value that was
-        sent one step before; so the step is made in parts. Of lags, and in a simulator's step, only
-        the first moment is known: by how much u (..., 2 m) arrives early, the leads l. With F the
-        step's slope and B l what these, held over a step, would add to its states, they add
+        sent one step before; so the step is made in parts. Of lags, and where it is not divisible,
+        only the first moment is used: by how much u (..., 2 m) arrives early, the leads l. With F
+        the step's slope and B l what these, held over a step, would add to its states, they add
 
             (F - 1) (1 - (F - 1) / 2) B l
 
-        to third order in dt: dt B l of a position, -dt / tau B l of a servo's angle. A simulator is
-        not asked for the second factor.
+        to third order in dt: dt B l of a position, -dt / tau B l of a servo's angle. The second
+        factor is left out where the step is not divisible.
         """
-        p, m, slow = self.params(h), self.data.model.m, simulated(self.data.model)
-        parts = None if slow else delayed(self.acting(h), self.data)
+        p, m = self.params(h), self.data.model.m
+        parts = delayed(self.acting(h), self.data) if self.divisible else None
         if parts is None:
             mean, lead = u[..., :m], u[..., m:]
             after = self.step(x, mean, p)
             by = self.step(x, mean + lead, p) - after
             by = self.step(x + by, mean, p) - after - by
-            less = by if slow else self.step(x + by, mean, p) - after  # F by
+            less = self.step(x + by, mean, p) - after if self.divisible else by  # F by
             return np.asarray(after + by + 0.5 * (by - less))
         if parts.ndim == p.ndim == 1:
-            return self._in_parts(x, u, p, parts)
+            return self.logged(h, x, self._in_parts(x, u, p, parts))
         found = np.empty_like(x)
         for own, its_p, its_parts in self._groups(p, parts, len(x)):
             found[own] = self._in_parts(x[own], u[own], its_p, its_parts)
-        return found
+        return self.logged(h, x, found)
 
     def _groups(self, p: Array, parts: Array, rows: int) -> list[tuple[Array, Array, Array]]:
         """Return the rows with the same parameters and parts of a step, with these; cached."""
