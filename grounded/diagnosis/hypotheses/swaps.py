@@ -95,8 +95,8 @@ def parted(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     for h in _of_fewer_inputs(own, fit.hypothesis):
         key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
         known = search.fits.get(key)
-        starts = [(h, fit.noise, fit.track), *([known] if known else [])]
-        search.refined(starts, TO_THE_TOP)
+        starts: list[Fitted | Start] = [(h, fit.noise, fit.track)]
+        search.refined([*starts, known] if known else starts, TO_THE_TOP)
         found += [search.fits[key]] if key in search.fits else []
     return found
 

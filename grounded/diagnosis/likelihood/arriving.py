@@ -58,7 +58,7 @@ def delayed(acting: Acting, data: Data) -> Array | None:
         return None
     late = [np.asarray(_late(acting, data, j)) / data.dt for j in range(data.model.m)]
     steps = np.stack(np.broadcast_arrays(*late), axis=-1)
-    return np.maximum(steps - np.floor(steps + WHOLE), 0.0)
+    return np.asarray(np.maximum(steps - np.floor(steps + WHOLE), 0.0))
 
 
 def _late(acting: Acting, data: Data, j: int) -> float:

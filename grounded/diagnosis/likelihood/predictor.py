@@ -75,7 +75,7 @@ class Predictor(SentOnce):
     _steps: dict[bytes, Array] = field(default_factory=dict)
     _loads: dict[Any, Loads] = field(default_factory=dict)
     _weights: dict[str, dict[bytes, Mapping[str, float]]] = field(default_factory=dict)
-    _alike: dict[Any, list[tuple[Array, Array, Array]]] = field(default_factory=dict)
+    _alike: dict[Any, list[tuple[Any, Array, Array]]] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
@@ -311,7 +311,7 @@ class Predictor(SentOnce):
             found[own] = self._in_parts(x[own], u[own], its_p, its_parts)
         return self.logged(h, x, found)
 
-    def _groups(self, p: Array, parts: Array, rows: int) -> list[tuple[Array, Array, Array]]:
+    def _groups(self, p: Array, parts: Array, rows: int) -> list[tuple[Any, Array, Array]]:
         """Return the rows with the same parameters and parts of a step, with these; cached."""
         key = (rows, p.tobytes(), parts.tobytes())
         if key not in self._alike:
