@@ -255,8 +255,8 @@ def planner_with(
 
     A pure delay becomes latency of the task, a queue of inputs that the robot's runner keeps. Every
     other effect wraps the model, with memory states if it has memory. If an input also has a
-    nonlinear effect (a dead zone, a rate limit), its latency has whole steps only, since the mean of
-    two commands, bent, is not the mean of what was bent. For the remaining fraction, the model's
+    nonlinear effect (a dead zone, a rate limit), its latency has whole steps only, since the mean
+    of two commands, bent, is not the mean of what was bent. For the remaining fraction, the model's
     step is made in parts.
 
     Args:
