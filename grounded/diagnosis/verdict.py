@@ -439,7 +439,8 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
     """Return a clause on the parameters that are adopted too, though they need not be off.
 
     They were calibrated together with those that are off, whose values are only valid with them.
-    Of one that is off with an effect that ties with a claimed one, the clause says so.
+    Of one that is off with an effect that ties with a claimed one, the clause says so. One whose
+    value in the model the trials exclude may be off, though predictions don't need that.
     """
     params, known, off = claims.data.model.params, claims.parameters(), parameters_off(claims)
     lost = {one.parameter for one in identified if one.lost}
@@ -452,7 +453,10 @@ def _others(claims: Claims, identified: Sequence[Identifiable], adopted: Collect
     for name in old:
         if name in off_with:
             ties.setdefault(off_with[name], []).append(value_called(name, adopted))
-    wrong = "but need not be wrong" + "".join(
+    ends = [(value, known[name].interval) for name, value in old.items()]
+    sure = any(both and not both[0] <= value <= both[1] for value, both in ends)
+    doubt = "which predictions hardly need" if sure else "but need not be wrong"
+    wrong = doubt + "".join(
         f"; if {tie} is the cause instead, {listed(some)} {'is' if len(some) == 1 else 'are'} off"
         for tie, some in ties.items()
     )

@@ -127,6 +127,10 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
     known.pop("delay_u_d"), known.pop("p0"), known.pop("p1"), known.pop("p2")
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     assert told.endswith("; p3 and p4 are adjusted with it by at most 8.0 %, but need not be wrong")
+    known["p4"] = replace(known["p4"], interval=(5.3, 5.5))  # which excludes the model's 5
+    (excluded,) = _causes(claims, (), [Credit("calibration")], (), {})
+    assert excluded.endswith("are adjusted with it by at most 8.0 %, which predictions hardly need")
+    known["p4"] = replace(known["p4"], interval=(4.9, 5.9))
     claims.off_with_rivals = lambda: {"p4": "drag:v"}
     (tied,) = _causes(claims, (), [Credit("calibration")], (), {})
     assert tied == f"{told}; if drag:v is the cause instead, p4 is off"

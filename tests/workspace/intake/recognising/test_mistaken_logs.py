@@ -342,15 +342,18 @@ def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_p
     assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)
 
 
-def driven_by(w, path, action, noise=1e-3, late=0):
-    """Write the log of a run whose program sends action(k, the states as they are logged, now)."""
+def driven_by(w, path, action, noise=1e-3, late=0, pull=1.0):
+    """Write the log of a run whose program sends action(k, the states as they are logged, now).
+
+    pull: of the real robot's drives, relative to the model's.
+    """
     model, x, rows, past = w.base_model, w.task.start.copy(), [], []
     for k in range(w.task.horizon):
         past.append(x + RNG.normal(0, noise, 3))
         logged = past[max(0, k - late)]
         u = action(k, logged, past[k])
         rows.append([k * w.task.dt, *logged, *u])
-        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+        x = model.system.step(x[None], pull * u[None], model.values, w.task.dt)[0]
     np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
     return w.ingest(path)
 
@@ -413,6 +416,48 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), "starboard", "multiply the scale in [log.input.starboard]")
+
+
+def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w, tmp_path):
+    """`multiply the scale in [log.input.right] by 1.41`: obeyed, that spoilt the next run."""
+    dt, wrong = w.task.dt, np.array([0.7, 1.0])
+
+    def run(size):
+        plan = w.propose().candidate
+        runner = Runner(plan.policy)
+        path = tmp_path / f"{plan.id}.csv"
+        sent = lambda k, logged, now: size * runner.action(k * dt, logged)  # noqa: E731
+        return driven_by(w, path, sent, pull=0.8)
+
+    with pytest.raises(GroundedError, match="multiply the scale"):
+        run(wrong)  # nothing tells whether the log is wrong, or the program
+    run(1.0)
+    with pytest.raises(GroundedError) as refused:
+        run(wrong)
+    told = "its program sends port 1.43 times too small", "earlier runs", "run c0002 again"
+    assert holds(str(refused.value), *told, "if it is the log that changed since")
+    assert refused.value.then == NextCommand("next", ("LOG",))
+
+
+def test_a_program_that_acts_on_states_a_step_old_is_told_by_earlier_runs(w, tmp_path):
+    """ "They seem to be logged 1 step late": the log was right, as six earlier runs showed."""
+    dt = w.task.dt
+
+    def run(old):
+        plan, past = w.propose().candidate, []
+        runner = Runner(plan.policy)
+
+        def action(k, logged, now):
+            past.append(logged)
+            return runner.action(max(0, k - old) * dt, past[max(0, k - old)])
+
+        return driven_by(w, tmp_path / f"{plan.id}.csv", action, noise=0.01, pull=0.8)
+
+    run(0)
+    found = run(1)
+    told = [one for one in found.warnings if "shifted by 1 step" in one]
+    assert len(told) == 1 and holds(told[0], "Earlier runs", "states that are 1 step old")
+    assert holds(told[0], f"`discard {found.trial}`", f"run {found.candidate} again")
 
 
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])

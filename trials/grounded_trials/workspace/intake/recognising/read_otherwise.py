@@ -345,6 +345,12 @@ def _paced(series: Series, pace: float) -> Series:
     return replace(series, t=t, log_times=log)
 
 
+def times_too(by: float) -> str:
+    """Return that numbers which have to be multiplied by `by` are too small, or too large."""
+    size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
+    return size + " and of the other sign" * (by < 0)
+
+
 def units_told(task: Task, names: Sequence[str], by: float, mapped: bool) -> str:
     """Describe a wrong unit or sign in a log and how to correct it.
 
@@ -360,9 +366,7 @@ def units_told(task: Task, names: Sequence[str], by: float, mapped: bool) -> str
         mend = f"multiply the scale in {tables} of {FILE} by -1 (a missing scale is 1)"
         alone = f"write {which} times -1 and run it again, or ingest it with --data"
         return f"with {which} of the other sign: {mend if mapped else alone}"
-    size = f"{max(abs(by), 1 / abs(by)):.4g} times too {'large' if abs(by) < 1 else 'small'}"
-    size += " and of the other sign" * (by < 0)
-    unit = unit_named(task.model, names, by) or of_full_scale(task, names, by)
+    size, unit = times_too(by), unit_named(task.model, names, by) or of_full_scale(task, names, by)
     mend = f"multiply the scale in {tables} of {FILE} by {by:.6g} (a missing scale is 1)"
     if not unit and by not in THOUSAND:
         mend += "; if the log is right, the robot's program measures it wrong"

@@ -24,7 +24,13 @@ from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import odd_columns
 from grounded.search.returned.misused import WITHOUT, without_feedback
-from grounded.search.returned.other_scale import other_units, unit_named, units_tried
+from grounded.search.returned.other_scale import (
+    THOUSAND,
+    of_full_scale,
+    other_units,
+    unit_named,
+    units_tried,
+)
 from grounded.search.returned.who_drove import (
     OTHERS,
     Following,
@@ -55,6 +61,7 @@ from grounded_trials.workspace.intake.recognising.read_otherwise import (
     misled,
     pace_of,
     rather_exchanged,
+    times_too,
     unit_of,
     units_told,
     zero_in,
@@ -229,6 +236,11 @@ def recognised(
                 f"{ran}, {shown}. Mend that and run {ran} again",
                 NextCommand("next", ("LOG",)),
             )
+        if shown := sent_scaled(workspace, units, by):
+            raise GroundedError(
+                f"{path} ran {ran}, but {shown}. Mend that and run {ran} again",
+                NextCommand("next", ("LOG",)),
+            )
         other_unit = units_told(task, units, by, read.log is not None)
         raise GroundedError(f"{path} ran {ran}, {other_unit}", again)
     if pace:
@@ -367,6 +379,33 @@ def sent_reversed(workspace: Folder, trial: Trial, names: Sequence[str]) -> str:
     if all(min(as_modelled(one)) > 0 for one in earlier):
         return f"but earlier logs, read in the same way, have the right one, {program}"
     return ""
+
+
+def sent_scaled(workspace: Folder, names: Sequence[str], by: float) -> str:
+    """Return that a program sent inputs times a number that is no unit, as earlier runs show.
+
+    They were read in the same way and had what their candidates send. Another scale in the log
+    would spoil every later one.
+
+    Args:
+        workspace: the workspace with the earlier runs.
+        names: signals that have to be multiplied for the candidate's commands.
+        by: the number.
+
+    Returns:
+        A clause; "" if the log may have another unit, or there are no earlier runs.
+    """
+    task = workspace.task
+    known = unit_named(task.model, names, by) or of_full_scale(task, names, by)
+    earlier = any(one.candidate for one in workspace.task_trials(measured=True))
+    if not {*names} <= {*task.model.input_names} or known or by in THOUSAND or not earlier:
+        return ""
+    tables = listed(f"[log.input.{name}]" for name in names)
+    return (
+        f"its program sends {listed(names)} {times_too(by)}: earlier runs, whose logs were read in "
+        f"the same way, have the right size (if it is the log that changed since, multiply the "
+        f"scale in {tables} by {by:.6g})"
+    )
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
