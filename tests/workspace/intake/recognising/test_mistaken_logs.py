@@ -439,27 +439,6 @@ def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w,
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
-def test_a_program_that_acts_on_states_a_step_old_is_told_by_earlier_runs(w, tmp_path):
-    """ "They seem to be logged 1 step late": the log was right, as six earlier runs showed."""
-    dt = w.task.dt
-
-    def run(old):
-        plan, past = w.propose().candidate, []
-        runner = Runner(plan.policy)
-
-        def action(k, logged, now):
-            past.append(logged)
-            return runner.action(max(0, k - old) * dt, past[max(0, k - old)])
-
-        return driven_by(w, tmp_path / f"{plan.id}.csv", action, noise=0.01, pull=0.8)
-
-    run(0)
-    found = run(1)
-    told = [one for one in found.warnings if "shifted by 1 step" in one]
-    assert len(told) == 1 and holds(told[0], "Earlier runs", "states that are 1 step old")
-    assert holds(told[0], f"`discard {found.trial}`", f"run {found.candidate} again")
-
-
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
 def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
     """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""

@@ -78,34 +78,13 @@ def warnings_about(
     found += [] if fell else _unsafe(task, whole, candidate)
     ran = follows(candidate.policy, whole, max(LATEST, latest(task))) if late else None
     if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
-        by, sooner = count(abs(ran.late), "step"), ran.late > 0
-        said = f"the inputs fit the policy better when shifted by {by}"
-        if sooner and candidate.policy.gain is not None and _in_time(workspace, trial):
-            found.append(
-                f"{said}. Earlier runs, whose logs were read in the same way, are in time, so its "
-                f"program seems to act on states that are {by} old: pass the latest sample to the "
-                f"runner, `discard {trial.id}` and run {trial.candidate} again. As it is, the run "
-                f"may be judged from {by} too early"
-            )
-        else:
-            found.append(
-                f"{said}: they seem to be logged {by} {'late' if sooner else 'early'}. Log each "
-                f"command at the time it is sent; if it is, [log.span] start is {by} too "
-                f"{'early' if sooner else 'late'}"
-            )
+        by = count(abs(ran.late), "step")
+        found.append(
+            f"the inputs fit the policy better when shifted by {by}: they seem to be logged {by} "
+            f"{'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
+            f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
+        )
     return tuple(found)
-
-
-def _in_time(workspace: Folder, trial: Trial) -> bool:
-    """Check whether the latest earlier runs sent what their candidates send, and none was late."""
-    earlier = [one for one in workspace.task_trials(measured=True) if one.id != trial.id]
-    fits = [
-        follows(workspace.candidate(one.candidate)[0].policy, one, latest(workspace.task))
-        for one in earlier[-LATEST:]
-        if one.candidate
-    ]
-    alike = [fit for fit in fits if fit is not None and fit.alike]
-    return bool(alike) and not any(fit.late and fit.moved < UNLIKE for fit in alike)
 
 
 def _first_bad(trial: Trial) -> tuple[str, int]:
