@@ -19,9 +19,14 @@ def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     return {} if found is None else dict(found(a, p))
 
 
+def part_of(steps: Any) -> Any:
+    """Return by how much a delay of some steps is longer than whole ones, 0 to 1."""
+    return np.maximum(steps - np.floor(steps + 1e-9), 0.0)
+
+
 def shifted(signal: Array, held: Array, steps: float) -> Array:
     """Delay a zero-order-hold signal (S, T) by any number of steps; return its mean over each."""
-    now, before, part = _both(signal, held, steps)
+    (now, before), part = _both(signal, held, steps), float(part_of(steps))
     return (1 - part) * now + part * before
 
 
@@ -53,24 +58,24 @@ def shifted_within(sent: Sent, steps: float) -> tuple[Array, Array]:
     one, which `sent.early` has. With means of whole steps instead, the delay of a lag's output acts
     as a further lag, and the lag itself was estimated short by p (1 - p) dt^2 / (2 tau).
     """
-    p = steps - np.floor(steps + 1e-9)
+    p = float(part_of(steps))
     q = 1 - p
     first, own = q * sent.early, 0.5 * p * q * sent.held  # integrals, in steps
     moment = q * q * sent.early_lead + 0.5 * p * first
-    now, before, _ = _both(first, q * sent.held, steps)
-    moment_now, moment_before, _ = _both(moment, own, steps)
-    _, mean_before, _ = _both(sent.mean, sent.held, steps)
-    _, lead_before, _ = _both(sent.lead, 0 * sent.held, steps)
+    now, before = _both(first, q * sent.held, steps)
+    moment_now, moment_before = _both(moment, own, steps)
+    _, mean_before = _both(sent.mean, sent.held, steps)
+    _, lead_before = _both(sent.lead, 0 * sent.held, steps)
     rest = mean_before - before
     return now + rest, moment_now - p * now + lead_before - moment_before + q * rest
 
 
-def _both(signal: Array, held: Array, steps: float) -> tuple[Array, Array, float]:
-    """Return a signal (S, T) after the whole steps of a delay, after one more, and the rest."""
+def _both(signal: Array, held: Array, steps: float) -> tuple[Array, Array]:
+    """Return a signal (S, T) after the whole steps of a delay, and after one more."""
     whole = int(np.floor(steps + 1e-9))
     line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
     T = signal.shape[1]
-    return line[:, 1 : T + 1], line[:, :T], max(0.0, steps - whole)
+    return line[:, 1 : T + 1], line[:, :T]
 
 
 def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:

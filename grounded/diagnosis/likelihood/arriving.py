@@ -13,7 +13,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
-from grounded.effects.memory import Sent, settled, shifted, shifted_within
+from grounded.effects.memory import Sent, part_of, settled, shifted, shifted_within
 from grounded.frozen import Array
 
 WHOLE = 1e-9  # steps by which a latency may differ from a whole number
@@ -58,7 +58,7 @@ def delayed(acting: Acting, data: Data) -> Array | None:
         return None
     late = [np.asarray(_late(acting, data, j)) / data.dt for j in range(data.model.m)]
     steps = np.stack(np.broadcast_arrays(*late), axis=-1)
-    return np.asarray(np.maximum(steps - np.floor(steps + WHOLE), 0.0))
+    return np.asarray(part_of(steps))
 
 
 def _late(acting: Acting, data: Data, j: int) -> float:
@@ -75,12 +75,12 @@ def _sent_on(acting: Acting, data: Data, j: int, steps: float = 0.0) -> Sent:
 
     steps: the delay to come, which the first part of each step (`Sent.early`) leaves in this step.
     """
-    name, part = data.model.input_names[j], 1 - (steps - np.floor(steps + WHOLE))
+    name, part = data.model.input_names[j], 1 - float(part_of(steps))
     u, held = data.commands[data.used, :, j], data.held[data.used, j]
     sent = Sent(u, held, np.zeros_like(u), u, np.zeros_like(u))
     for effect, values in acting:
         if effect.family.name != "delay" and name in effect.site.targets:
-            sent = _transformed(effect, values, sent, data.dt, float(part))
+            sent = _transformed(effect, values, sent, data.dt, part)
     return sent
 
 

@@ -236,7 +236,7 @@ def recognised(
                 f"{ran}, {shown}. Mend that and run {ran} again",
                 NextCommand("next", ("LOG",)),
             )
-        if shown := sent_scaled(workspace, units, by):
+        if by != -1 and (shown := sent_scaled(workspace, units, by)):
             raise GroundedError(
                 f"{path} ran {ran}, but {shown}. Mend that and run {ran} again",
                 NextCommand("next", ("LOG",)),
