@@ -85,12 +85,13 @@ def judged(
             model,
         ):
             losses += 1
+            most, once = losses + options.repeats, options.repeats + 1
             if (
                 options.rerun_incumbent
                 and not (spent or exact)
-                and in_doubt(task, incumbent, tried, history, losses + options.repeats)
+                and in_doubt(task, incumbent, tried, history, most, once)
             ):
-                again = to_settle(incumbent, tried, losses + options.repeats)
+                again = to_settle(incumbent, tried, most, once)
                 name = again.candidate.id if again else ""
                 tried = replace(tried, accepted=None, in_doubt=True, to_settle=name)
         history.append(tried)
@@ -131,19 +132,20 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
 
 
 def in_doubt(
-    task: Task, incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int
+    task: Task, incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int, once: int = 2
 ) -> bool:
     """Return whether a loss may be due to a lucky trial of the incumbent, or to other start states.
 
     What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would
     block every further step. So after a loss within two standard errors the incumbent is run again,
-    until it has `most` trials: one for each loss. Without repeats at a similar utility, the
-    standard deviation is taken as half of the utility, as for chi-squared with eight degrees of
-    freedom; a loss of more than 1.4 times the best cost is then accepted at once, and one of more
-    than 0.7 times if it is of another kind (`another_kind`).
+    until it has `most` trials: one for each loss; a loser whose starts explain it is, until it has
+    `once`. Without repeats at a similar utility, the standard deviation is taken as half of the
+    utility, as for chi-squared with eight degrees of freedom; a loss of more than 1.4 times the
+    best cost is then accepted at once, and one of more than 0.7 times if it is of another kind
+    (`another_kind`).
     On a deterministic system this costs one trial per incumbent.
     """
-    if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most) is None:
+    if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most, once) is None:
         return False
     scatter = Repeats((*history, loser)).near(incumbent.utility)
     each = math.sqrt(scatter.variance) if scatter.known else 0.5 * abs(incumbent.utility)
@@ -154,17 +156,18 @@ def in_doubt(
     return not loss > 2 * error
 
 
-def to_settle(incumbent: Tried, loser: Tried, most: int) -> Tried | None:
+def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried | None:
     """Return which of two candidates to run again after a loss; None if that was done enough.
 
     It is the incumbent, which may have been lucky, but the one whose starts matter more if start
-    states explain the loss. Neither is run again that has `most` trials.
+    states explain the loss. An incumbent is not run again that has `most` trials, nor a loser that
+    has `once`: where a robot can't be placed more exactly, a further run begins no nearer.
     """
-    either = [incumbent]
+    either = [(incumbent, most)]
     if loser.starts is not None and loser.excused(incumbent):
-        either, cost = [loser, incumbent], loser.starts.cost
-        either.sort(key=lambda one: -abs(cost(one)))
-    return next((one for one in either if len(one.trials) < most), None)
+        either, cost = [(loser, min(once, most)), (incumbent, most)], loser.starts.cost
+        either.sort(key=lambda one: -abs(cost(one[0])))
+    return next((one for one, runs in either if len(one.trials) < runs), None)
 
 
 def another_kind(task: Task, incumbent: Tried, loser: Tried) -> bool:

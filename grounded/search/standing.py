@@ -454,7 +454,7 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
         elif Repeats(now.history).near(now.incumbent.utility).known:
             lost += " by no more than noise may explain"
         else:
-            lost += ", but none as good ran twice, so how much runs differ is not known"
+            lost += ", but none as good ran twice, so how much such runs differ is not known"
         sentence = f"{lost}: {made.id} is waiting for another trial{from_start}"
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)

@@ -220,7 +220,7 @@ RUNS = {
         lambda s, u: (s, u * 0 + 9.0),
         ["force in the log is up to 4 outside its [limits]"],
     ),
-    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["logged 1 step late"]),
+    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["logged 1 step (50 ms) late"]),
     "longer": (
         lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])),
         ["continues for 3 steps after the horizon of 40"],

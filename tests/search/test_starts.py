@@ -115,6 +115,7 @@ def test_the_candidate_whose_start_matters_more_is_run_again(story):
     assert to_settle(best, doubt, 2) is doubt and to_settle(best, doubt, 1) is None
     twice = replace(doubt, trials=doubt.trials * 2, utilities=doubt.utilities * 2)
     assert to_settle(best, twice, 2) is best
+    assert to_settle(best, twice, 9) is best  # where starts scatter, it was asked for without end
     policy = doubt.candidate.policy
     assert worth_of_start(PLANNER, policy, OFF) < 0 == worth_of_start(PLANNER, policy, 0 * OFF)
 

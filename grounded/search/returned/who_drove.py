@@ -52,6 +52,7 @@ class Following:
     until_s: float  # the commands are alike up to this time [s]
     opens: bool  # they are alike until then, at least `LEAST` steps, not only at their limits
     late: int  # steps by which the log is late
+    age: float  # of the states that it acted on, where its commands are logged [steps]
     moved: float  # squared difference at `late`, relative to that without shift
     foreign: bool  # that input differs by about as much as unrelated commands do
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
@@ -120,6 +121,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         until_s=float(left) * policy.dt if sane else 0.0,
         opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
         late=late,
+        age=late + BACK[back],
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
         foreign=bool(off[:, j].mean() > FOREIGN * unrelated[j]),
         off=apart,

@@ -342,17 +342,19 @@ def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_p
     assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)
 
 
-def driven_by(w, path, action, noise=1e-3, late=0, pull=1.0):
+def driven_by(w, path, action, noise=1e-3, late=0, pull=1.0, shown=0):
     """Write the log of a run whose program sends action(k, the states as they are logged, now).
 
-    pull: of the real robot's drives, relative to the model's.
+    pull: of the real robot's drives, relative to the model's. shown: steps by which commands are
+    logged late.
     """
-    model, x, rows, past = w.base_model, w.task.start.copy(), [], []
+    model, x, rows, past, sent = w.base_model, w.task.start.copy(), [], [], []
     for k in range(w.task.horizon):
         past.append(x + RNG.normal(0, noise, 3))
         logged = past[max(0, k - late)]
         u = action(k, logged, past[k])
-        rows.append([k * w.task.dt, *logged, *u])
+        sent.append(u)
+        rows.append([k * w.task.dt, *logged, *(sent[k - shown] if k >= shown else 0 * u)])
         x = model.system.step(x[None], pull * u[None], model.values, w.task.dt)[0]
     np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
     return w.ingest(path)
@@ -437,6 +439,45 @@ def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w,
     told = "its program sends port 1.43 times too small", "earlier runs", "run c0002 again"
     assert holds(str(refused.value), *told, "if it is the log that changed since")
     assert refused.value.then == NextCommand("next", ("LOG",))
+
+
+@pytest.mark.parametrize(("fault", "by"), [("", 0), ("program", 1), ("program", 2), ("log", 1)])
+def test_commands_that_are_sent_late_are_told_from_a_log_that_has_them_late(w, tmp_path, fault, by):
+    """`Logged 1 step late`, said of a program that passed the sample of a step before: it counted.
+
+    By the commands alone they are one; the robot moves with those of a truthful log.
+    """
+    dt = w.task.dt
+
+    def run(by, fault):
+        plan, seen = w.propose().candidate, list[np.ndarray]()
+        runner, path = Runner(plan.policy), tmp_path / f"{plan.id}.csv"
+        was = by if fault == "program" else 0
+
+        def action(k, logged, now):
+            seen.append(logged)
+            return runner.action(max(0, k - was) * dt, seen[max(0, k - was)])
+
+        shown = by if fault == "log" else 0
+        return plan.id, driven_by(w, path, action, pull=0.8, shown=shown)
+
+    _, found = run(by, fault)
+    told = [one for one in found.warnings if "ms) late" in one]
+    assert len(told) == (by > 0) and found.then.verb != "discard"  # no run to compare it with
+    assert all(holds(one, "its program sent", "log") for one in told) or fault == "log"
+    w.discard(found.trial)
+    _, found = run(0, "")
+    name, found = run(by, fault)
+    told = [one for one in found.warnings if "ms) late" in one]
+    assert len(told) == (by > 0) and (found.then.verb == "discard") == (fault == "program")
+    steps = "1 step (50 ms)" if by == 1 else f"{by} steps ({50 * by} ms)"
+    if fault == "program":
+        assert holds(told[0], f"sent the commands of {name} {steps} late", f"run {name} again")
+        assert "[log.span]" not in told[0] and not found.faults
+        status = grounded("-C", w.folder, "status").out.replace("\\\n", " ")
+        assert f"discard {found.trial}" in " ".join(status.split())
+    elif fault == "log":
+        assert holds(told[0], f"logged {steps} late", "[log.span]") and not found.notes
 
 
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])

@@ -50,9 +50,8 @@ from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, 
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.log_faults import (
-    log_faults,
-)
+from grounded_trials.workspace.intake.remarks.lagging import lagging
+from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.intake.remarks.trial_check import warnings_about
 from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
@@ -160,7 +159,10 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
     other = "" if read.doubted else ran_otherwise(workspace, trial)
-    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled, late=not other)
+    lag = lagging(workspace, interpolate_gaps(trial).trial) if trial.candidate else None
+    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
+    if lag and not other:
+        checked = (*checked, lag.told())
     counts = elsewhere is not None and not elsewhere.again  # as the words say
     begun = [elsewhere.told] if elsewhere and not (counts and (read.aside or odd)) else []
     warnings = (*read.warnings, *odd, *begun, *checked)
@@ -221,7 +223,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         crashed=tried.failed if tried and verdict == "crashed" else (),
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
-            *filter(None, [*read.notes, *(() if odd or wrong else read.aged), told]),
+            *filter(None, [*read.notes, *(() if odd or wrong or lag else read.aged), told]),
             *(no_longer(workspace, added.id, now) if now and not added.known else ()),
             *(
                 odd_run(workspace, now, added.id, aside=bool(read.aside))

@@ -31,6 +31,7 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.remarks.lagging import lagging
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 UNSENT = 5  # steps without a command that are fewer are sought where the run begins
@@ -58,6 +59,8 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> str:
         return told
     if found := smoothed(workspace.base_model, own, whole):
         return f"its commands are {found.told(own)}, and run {own.id} again"
+    if (lag := lagging(workspace, whole)) and lag.again:
+        return lag.told()
     return _predicted_ahead(workspace, own, whole)
 
 

@@ -108,10 +108,13 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usually_so, *tolerated))
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
     if repeats:
-        why = "The run counts; for where its other runs began,"
+        why = "where its runs began explains"
         if lost > 0:
-            why = "By the model that explains much of what it lost:"
-        does = f"{why} {trial.candidate} is to be run again. Place the robot nearer to the start"
+            why = "that explains"
+        does = (
+            f"The run counts; by the model {why} much of what {trial.candidate} lost, so it is to "
+            "be run once more. Place the robot nearer to the start"
+        )
     elif usually_so:
         usually = listed(
             f"{with_unit(f'{placed.rms[i]:.2g}', list(task.model.states.values())[i])} in "

@@ -12,13 +12,11 @@ import numpy as np
 
 from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import count, with_unit
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 
-LATEST = 3  # largest number of steps by which late inputs are reported
 FLIP = "its scale in [log] is negative, so multiply these limits by -1 too, if they are of the log"
 WIDEN = "no plan will use that; widen them if the robot can take it"
 
@@ -29,7 +27,6 @@ def warnings_about(
     last_s: float = float("nan"),
     fell: bool = False,
     scaled: Sequence[str] = (),
-    late: bool = True,
 ) -> tuple[str, ...]:
     """Return warnings on gaps, an early end, a start far from s_0, and exceeded bounds.
 
@@ -40,7 +37,6 @@ def warnings_about(
             control grid.
         fell: whether it was already reported that the run failed where the trial ends.
         scaled: inputs for which another unit was already reported.
-        late: whether commands may be logged late; what was already reported may look like that.
     """
     task = workspace.task
     filled = interpolate_gaps(trial)
@@ -76,14 +72,6 @@ def warnings_about(
     candidate, _ = workspace.candidate(trial.candidate)
     found += _still(whole) if np.ptp(candidate.predicted_states, axis=0).any() else []
     found += [] if fell else _unsafe(task, whole, candidate)
-    ran = follows(candidate.policy, whole, max(LATEST, latest(task))) if late else None
-    if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
-        by = count(abs(ran.late), "step")
-        found.append(
-            f"the inputs fit the policy better when shifted by {by}: they seem to be logged {by} "
-            f"{'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
-            f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
-        )
     return tuple(found)
 
 

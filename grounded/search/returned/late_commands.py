@@ -1,0 +1,97 @@
+"""Tell a program that sends its commands late from a log that has them late, by the robot's motion.
+
+A program that passes its policy the state and the time of some steps ago sends what was due then.
+A log that stamps commands late has the same numbers. But the robot moves by what it was sent: in
+the first case its motion follows the commands in the log as it does in every run, in the second it
+leads them by that time. How far motion usually follows commands is not known from a crude model,
+which may lack a delay, but from earlier runs whose commands were in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import Enum
+
+import numpy as np
+
+from grounded.instruments.predictions.short_runs import Ahead
+from grounded.search.planner import Planner
+from grounded.trial import Trial
+
+STARTS = 80  # samples to predict from
+BEYOND = 1, 6  # steps beyond the lead or lag in question that are tried: a delay may be missing
+CLEAR = 0.2  # [nats] by which one explanation must predict the run better than the other
+NEAR = 0.35  # of the lag: how near the motion must be to what an explanation expects
+
+
+class Late(Enum):
+    """What is late where the commands of a log lag those of its policy."""
+
+    PROGRAM = "program"
+    LOG = "log"
+    EITHER = "either"
+
+
+def what_is_late(planner: Planner, trial: Trial, late: int, before: Sequence[Trial]) -> Late:
+    """Return whether a run's commands were sent late or logged late.
+
+    Args:
+        planner: plans with the model, and the effects adopted.
+        trial: a run without gaps, whose commands are those of its policy `late` steps before.
+        late: [steps], > 0.
+        before: earlier runs, whose commands were in time.
+    """
+    now = Shifted(planner, trial, late)
+    if (own := now.best) is None:
+        return Late.EITHER
+    known = [by for one in before if (by := Shifted(planner, one, late).best) is not None]
+    usual = float(np.median(known)) if known else 0.0
+    clear, leads = now.missed(usual - late) - now.missed(usual), usual - own
+    if leads > (1 - NEAR) * late and clear < -CLEAR:  # a cause comes before its effect
+        return Late.LOG
+    # without earlier runs the rest may be a delay that no model has yet
+    return Late.PROGRAM if known and abs(leads) < NEAR * late and clear > CLEAR else Late.EITHER
+
+
+class Shifted:
+    """How well the model predicts a run with its commands moved by some steps.
+
+    Args:
+        planner: plans with the model, and the effects adopted.
+        trial: a run without gaps.
+        most: the largest lead or lag of interest [steps].
+    """
+
+    def __init__(self, planner: Planner, trial: Trial, most: int) -> None:
+        whole = trial.until(max(trial.finite_steps, 0))
+        self.shifts = np.arange(-most - BEYOND[0], most + BEYOND[1] + 1)
+        with np.errstate(all="ignore"):
+            self.scores = np.array([_missed(planner, whole, shift) for shift in self.shifts])
+
+    @property
+    def best(self) -> float | None:
+        """By how many steps the motion follows the commands, beyond the model's delays.
+
+        Negative if it leads; None if the run does not tell.
+        """
+        if not np.isfinite(self.scores).all():
+            return None
+        k = int(np.argmin(self.scores))
+        if not 0 < k < len(self.scores) - 1:
+            return None
+        left, least, right = self.scores[k - 1 : k + 2]
+        return float(self.shifts[k] + 0.5 * (left - right) / max(left - 2 * least + right, 1e-12))
+
+    def missed(self, shift: float) -> float:
+        """Return the errors of predictions with commands moved later by `shift` steps [nats]."""
+        return float(np.interp(shift, self.shifts, self.scores))
+
+
+def _missed(planner: Planner, trial: Trial, shift: int) -> float:
+    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps."""
+    at = np.clip(np.arange(len(trial.inputs)) - shift, 0, len(trial.inputs) - 1)
+    moved = planner.lift(replace(trial, inputs=trial.inputs[at]))
+    own = range(planner.task.model.n)
+    ahead = Ahead(planner.plan.model, moved, own, STARTS, (0.0,))
+    return ahead.best([np.ones(planner.plan.model.m)]).score if ahead.enough else float("nan")
