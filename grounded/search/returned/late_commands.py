@@ -67,7 +67,7 @@ class Shifted:
         whole = trial.until(max(trial.finite_steps, 0))
         self.shifts = np.arange(-most - BEYOND[0], most + BEYOND[1] + 1)
         with np.errstate(all="ignore"):
-            self.scores = np.array([_missed(planner, whole, shift) for shift in self.shifts])
+            self.scores = np.array([_missed(planner, whole, int(shift)) for shift in self.shifts])
 
     @property
     def best(self) -> float | None:
