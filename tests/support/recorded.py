@@ -26,16 +26,18 @@ def record(
     noise=(0.002, 0.01),
     differs=0,
     turned=False,
+    stale=0,
 ):
     """Run a policy on the model against a load, and log everything as a table.
 
     `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
     `differs`: rows over which the program differentiates x, in place of the speed. `turned`: the
-    motor is wired the wrong way round.
+    motor is wired the wrong way round. `stale`: steps by which the program passes an older sample,
+    with its time.
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
-    past = []
+    past, acted = [], []
     every, begin = round(dt * rate), round(before * rate)
     end = begin + every * policy.horizon if until is None else begin + round(until * rate)
     last = end + round(after * rate) if until is None else end
@@ -47,7 +49,9 @@ def record(
             felt[1] = (past[k] - past[max(0, k - differs)]) * rate / differs
         step, part = divmod(k - begin, every)
         if 0 <= step < policy.horizon and part == 0:
-            force = float(follow(policy, step, felt, sent)[0])
+            acted.append(felt)
+            then = max(0, step - stale)
+            force = float(follow(policy, then, acted[then], sent)[0])
         if step >= policy.horizon:
             force = 0.0
         if k < begin:

@@ -141,6 +141,7 @@ class Ahead:
         delays: command delays tried [s].
         linear: also remove errors that are linear in the initial states.
         constant: remove a constant rate of each state.
+        horizon: how far ahead is predicted [s].
     """
 
     def __init__(
@@ -153,9 +154,10 @@ class Ahead:
         *,
         linear: bool = False,
         constant: bool = True,
+        horizon: float = AHEAD,
     ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
-        self.steps = max(1, round(AHEAD / trial.dt))
+        self.steps = max(1, round(horizon / trial.dt))
         self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
         logged = starts_from(model, trial, self.shown)
         good = np.asarray(np.isfinite(logged).all(axis=1))

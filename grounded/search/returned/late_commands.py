@@ -22,6 +22,8 @@ from grounded.trial import Trial
 STARTS = 80  # samples to predict from
 BEYOND = 1, 6  # steps beyond the lead or lag in question that are tried: a delay may be missing
 CLEAR = 0.2  # [nats] by which one explanation must predict the run better than the other
+AHEAD = 0.25, 0.5, 1.0  # [s] of the predictions; over a single one, a swing may fit a period late
+BESIDE = 1  # steps about the best shift in which another that is as good is the same
 NEAR = 0.35  # of the lag: how near the motion must be to what an explanation expects
 
 
@@ -51,7 +53,7 @@ def what_is_late(planner: Planner, trial: Trial, late: int, before: Sequence[Tri
     if leads > (1 - NEAR) * late and clear < -CLEAR:  # a cause comes before its effect
         return Late.LOG
     # without earlier runs the rest may be a delay that no model has yet
-    return Late.PROGRAM if known and abs(leads) < NEAR * late and clear > CLEAR else Late.EITHER
+    return Late.PROGRAM if known and leads < NEAR * late and clear > CLEAR else Late.EITHER
 
 
 class Shifted:
@@ -73,12 +75,14 @@ class Shifted:
     def best(self) -> float | None:
         """By how many steps the motion follows the commands, beyond the model's delays.
 
-        Negative if it leads; None if the run does not tell.
+        Negative if it leads; None if the run does not tell, since another shift fits as well.
         """
         if not np.isfinite(self.scores).all():
             return None
         k = int(np.argmin(self.scores))
-        if not 0 < k < len(self.scores) - 1:
+        others = np.abs(self.shifts - self.shifts[k]) > BESIDE
+        rival = self.scores[others].min() < self.scores[k] + CLEAR
+        if rival or not 0 < k < len(self.scores) - 1:
             return None
         left, least, right = self.scores[k - 1 : k + 2]
         return float(self.shifts[k] + 0.5 * (left - right) / max(left - 2 * least + right, 1e-12))
@@ -89,9 +93,20 @@ class Shifted:
 
 
 def _missed(planner: Planner, trial: Trial, shift: int) -> float:
-    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps."""
+    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps.
+
+    The mean over predictions of several lengths, of those that the run has.
+    """
+    from grounded.effects.memory import shifted
+
+    assert planner.plan.latency is not None
     at = np.clip(np.arange(len(trial.inputs)) - shift, 0, len(trial.inputs) - 1)
     moved = planner.lift(replace(trial, inputs=trial.inputs[at]))
-    own = range(planner.task.model.n)
-    ahead = Ahead(planner.plan.model, moved, own, STARTS, (0.0,))
-    return ahead.best([np.ones(planner.plan.model.m)]).score if ahead.enough else float("nan")
+    late = planner.plan.latency / trial.dt
+    sent = zip(moved.inputs.T[:, None], moved.inputs[0], late, strict=True)
+    arrives = np.vstack([shifted(u, np.array([held]), by) for u, held, by in sent]).T
+    model, own = planner.plan.model, range(planner.task.model.n)
+    acts = replace(moved, inputs=arrives)
+    each = [Ahead(model, acts, own, STARTS, (0.0,), horizon=one) for one in AHEAD]
+    scores = [one.best([np.ones(model.m)]).score for one in each if one.enough]
+    return float(np.mean(scores)) if scores else float("nan")

@@ -18,6 +18,7 @@ from grounded.search.returned.who_drove import (
 from grounded.task import Task
 from grounded.trial import interpolate_gaps
 from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell
+from grounded_trials.workspace.intake.locating.late_start import late_start
 from grounded_trials.workspace.intake.locating.missed_steps import not_sent
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.reading import Read, cut_log
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
+STEP_OLD = 0.4  # of a step: commands on older samples may as well be late ones
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
@@ -62,14 +64,20 @@ class Look:
         if log and read.log and self.log:
             start_of = cache(partial(_start_of, self.log))
             self.found = found = start_of(own)
-            if found and elsewhere(self.log, found, own.policy, seen.why):
-                self._cut(read.log, apart, found, own, task)
-                seen = judged(self.whole)
             sender = sender_of(self.log, own, candidates, start_of)
             self.exact = sender.own is not None and sender.own.exact
             if sender.own is not None and sender.sure:
                 self.old = sender.own.old
-            if sender.sure:
+            behind = _behind(self.log, own.policy, found, self.old)
+            if behind:
+                self.found, self.exact, self.old = behind, True, None
+                if abs(behind.seconds - self.log.first) > ALIGNED * self.log.interval:
+                    self._cut(read.log, apart, behind, own, task)
+                seen = judged(self.whole)
+            elif found and elsewhere(self.log, found, own.policy, seen.why):
+                self._cut(read.log, apart, found, own, task)
+                seen = judged(self.whole)
+            if behind or sender.sure:
                 seen = replace(seen, why="", other="")
             elif sender.other:
                 seen = replace(seen, why=sender.why, other=sender.other)
@@ -130,6 +138,30 @@ class Look:
 def _start_of(log: Recording, candidate: Candidate) -> Start | None:
     """Return where a candidate's run seems to begin in a log."""
     return log.start_of(candidate.policy)
+
+
+def _behind(log: Recording, policy: Policy, found: Start | None, old: Array | None) -> Start | None:
+    """Return where a run begins whose commands are some steps late, or None.
+
+    The same commands are exact a step later, too, on samples that were a step old; but there the
+    program had sent something before its first step.
+
+    Args:
+        log: the log.
+        policy: the candidate's.
+        found: the start that fits best with commands in time.
+        old: ages of the samples [s] with which the commands are exact there; None if they are not.
+    """
+    if old is not None and not (old.size and old.max() > STEP_OLD * log.dt):
+        return None
+    late = late_start(log, policy, found)
+    if late is None or old is None or found is None:
+        return late
+    near = ALIGNED * log.interval
+    here, there = (
+        any(abs(at - one.seconds) < near for at in log.openings) for one in (late, found)
+    )
+    return late if here and not there else None
 
 
 def _other_speeds(ran: str, guessed: Sequence[str]) -> str:

@@ -438,9 +438,9 @@ def _misused(path: Path, own: Candidate, told: str) -> GroundedError:
     """Return the error that the robot's program misused its candidate, with the remedy."""
     return GroundedError(
         f"{path} did not run {own.id} as it should: its commands are not what {own.id} sends "
-        f"on the logged states and times; {told}, and run {own.id} again. Ingest it with "
-        "--data for fitting and diagnosis",
-        NextCommand("ingest", (str(path), "--data")),
+        f"on the logged states and times; {told}, and run {own.id} again. This log serves fitting "
+        f"and diagnosis: `ingest --data {path}`",
+        NextCommand("next", ("LOG",)),
     )
 
 
