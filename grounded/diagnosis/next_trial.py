@@ -67,13 +67,14 @@ def next_trial(
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
-    if groups and groups[0] in same and not (worse or ended or flip):
+    separable = [group for group in groups if group not in same]
+    if groups and not separable and not (worse or ended or flip):
         own = next((name for name in groups[0] if name in claims.names), groups[0][0])
         return f"No trial helps: {told_apart(groups[0], same)}, so adopt the claimed one, {own}."
-    if groups and groups[0] not in same:
-        made = f"A trial designed for it may tell {tied(groups[0])}."
+    if separable:
+        made = f"A trial designed for it may tell {tied(separable[0])}."
         turns = bool(places.plane(claims.data.model))
-        return " ".join([made, *distinguishing(groups[0], turns=turns)])
+        return " ".join([made, *distinguishing(separable[0], turns=turns)])
     if seen:
         one = seen[0]
         if one.repeats:

@@ -230,6 +230,7 @@ class Tried(Result):
     noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
     repeats: int = 0  # runs beyond the first of each candidate on which that rests
+    placed: bool = False  # whether where runs began is most of what they scatter by
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
@@ -267,9 +268,10 @@ class Tried(Result):
         """Whether its runs scatter by about as much as they cost.
 
         Noise in many samples scatters far less than it costs. So something else decides how a run
-        goes, such as where dry friction holds, and another policy may well be steadier.
+        goes, such as where dry friction holds, and another policy may well be steadier; where runs
+        scatter by where they began, none is.
         """
-        return bool(self.deviation > UNSTEADY * abs(self.utility))
+        return bool(self.deviation > UNSTEADY * abs(self.utility)) and not self.placed
 
     @cached_property
     def standard_error(self) -> float:

@@ -336,8 +336,8 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> str:
     stop = f". If that is too many, stop with {own}" * (not made.doubtful)  # else `doubt` says it
     if best.is_unsteady:
         stop = (
-            f". But runs of {own} scatter by about as much as they cost, and {made.id} may be "
-            "steadier, which its first runs would show"
+            f". But runs as good as {own} scatter by about as much as they cost, and {made.id} may "
+            "be steadier, which its first runs would show"
         )
     return (
         f"{made.id} promises {gain:.2g} over {own}, less than its trial can show: the utilities of "

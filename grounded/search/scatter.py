@@ -37,6 +37,7 @@ from grounded.trial import Trial
 PIECES = 4  # parts of a run
 LATEST, ROWS = 9, 10_000  # trials from which the noise of the sensors is estimated; rows of each
 HUGE = 1e100  # bound on the noise of a diverged run, in the state's unit
+LEFT = 0.5  # share of the variance of repeats that starts may leave if they are most of it
 FAR = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 
 
@@ -220,12 +221,24 @@ class Repeats:
 
 def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
     """Return the candidates, each with the standard deviation of a run of similar utility."""
-    near = Repeats(history).near
+    near, placed = Repeats(history).near, by_starts(history)
     each = [(tried, near(tried.utility)) for tried in history]
     return tuple(
-        replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats)
+        replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats, placed=placed)
         for tried, found in each
     )
+
+
+def by_starts(history: Sequence[Tried]) -> bool:
+    """Return whether where runs began is most of what repeats scatter by, as the model tells."""
+    whole = left = 0.0
+    for tried in history:
+        if _repeated(tried) and tried.starts is not None:
+            costs, worth = tried.starts.costs(tried), np.array(tried.utilities)
+            if np.isfinite(costs).all():
+                whole += float(np.var(worth)) * len(worth)
+                left += float(np.var(worth + costs)) * len(worth)
+    return left < LEFT * whole
 
 
 def _repeated(tried: Tried) -> bool:

@@ -57,7 +57,11 @@ class Starts:
 
         It is NaN if a run fails in the model, or if a start would cost more than the whole run did.
         """
-        return float(np.mean([self._of(tried, k) for k in range(len(tried.trials))]))
+        return float(np.mean(self.costs(tried)))
+
+    def costs(self, tried: Tried) -> Array:
+        """Return what the start of each of a candidate's runs cost, (runs,), see `cost`."""
+        return np.array([self._of(tried, k) for k in range(len(tried.trials))])
 
     def _of(self, tried: Tried, k: int) -> float:
         key = (tried.candidate.id, k)

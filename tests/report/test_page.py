@@ -190,10 +190,11 @@ def test_a_gain_that_scatter_may_explain_is_headed_perhaps(car):
         return page(replace(findings, standing=replace(now, history=unsure, incumbent=unsure[1])))
 
     likelier_worse = page_of((-9.9, -10.7), (-10.0, -11.0))
-    told = r"<h2>What the runs changed \(an improvement with probability 0\.[34]\d\)</h2>"
+    better = r"\(c\d{4} is better than c0001 with probability"
+    told = rf"<h2>What the runs changed {better} 0\.[34]\d\)</h2>"
     assert re.search(told, likelier_worse)
     text = page_of((-10.0, -11.0), (-9.9, -10.7))
-    assert re.search(r"<h2>What perhaps improved \(probability 0\.[67]\d\)</h2>", text)
+    assert re.search(rf"<h2>What perhaps improved {better} 0\.[67]\d\)</h2>", text)
     assert ": the scatter of repeats may explain the difference" in text
     assert "cost reduced" not in text and "cost raised" not in text
     assert "bias in 1 s, c0" in text and "bias per s" not in text  # its column is in rad, not rad/s

@@ -138,7 +138,7 @@ def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
     assert runs_to_show(0.05, promising(0.05)[1]) == 22
     assert holds(beyond_one_trial(*promising(0.01)), "more than 50 runs")
     unsteady = beyond_one_trial(*promising(0.05, deviation=0.6))
-    assert holds(unsteady, "runs of c scatter by about as much as they cost", "steadier")
+    assert holds(unsteady, "runs as good as c scatter by about as much as they cost", "steadier")
     assert "stop with" not in unsteady
     error = 0.1 * (2 / 22) ** 0.5  # of the difference of two means
     assert norm.cdf(0.05 / error) == pytest.approx(0.95, abs=0.01)

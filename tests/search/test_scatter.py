@@ -16,6 +16,7 @@ from grounded.search.scatter import (
     PIECES,
     Repeats,
     by_pieces,
+    by_starts,
     noise_cost,
     noise_missed,
     sensor_noise,
@@ -238,3 +239,14 @@ def test_the_noise_of_a_trial_is_found_once():
     assert trial.noise() is trial.noise(1000) is not trial.noise(20) is trial.noise(20)
     other = replace(trial, states=2 * log)
     np.testing.assert_array_equal(other.noise(), resampled_noise(2 * log))
+
+
+def test_runs_that_scatter_by_where_they_began_are_none_that_another_policy_steadies():
+    """ "More than 50 runs would show the gain", and the next was handed out: it may be steadier."""
+    worth, costs = (-2.1, -1.8, -4.2), np.array([0.3, 0.0, 2.6])
+    for explained, placed in ((costs, True), (0.1 * costs, False), (np.array([np.nan] * 3), False)):
+        starts = SimpleNamespace(costs=lambda _, e=explained: e)
+        made = SimpleNamespace(id="c0001", base="")
+        (one,) = with_errors([Tried(made, (None,) * 3, worth, True, starts=starts)])
+        assert one.placed == placed and by_starts([one]) == placed
+        assert replace(one, deviation=2.0).is_unsteady == (not placed)

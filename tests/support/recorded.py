@@ -27,13 +27,14 @@ def record(
     differs=0,
     turned=False,
     stale=0,
+    ahead=0,
 ):
     """Run a policy on the model against a load, and log everything as a table.
 
     `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
     `differs`: rows over which the program differentiates x, in place of the speed. `turned`: the
     motor is wired the wrong way round. `stale`: steps by which the program passes an older sample,
-    with its time.
+    with its time. `ahead`: steps by which the program's clock ran before the run.
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -51,8 +52,9 @@ def record(
         if 0 <= step < policy.horizon and part == 0:
             acted.append(felt)
             then = max(0, step - stale)
-            force = float(follow(policy, then, acted[then], sent)[0])
-        if step >= policy.horizon:
+            if then + ahead < policy.horizon:
+                force = float(follow(policy, then + ahead, acted[then], sent)[0])
+        if step + ahead >= policy.horizon:
             force = 0.0
         if k < begin:
             force = jog * np.sin(k / rate * 4) if k < 0.4 * begin else 0.0

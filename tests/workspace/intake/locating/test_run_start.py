@@ -291,6 +291,22 @@ def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, befo
     assert found.candidate == "c0002" and begun == pytest.approx(before, abs=0.2 / RATE)
 
 
+@pytest.mark.parametrize(("before", "since"), [(0.5, "the log began"), (2.0, "it was started")])
+def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(
+    w, tmp_path, before, since
+):
+    """Somebody drove, it said, or states in other units; and the clock only with --candidate."""
+    policy = w.candidate("c0002")[0].policy
+    log = record(w, tmp_path / "a.csv", policy, before, ahead=10)
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(log)
+    told = f"its first command, {before:.2f} s after the log began, is that of step 10 (0.5 s)"
+    assert holds(str(refused.value), told, f"since the run began, not since {since}")
+    assert refused.value.then == NextCommand("next", ("LOG",))
+    named = w.ingest(log, candidate="c0002")
+    assert named.then.verb == "discard" and holds(named.warnings[0], told)
+
+
 def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     """Velocities that were made of positions afterwards moved the start by 6 ms, unsaid."""
     policy = w.candidate("c0002")[0].policy

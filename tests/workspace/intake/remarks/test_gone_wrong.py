@@ -104,6 +104,17 @@ def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w)
     assert said[-2:] == ["discard", "t0002"] and "Run c0" not in out
 
 
+@pytest.mark.parametrize(("force", "asked"), [("a.force + 2.5", True), ("a.force", False)])
+def test_a_run_that_cost_ten_times_what_its_candidate_s_others_did_is_asked_about(w, force, asked):
+    """-49 beside -1.8 and -2.1 of the same candidate: it was no longer the best, and on it went."""
+    w.ingest(run(w, "a.force"))
+    found = w.ingest(run(w, force), candidate="c0002")
+    told = [one for one in found.warnings if "times as much as the other run of c0002" in one]
+    assert bool(told) == asked == (found.then.verb == "discard")
+    assert all(holds(one, "(t0002)", "did it run as it should", "`discard t0003`") for one in told)
+    assert (w.status().then.verb == "discard") == asked
+
+
 @pytest.mark.parametrize("force", ["a.force", "0.6 * a.force", "a.force + 0.5"])
 def test_a_run_of_a_robot_that_the_model_knows_little_of_is_not(w, force):
     found = w.ingest(run(w, force))

@@ -226,11 +226,11 @@ def _heading(findings: Findings) -> str:
 
     if (two := _first_and_best(findings)) is None or not explained(*two, findings.history):
         return "What improved"
-    sure = chance(*two, findings.history)
+    sure, (first, best) = chance(*two, findings.history), (one.candidate.id for one in two)
+    better = f"{best} is better than {first} with probability {sure:.2f}"
     if sure < 0.5:
-        return f"What the runs changed (an improvement with probability {sure:.2f})"
-    why = "not repeated" if math.isnan(sure) else f"probability {sure:.2f}"
-    return f"What perhaps improved ({why})"
+        return f"What the runs changed ({better})"
+    return f"What perhaps improved ({'not repeated' if math.isnan(sure) else better})"
 
 
 def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:

@@ -25,6 +25,7 @@ from grounded_trials.workspace.intake.locating.acted_on import acted_on
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.locating.run_start import Recording
 
+OPENINGS = 5  # instants at which commands begin that are examined
 MOST = 5  # largest number of missed steps that is tried
 COARSE = 100  # steps of a run at which a log may begin, first tried
 ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
@@ -82,14 +83,51 @@ def begins_late(log: Recording, policy: Policy) -> float:
         log: the log in which no run of the policy was found.
         policy: the policy, for the states and inputs of the log.
     """
-    trial = log.trial_from(log.first)
-    if trial is None or _waits(log):
-        return 0.0
+    return 0.0 if _waits(log) else _step_at(log, policy, log.first) * policy.dt
+
+
+def other_clock(log: Recording, policy: Policy) -> str:
+    """Return that a program began with a later step, since its clock ran before; or "".
+
+    Args:
+        log: the log in which no run of the policy was found, which begins before it.
+        policy: the policy, for the states and inputs of the log.
+
+    Returns:
+        A clause about its commands, and what to pass.
+    """
+    for at in log.openings[:OPENINGS] if _waits(log) else []:
+        begins = log.on_step(policy, at)
+        step = _step_at(log, policy, begins)
+        fit = acted_on(log, policy.after(step), begins) if step else None
+        if fit is not None and fit.throughout:
+            since = "it was started"
+            if abs(begins - step * policy.dt) < 1.5 * policy.dt:
+                since = "the log began"
+            return (
+                f"its first command, {begins:.2f} s after the log began, is that of step {step} "
+                f"({step * policy.dt:.3g} s), and the others follow: pass `runner.action` the "
+                f"seconds since the run began, not since {since}"
+            )
+    return ""
+
+
+def _step_at(log: Recording, policy: Policy, begins: float) -> int:
+    """Return the step that a policy's first command in a log is of; 0 if that is unclear.
+
+    Args:
+        log: the log.
+        policy: the policy, for the states and inputs of the log.
+        begins: where its first command stands [s].
+    """
+    trial = log.trial_from(begins)
+    if trial is None:
+        return 0
     past = policy.past if trial.start_inputs is None else trial.start_inputs
     most = min(trial.finite_steps, policy.horizon)
 
     def left(k: int) -> float:
-        """Return the median difference of commands if the log begins at step k."""
+        """Return the median difference of commands if the first one is that of step k."""
         T = min(most, policy.horizon - k)
         if T < LEAST:
             return np.inf
@@ -98,8 +136,7 @@ def begins_late(log: Recording, policy: Policy) -> float:
     stride = max(1, policy.horizon // COARSE)
     best = min(range(0, policy.horizon, stride), key=left)
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
-    sure = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
-    return best * policy.dt if sure else 0.0
+    return best if best > 0 and left(best) < min(ALIKE, BY_FAR * left(0)) else 0
 
 
 def _waits(log: Recording) -> bool:

@@ -42,6 +42,7 @@ from grounded.trial import Trial
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
+from grounded_trials.workspace.intake.locating.missed_steps import other_clock
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
@@ -184,7 +185,9 @@ def recognised(
     if not remedies and why and not (other or fell):
         _refuse_earlier(workspace, path, log, whole)
         raise GroundedError(why, NextCommand("ingest", (str(path), "--data")))
-    passed = exactly_misused(log, task, own) if log and why and not other else ""
+    passed = ""
+    if log and why and not other:
+        passed = exactly_misused(log, task, own) or other_clock(log, own.policy)
     if passed and candidate is None:
         raise _misused(path, own, passed)
     slow = pace_of(log, task, own) if log and not other else None
@@ -224,7 +227,7 @@ def recognised(
         opens = found and found.opens_alike
         unread = not (opens or other or units or pace or passed or seen.silent)
         foreign = log and unread and seen.ran and seen.ran.foreign and not seen.ran.opens
-        aside = doubts[0] if turned or foreign else ""
+        aside = doubts[0] if turned or foreign or gone else ""
         return replace(read, warnings=(*read.warnings, *doubts), doubted=True, aside=aside)
     if units:
         its = log and _in_programs_unit(task.model, units, by)

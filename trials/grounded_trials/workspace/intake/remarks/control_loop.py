@@ -29,7 +29,7 @@ from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import LEAST, commanded
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.remarks.lagging import lagging
 
@@ -282,6 +282,13 @@ def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried
     ]
     if not told:
         return []
+    others = [one for one in tried.trials if one.id != trial.id]
+    calm = [one.id for one in others if not (swings(made, one, sizes) >= SWINGS).any()]
+    if calm:
+        return [
+            f"its feedback made {listed(told)} oscillate about the plan, but not in "
+            f"{ranges(calm)}: did the program or the robot differ?"
+        ]
     return [
         f"its feedback made {listed(told)} oscillate about the plan: the next candidates get "
         "weaker feedback, or say if they can't"

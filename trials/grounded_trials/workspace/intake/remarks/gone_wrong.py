@@ -80,12 +80,30 @@ def gone_wrong(
     found = (reversed_input if astray else beside_friction)(workspace.planner, run)
     if found:
         return _is_it_wired(workspace, trial, found)
+    if tried is not None and (odd := _unlike_its_runs(workspace, trial, tried)):
+        return Asked(odd)
     if tried is None or not (others and astray and STRAYED * usual < missed < math.inf):
         return None
     return Asked(
         f"it missed its prediction by {missed:,.3g}, {missed / usual:,.3g} times what runs miss or "
         "cost otherwise: did it run as it should? If not (a motor, a sensor, somebody in the way), "
         f"`discard {trial.id}` and run {tried.candidate.id} again; if it did, `propose` goes on"
+    )
+
+
+def _unlike_its_runs(workspace: Folder, trial: Trial, tried: Tried) -> str:
+    """Return the question about a run that cost many times what its candidate's others did; ""."""
+    each = zip(tried.trials, tried.utilities, strict=True)
+    others = {one.id: -u for one, u in each if one.id != trial.id and math.isfinite(u)}
+    cost, most = -workspace.task.utility(trial), max(others.values(), default=math.inf)
+    if not (most > 0 and FAR * most < cost < math.inf):
+        return ""
+    name, runs = tried.candidate.id, "other run" if len(others) == 1 else "worst other run"
+    return (
+        f"it cost {cost:,.3g}, {cost / most:,.2g} times as much as the {runs} of {name} "
+        f"({ranges([*others])}): did it run as it should? If not (the program, a motor, a sensor, "
+        f"somebody in the way), `discard {trial.id}` and run {name} again; if it did, `propose` "
+        "goes on"
     )
 
 
