@@ -15,6 +15,7 @@ from grounded_cli.console.terminal import (
     lines,
     names_in,
     number,
+    remark,
     show,
     show_json,
     stages,
@@ -78,6 +79,7 @@ def command(
     workspace = open_workspace()
     from grounded.errors import GroundedError
     from grounded_trials.workspace.diagnosing import unheld_in
+    from grounded_trials.workspace.last_diagnosis import left_out
 
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
@@ -105,6 +107,8 @@ def command(
             engine=engine,
             progress=tell,
         )
+    for note in [] if trials or first else left_out(workspace):
+        remark("note", note)
     if json_:
         show_json(found.to_json())
     else:

@@ -106,7 +106,12 @@ def command(
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
     from grounded_trials.workspace.candidates.rest_at_end import NOISY, names_told, rest_at_end
     from grounded_trials.workspace.candidates.standstill import read_at_start
-    from grounded_trials.workspace.off_target import driven, position_names, rates_beside
+    from grounded_trials.workspace.off_target import (
+        driven,
+        position_names,
+        rates_beside,
+        usual_weights,
+    )
     from grounded_trials.workspace.user_files.config import set_start
     from grounded_trials.workspace.user_files.task_file import limits_of_log, without_range
 
@@ -200,6 +205,7 @@ def command(
             f"{', '.join(f'{name} = {number(value)}' for name, value in rest.items())}. If runs "
             "begin elsewhere, change it and draw the target again"
         )
+    suggested = {name: float(f"{w:.6g}") for name, w in usual_weights(model, columns).items()}
     shared = len({*position_names(model)} & {*columns}) > 1
     alike = ", coordinates of a position alike by the smaller of their ranges" * shared
     slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))
@@ -211,6 +217,14 @@ def command(
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
             told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
             sentence(f"[reward] {kind} is new, {by}: {told}")
+        elif kind == "state" and weights and weights != suggested:
+            told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
+            usual = ", ".join(f"{name} = {number(weight)}" for name, weight in suggested.items())
+            remark(
+                "note",
+                f"[reward] state is kept, since its weights are not those that the target before "
+                f"this one gave: {told}. This one gives {usual}",
+            )
     noisy = {} if ended is None else {n: (s, ended.weights[n]) for n, s in ended.noise.items()}
     for name, (deviation, weight) in noisy.items():
         if reward["terminal"][name] != weight:

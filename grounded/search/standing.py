@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
+from grounded.search.candidate import BY_STEP, LITTLE, PART, Candidate, Tried, Way
 from grounded.search.certainty import (
     LUCK,
     error_between,
@@ -365,6 +365,14 @@ def _restarted(history: tuple[Tried, ...], model: str) -> str:
     )
 
 
+def due(tried: Tried, best: Tried) -> float:
+    """Return the part of a loss to the best one that the start states explain by the model."""
+    if tried.starts is None or not (tried.trials and best.trials):
+        return 0.0
+    owed = tried.starts.owed(tried, best)
+    return max(-owed, 0.0) if math.isfinite(owed) else 0.0
+
+
 def let_down(ended: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if a step that promised much has lost.
 
@@ -380,7 +388,10 @@ def let_down(ended: Standing, model: str) -> Standing:
         if made not in lost or made.doubtful:
             continue
         error, known = error_between(best, tried, ended.history)
-        loss, noise = -tried.gain_over(best), LUCK * error if known else 0.0
+        loss, noise = (
+            best.utility - tried.utility - due(tried, best),
+            LUCK * error if known else 0.0,
+        )
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:
@@ -389,9 +400,12 @@ def let_down(ended: Standing, model: str) -> Standing:
     if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
         return ended
     gave = f"gave {figure(most.utility)}" if math.isfinite(most.utility) else "failed"
+    cost = most.starts.cost(most) if most.starts is not None and most.trials else 0.0
+    from_there = math.isfinite(cost) and abs(cost) > PART * abs(most.promised - most.utility)
+    said = figure(most.promised - cost * from_there) + " from where its runs began" * from_there
     why = (
-        f". But {most.candidate.id}, for which {figure(most.promised)} was predicted, {gave}: the "
-        f"model is wrong near {own}, and a diagnosis may show what it lacks"
+        f". But {most.candidate.id}, for which {said} was predicted, {gave}: the model is wrong "
+        f"near {own}, and a diagnosis may show what it lacks"
     )
     then = NextCommand("diagnose")
     return replace(ended, sentence=ended.sentence + why, then=then, missed=why)

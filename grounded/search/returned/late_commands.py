@@ -15,14 +15,12 @@ from enum import Enum
 
 import numpy as np
 
-from grounded.instruments.predictions.short_runs import Ahead
 from grounded.search.planner import Planner
+from grounded.search.returned.by_motion import fits, score
 from grounded.trial import Trial
 
-STARTS = 80  # samples to predict from
 BEYOND = 1, 6  # steps beyond the lead or lag in question that are tried: a delay may be missing
 CLEAR = 0.2  # [nats] by which one explanation must predict the run better than the other
-AHEAD = 0.25, 0.5, 1.0  # [s] of the predictions; over a single one, a swing may fit a period late
 BESIDE = 1  # steps about the best shift in which another that is as good is the same
 NEAR = 0.35  # of the lag: how near the motion must be to what an explanation expects
 
@@ -68,8 +66,7 @@ class Shifted:
     def __init__(self, planner: Planner, trial: Trial, most: int) -> None:
         whole = trial.until(max(trial.finite_steps, 0))
         self.shifts = np.arange(-most - BEYOND[0], most + BEYOND[1] + 1)
-        with np.errstate(all="ignore"):
-            self.scores = np.array([_missed(planner, whole, int(shift)) for shift in self.shifts])
+        self.scores = np.array([_missed(planner, whole, int(shift)) for shift in self.shifts])
 
     @property
     def best(self) -> float | None:
@@ -93,20 +90,6 @@ class Shifted:
 
 
 def _missed(planner: Planner, trial: Trial, shift: int) -> float:
-    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps.
-
-    The mean over predictions of several lengths, of those that the run has.
-    """
-    from grounded.effects.memory import shifted
-
-    assert planner.plan.latency is not None
+    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps."""
     at = np.clip(np.arange(len(trial.inputs)) - shift, 0, len(trial.inputs) - 1)
-    moved = planner.lift(replace(trial, inputs=trial.inputs[at]))
-    late = planner.plan.latency / trial.dt
-    sent = zip(moved.inputs.T[:, None], moved.inputs[0], late, strict=True)
-    arrives = np.vstack([shifted(u, np.array([held]), by) for u, held, by in sent]).T
-    model, own = planner.plan.model, range(planner.task.model.n)
-    acts = replace(moved, inputs=arrives)
-    each = [Ahead(model, acts, own, STARTS, (0.0,), horizon=one) for one in AHEAD]
-    scores = [one.best([np.ones(model.m)]).score for one in each if one.enough]
-    return float(np.mean(scores)) if scores else float("nan")
+    return score(fits(planner, replace(trial, inputs=trial.inputs[at])))

@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from grounded import places
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
@@ -73,8 +74,15 @@ def path_target(
     if len(position) < 2:
         raise GroundedError(
             f"model '{model.name}' has no role 'position' of two states, which a {shape} needs: "
-            'add roles={"position": ("x", "y"), "heading": "psi", "speed": "v"} to model.py. '
-            "`target line --to STATE=VALUE` and `target step --to STATE=VALUE` need no role"
+            f"add {_roles(model)} to model.py. `target line --to STATE=VALUE` and `target step "
+            "--to STATE=VALUE` need no role"
+        )
+    ahead, across = places.body_velocity(model) or ("", "")
+    if across and model.roles.get("speed") == across:
+        raise GroundedError(
+            f"model '{model.name}' has the role 'speed' for {across}, which moves it across its "
+            f'heading by its equations; {ahead} moves it ahead: write "speed": "{ahead}" in '
+            "model.py"
         )
     _check(drive)
     along, x, y, heading = _path(shape, drive)
@@ -95,6 +103,14 @@ def path_target(
             columns[played] = values
     rates = dict(zip(position, (pace * np.cos(turned), pace * np.sin(turned)), strict=False))
     return columns | _kept(shape, model, to, start, columns, rates)
+
+
+def _roles(model: Model) -> str:
+    """Return the roles to declare, of the states that the model's equations show in them."""
+    x, y = (*places.position(model), "x", "y")[:2] if len(places.position(model)) > 1 else "xy"
+    ahead = (*places.body_velocity(model), places.speed(model) or "v")[0]
+    turned = places.heading(model) or "psi"
+    return f'roles={{"position": ("{x}", "{y}"), "heading": "{turned}", "speed": "{ahead}"}}'
 
 
 def _driven(

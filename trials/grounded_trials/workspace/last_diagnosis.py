@@ -19,6 +19,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
+from grounded_trials.wording import ranges
 from grounded_trials.workspace.read_before import changed_since
 from grounded_trials.workspace.unknown_id import named_trials
 
@@ -87,6 +88,35 @@ def diagnosable(workspace: Folder) -> list[Trial]:
     """
     cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
     return [trial for trial in cut if trial.steps >= LEAST_STEPS]
+
+
+def left_out(workspace: Folder) -> list[str]:
+    """Return notes on stored trials that nothing can use, since [task] dt or the model was changed.
+
+    Raises:
+        GroundedError: if a stored file is damaged.
+    """
+    model, dt = workspace.base_model, workspace.config.task.dt
+    paced, others = dict[float, list[str]](), list[str]()
+    for one in workspace.trials():
+        if not workspace.fits(one.trial):
+            names = (one.trial.state_names, one.trial.input_names)
+            same = names == (model.state_names, model.input_names)
+            (paced.setdefault(one.trial.dt, []) if same else others).append(one.stored.id)
+    notes = [
+        f"{ranges(ids)} {'was' if len(ids) == 1 else 'were'} sampled every {was:g} s, [task] dt is "
+        f"{dt:g} s now: fit, diagnose and the search leave {'it' if len(ids) == 1 else 'them'} "
+        f"out. To use {'it' if len(ids) == 1 else 'them'}, `discard` and ingest the log again, or "
+        f"set dt back"
+        for was, ids in paced.items()
+    ]
+    if others:
+        has = "has" if len(others) == 1 else "have"
+        notes.append(
+            f"{ranges(others)} {has} other states or inputs than model.py has now: fit, diagnose "
+            f"and the search leave {'it' if len(others) == 1 else 'them'} out"
+        )
+    return notes
 
 
 def made_from(diagnosis: Diagnosis) -> Made:

@@ -375,10 +375,15 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
     reward = replace(aim.reward, state=state, terminal=terminal)
     closer = finished(replace(aim, reward=reward).problem(), first.predicted_inputs)
     left, _ = _off_path(task, closer.z[:, : task.model.n])
-    if not left < ENOUGH * off:
-        return []
     was, now = measured_alike([off, left], unit)
     how = "at its end" if ends else "rms"
+    if not left < ENOUGH * off:
+        own = ", ".join(f"{names[k]} = {task.reward.state[i]:.4g}" for k, i in enumerate(states))
+        return [
+            f"the plan is off {what} by {was} {how}, and by {now} with {CLOSER:g} times the weight "
+            f"on it: are its weights in [reward] state ({own}) far below the others', or is the "
+            "target beyond what the model or [limits] allow?"
+        ]
     weights = ", ".join(f"{names[k]} = {state[i]:.4g}" for k, i in enumerate(states))
     return [
         f"the plan is off {what} by {was} {how}, because [reward] state weighs "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from grounded_trials.workspace.candidates.search_state import answered, planned,
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
+    left_out,
     readable_diagnosis,
     since_diagnosis,
     usable_ids,
@@ -169,9 +171,16 @@ def propose_in(workspace: Folder) -> Proposed:
             notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
-        asked, then = unanswered(workspace)
-        ended = replace(proposal, standing=status.standing, notes=(*proposal.notes, *asked))
-        then = PROPOSE if held else then or status.then  # after [task] start is changed, as noted
+        _, asked = unanswered(workspace)
+        if asked is not None:  # who proposes goes on; no candidate is handed out to show it
+            digest = workspace.store.find(asked.arguments[0]).digest
+            gone_on = {"note": "restore", "trial": digest, "why": ""}
+            with suppress(GroundedError):  # a folder that can't be written
+                workspace.notes.add(gone_on, again=False)
+            vars(workspace).pop("noted", None)
+            status = status_of(workspace, proposal.standing)
+        ended = replace(proposal, standing=status.standing)
+        then = PROPOSE if held else status.then  # after [task] start is changed, as noted
         return Proposed(ended, None, then)
     path = workspace.candidate_path(candidate.id)
     # the user should first correct the held input; a second `propose` hands the candidate out
@@ -317,6 +326,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
             *(_disowned(standing) if standing.phase != "propose" else ()),
             *_namesakes(workspace),
             *not_counted(uncounted(workspace, workspace.trials(), standing)),
+            *left_out(workspace),
         ),
         workspace.discarded(),
         off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),

@@ -243,23 +243,23 @@ def set_target(
     name: str,
     steps: int,
     weights: Mapping[str, float],
-    before: Mapping[str, float],
+    befores: Sequence[Mapping[str, float]],
     changes: Mapping[str, tuple[float, float]],
     terminal: Mapping[str, float] = MappingProxyType({}),
     left: Sequence[str] = (),
 ) -> None:
     """Replace [task] target and horizon, and the weights of [reward] not chosen by the user.
 
-    [reward] state counts as not chosen if it is empty, equals `before`, or is 1 for each state (as
-    `init --blank` writes it). In that case [reward] input_change is replaced too, for the inputs
-    whose weight is still what `init` wrote.
+    [reward] state counts as not chosen if it is empty, equals one of `befores`, or is 1 for each of
+    their states (as `init --blank` writes it). In that case [reward] input_change is replaced too,
+    for the inputs whose weight is still what `init` wrote.
 
     Args:
         file: grounded.toml.
         name: the file of the target.
         steps: the horizon.
         weights: the new weights of states.
-        before: the weights that the previous target gave.
+        befores: the weights that the previous target gave, by the model's roles now, and without.
         changes: by input, its weight on changes without [limits], and with them.
         terminal: weights for [reward] terminal of states that have none there.
         left: states that had a column in the previous target and have none now. Weights that they
@@ -272,11 +272,15 @@ def set_target(
     _put(document, "task", {"target": name, "horizon": steps})
     reward = document.get("reward", {})
     own, ends = dict(reward.get("state", {})), dict(reward.get("terminal", {}))
-    before = {k: w for k, w in before.items() if k in own or k not in ends}
-    same = own.keys() == before.keys() and any(
-        all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in unchosen.items())
-        for unchosen in (before, dict.fromkeys(before, 1.0))
-    )
+    given = [{k: w for k, w in one.items() if k in own or k not in ends} for one in befores]
+    given += [dict.fromkeys(one, 1.0) for one in given[:1]]
+    alike = [
+        one
+        for one in given
+        if own.keys() == one.keys()
+        and all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in one.items())
+    ]
+    before, same = alike[0] if alike else given[0], bool(alike)
     if same or (not own and not ends):
         ends = {
             k: OFFERED * weights[k] if k in weights and _is_offered(w, before.get(k)) else w

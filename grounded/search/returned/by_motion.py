@@ -1,0 +1,123 @@
+"""Compare a run's motion with its commands, by the model: two of them may have been exchanged.
+
+Commands as a policy sends them don't tell whether they reached the motors that they were for. The
+model, with the effects that were adopted and calibrated on the run, predicts from many samples a
+quarter of a second to a second ahead: over longer times it tells more, but of a robot that is
+unstable, or of a short run, only the shorter ones are known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from grounded.instruments.predictions.short_runs import Ahead, Fit
+from grounded.search.planner import Planner
+from grounded.trial import Trial
+
+STARTS = 80  # samples to predict from
+AHEAD = 0.25, 0.5, 1.0  # [s] of the predictions; over a single one, a swing may fit a period late
+SURE = 2.0  # [nats] by which exchanged inputs must predict a run better, and earlier runs worse
+MOST = 12  # number of pairs of inputs that are tried
+
+
+@dataclass(frozen=True)
+class Exchanged:
+    """Two inputs that acted in each other's place.
+
+    Args:
+        inputs: their names.
+        state: the state that is predicted better with them exchanged.
+        times: by how many times.
+        shown: earlier runs in which they were in their places.
+    """
+
+    inputs: tuple[str, str]
+    state: str
+    times: float
+    shown: tuple[str, ...]
+
+    @property
+    def said(self) -> str:
+        """That they did, and what shows it: one clause."""
+        a, b = self.inputs
+        times = f"{self.times:.2g} times" if self.times < 100 else "over 100 times"
+        return (
+            f"the robot did with {a} what was sent as {b}, and the reverse: with them exchanged, "
+            f"the model predicts {self.state} {times} as well"
+        )
+
+
+def exchanged(planner: Planner, trial: Trial, before: Sequence[Trial]) -> Exchanged | None:
+    """Return the two inputs that acted in each other's place in a run, or None.
+
+    Args:
+        planner: plans with the model, and the effects adopted.
+        trial: a run without gaps.
+        before: earlier runs; those that the exchange predicts better as well speak against it.
+    """
+    units = list(planner.task.model.inputs.values())
+    pairs = [pair for pair in combinations(range(len(units)), 2) if len({*_of(units, pair)}) == 1]
+    if not 0 < len(pairs) <= MOST:
+        return None
+    as_sent, least, best = fits(planner, trial), -SURE, None
+    if not as_sent:
+        return None
+    for pair in pairs:
+        other = fits(planner, _swapped(trial, pair))
+        if other and (gain := score(other) - score(as_sent)) < least:
+            least, best = gain, (pair, other)
+    if best is None:
+        return None
+    (i, j), other = best
+    known = [(one.id, score(fits(planner, one)), _swapped(one, (i, j))) for one in before]
+    told = [(name, plain - score(fits(planner, turned))) for name, plain, turned in known]
+    if any(gain > 0 for _, gain in told):
+        return None
+    shares = other[-1].rms / as_sent[-1].rms
+    k = int(np.argmin(shares[: planner.task.model.n]))
+    names = trial.input_names
+    shown = tuple(name for name, gain in told if gain < -SURE)
+    return Exchanged((names[i], names[j]), trial.state_names[k], float(1 / shares[k]), shown)
+
+
+def fits(planner: Planner, trial: Trial) -> list[Fit]:
+    """Return the fits of predictions of several lengths, shorter ones first; [] if none is known.
+
+    Args:
+        planner: plans with the model, and the effects adopted; its inputs arrive late by its own
+            latency.
+        trial: a run; only its part without gaps is used.
+    """
+    from grounded.effects.memory import shifted
+
+    assert planner.plan.latency is not None
+    lifted = planner.lift(trial.until(max(trial.finite_steps, 0)))
+    if not len(lifted.inputs):
+        return []
+    late = planner.plan.latency / trial.dt
+    sent = zip(lifted.inputs.T[:, None], lifted.inputs[0], late, strict=True)
+    arrives = np.vstack([shifted(u, np.array([held]), by) for u, held, by in sent]).T
+    model, own = planner.plan.model, range(planner.task.model.n)
+    acts = replace(lifted, inputs=arrives)
+    each = [Ahead(model, acts, own, STARTS, (0.0,), horizon=one) for one in AHEAD]
+    with np.errstate(all="ignore"):
+        return [one.best([np.ones(model.m)]) for one in each if one.enough]
+
+
+def score(found: Sequence[Fit]) -> float:
+    """Return the mean error of fits [nats]; NaN without any."""
+    return float(np.mean([one.score for one in found])) if found else float("nan")
+
+
+def _swapped(trial: Trial, pair: tuple[int, int]) -> Trial:
+    inputs = np.array(trial.inputs)
+    inputs[:, pair] = inputs[:, pair[::-1]]
+    return replace(trial, inputs=inputs)
+
+
+def _of(units: Sequence[str], pair: tuple[int, int]) -> list[str]:
+    return [units[k] for k in pair]
