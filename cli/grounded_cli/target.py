@@ -223,8 +223,8 @@ def command(
             remark(
                 "note",
                 f"[reward] state is kept, since its weights are not those that the target before "
-                f"this one gave: {told}. This one gives {usual}; to have these, delete the line and "
-                "draw the target again",
+                f"this one gave: {told}. This one gives {usual}; to have these, delete the line "
+                "and draw the target again",
             )
     noisy = {} if ended is None else {n: (s, ended.weights[n]) for n, s in ended.noise.items()}
     for name, (deviation, weight) in noisy.items():
