@@ -144,11 +144,10 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         doubted = one.verdict == "in doubt" and one.to_settle == one.candidate
         meaning = VERDICTS.get(BEGUN if doubted else one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
-            says = any("discard" in warning for warning in one.warnings)
-            meaning = (
-                f"; discard it, as the {'warning' if says else 'note'} says, or go on with it: "
-            )
-            meaning += "`propose`"
+            noted = any("discard" in note for note in one.notes)
+            warned = any("discard" in one or "again" in one for one in one.warnings)
+            says = "note" if noted and not warned else "warning"
+            meaning = f"; discard it, as the {says} says, or go on with it: `propose`"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         ended = one.utility == float("-inf")
