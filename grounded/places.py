@@ -1,8 +1,9 @@
 """The states and inputs of a model by their meaning: where effects act, what sensors relate.
 
 Roles come from the model (`Model.roles`). Without roles, a position is a pair of states called x
-and y (or north and east), a heading is an angle called psi, yaw, heading or theta, and a speed is a
-state called v or speed. A velocity is any state whose unit is per second; friction acts on those.
+and y (or north and east), a heading is an angle called psi, yaw, heading or theta (beside such a
+pair any state in rad of these names, whether declared an angle or not), and a speed is a state
+called v or speed. A velocity is any state whose unit is per second; friction acts on those.
 Effects whose targets can't be determined are not candidates.
 """
 
@@ -51,8 +52,9 @@ def position(model: Model) -> tuple[str, ...]:
 
 def heading(model: Model) -> str | None:
     """Return the state of the heading, or None."""
-    named = (*role(model, "heading"), *(h for h in HEADINGS if h in model.angles))
-    return next(iter(named), None)
+    declared = [h for h in HEADINGS if h in model.angles]
+    other = [h for h in HEADINGS if model.states.get(h) == "rad" and len(position(model)) == 2]
+    return next(iter((*role(model, "heading"), *declared, *other)), None)
 
 
 def speed(model: Model) -> str | None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import listed, number, percent
 from grounded.search.candidate import Candidate
@@ -27,13 +28,22 @@ NEARLY = 0.8  # least share of them in which more is asked for, and of those in 
 class Clipped:
     """Commands that were cut inside their limits."""
 
-    cuts: dict[str, list[float]]  # by input, lower before upper
+    cuts: dict[str, dict[int, float]]  # by input, and by the side, -1 or 1
     share: float  # of the steps in which some command was cut
+
+    def bounds(self, own: Candidate) -> tuple[Array, Array]:
+        """Return the limits with these cuts, (m,) each."""
+        low, high = own.policy.low.copy(), own.policy.high.copy()
+        for name, ends in self.cuts.items():
+            j = own.policy.input_names.index(name)
+            low[j], high[j] = ends.get(-1, low[j]), ends.get(1, high[j])
+        return low, high
 
     def told(self, own: Candidate) -> str:
         """Return what its commands are and the remedy, as the end of a sentence."""
         each = [
-            f"{name} at {listed([number(v) for v in ends])}" for name, ends in self.cuts.items()
+            f"{name} at {listed([number(v) for v in ends.values()])}"
+            for name, ends in self.cuts.items()
         ]
         return (
             f"those of {own.id} cut inside [limits] in {percent(self.share)} of the steps "
@@ -56,11 +66,11 @@ def clipped(own: Candidate, trial: Trial) -> Clipped | None:
     ):
         return None
     run = commanded(policy, trial)
-    cuts, cut = dict[str, list[float]](), np.zeros(T, bool)
+    cuts, cut = dict[str, dict[int, float]](), np.zeros(T, bool)
     for j, name in enumerate(policy.input_names):
-        for sign in (-1.0, 1.0):
+        for sign in (-1, 1):
             if (at := _cut(policy, run, j, sign)) is not None:
-                cuts.setdefault(name, []).append(float(run.sent[at, j][0]))
+                cuts.setdefault(name, {})[sign] = float(run.sent[at, j][0])
                 cut |= at
     return Clipped(cuts, float(cut.mean())) if cuts else None
 

@@ -307,6 +307,21 @@ def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(
     assert named.then.verb == "discard" and holds(named.warnings[0], told)
 
 
+@pytest.mark.parametrize("part", [0.2, 0.6])
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before, part):
+    """`Right 1000 times too small`: of commands that a limiter held at 0.6 all the time."""
+    policy = w.candidate("c0002")[0].policy
+    most = part * float(np.abs(policy.feedforward).max())
+    log = record(w, tmp_path / "a.csv", policy, before, most=most)
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(log)
+    assert holds(str(refused.value), "those of c0002 cut inside [limits]", "force at ")
+    assert refused.value.then == NextCommand("next", ("LOG",))
+    named = w.ingest(log, candidate="c0002")
+    assert named.then.verb == "discard" and any("cut inside" in one for one in named.warnings)
+
+
 def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     """Velocities that were made of positions afterwards moved the start by 6 ms, unsaid."""
     policy = w.candidate("c0002")[0].policy

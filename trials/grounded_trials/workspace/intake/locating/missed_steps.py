@@ -25,7 +25,6 @@ from grounded_trials.workspace.intake.locating.acted_on import acted_on
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.locating.run_start import Recording
 
-OPENINGS = 5  # instants at which commands begin that are examined
 MOST = 5  # largest number of missed steps that is tried
 COARSE = 100  # steps of a run at which a log may begin, first tried
 ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
@@ -96,20 +95,21 @@ def other_clock(log: Recording, policy: Policy) -> str:
     Returns:
         A clause about its commands, and what to pass.
     """
-    for at in log.openings[:OPENINGS] if _waits(log) else []:
-        begins = log.on_step(policy, at)
-        step = _step_at(log, policy, begins)
-        fit = acted_on(log, policy.after(step), begins) if step else None
-        if fit is not None and fit.throughout:
-            since = "it was started"
-            if abs(begins - step * policy.dt) < 1.5 * policy.dt:
-                since = "the log began"
-            return (
-                f"its first command, {begins:.2f} s after the log began, is that of step {step} "
-                f"({step * policy.dt:.3g} s), and the others follow: pass `runner.action` the "
-                f"seconds since the run began, not since {since}"
-            )
-    return ""
+    if not _waits(log) or not log.openings:
+        return ""
+    begins = log.on_step(policy, log.openings[0])
+    step = _step_at(log, policy, begins)
+    fit = acted_on(log, policy.after(step), begins) if step else None
+    if fit is None or not fit.throughout:
+        return ""
+    since = "it was started"
+    if abs(begins - step * policy.dt) < 1.5 * policy.dt:
+        since = "the log began"
+    return (
+        f"its first command, {begins:.2f} s after the log began, is that of step {step} "
+        f"({step * policy.dt:.3g} s), and the others follow: pass `runner.action` the seconds "
+        f"since the run began, not since {since}"
+    )
 
 
 def _step_at(log: Recording, policy: Policy, begins: float) -> int:

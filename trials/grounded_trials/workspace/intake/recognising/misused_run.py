@@ -19,14 +19,21 @@ from grounded.search.returned.clipped import clipped
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.who_drove import follows, latest
+from grounded.search.returned.who_drove import commanded, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
-from grounded_trials.workspace.intake.locating.run_start import BATCH, TRIED, Recording, least_of
+from grounded_trials.workspace.intake.locating.run_start import (
+    BATCH,
+    TRIED,
+    Recording,
+    Start,
+    least_of,
+)
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
+MOSTLY = 0.9  # least share of the steps in which cut commands are near what is logged
 MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
@@ -73,6 +80,37 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
                 return f"they are {cut.told(own)}"
             if found := smoothed(task.model, own, run):
                 return f"they are {found.told(own)}"
+    return ""
+
+
+def cut_in(log: Recording, own: Candidate, found: Start | None) -> str:
+    """Return that a program cut its candidate's commands inside their limits, wherever it began.
+
+    Multiplied by any large number, commands that a cut holds at one value are at their limit, as
+    the policy's may be: another unit, it seemed. In the run they follow the policy below the cut.
+
+    Args:
+        log: a log whose commands are not the candidate's.
+        own: the candidate.
+        found: the start that fits best, if any.
+
+    Returns:
+        The end of a sentence about its commands; "" if they were not cut.
+    """
+    starts = [*([found.seconds] if found else []), log.first, *log.openings[:TRIED]]
+    for begins in dict.fromkeys(log.on_step(own.policy, one) for one in starts):
+        if (trial := log.trial_from(begins)) and (cut := clipped(own, trial)):
+            run = trial.until(min(trial.finite_steps, own.policy.horizon))
+            (low, high), held = cut.bounds(own), log.past
+            if ((low >= held) & (low > own.policy.low)).any() or (
+                (high <= held) & (high < own.policy.high)
+            ).any():
+                continue  # nothing was sent there, as before a run and after it
+            within = replace(own.policy, low=low, high=high)
+            sent, fit = commanded(within, run), follows(within, run, 0)
+            near = (np.abs(sent.asked - sent.sent) <= NEAR * sent.size).all(axis=1)
+            if near.mean() >= MOSTLY or (fit and fit.alike):
+                return f"they are {cut.told(own)}"
     return ""
 
 

@@ -54,7 +54,11 @@ from grounded_trials.workspace.intake.opening.reading import (
     read_log_file,
 )
 from grounded_trials.workspace.intake.recognising.look import Look
-from grounded_trials.workspace.intake.recognising.misused_run import exactly_misused, misused_in
+from grounded_trials.workspace.intake.recognising.misused_run import (
+    cut_in,
+    exactly_misused,
+    misused_in,
+)
 from grounded_trials.workspace.intake.recognising.read_otherwise import (
     Misled,
     crossed,
@@ -175,6 +179,8 @@ def recognised(
         logged = [name for name in task.model.state_names if name not in _guessed(log)]
         tried = [(names, f) for names, f in units_tried(task.model) if {*names} <= {*logged}]
         units, by = odd_columns(task.model, own, whole, tried)
+    if cut := cut_in(log, own, found) if log and (why or units) and not other else "":
+        units, why = (), why or f"its commands are not what {ran} sends: {cut}"
     if not why and not units:
         if candidate is None and log and (off := zero_in(log, task, own, whole, seen.ran)):
             raise GroundedError(f"{path} ran {ran}, but {off}", again)
@@ -185,15 +191,15 @@ def recognised(
     if not remedies and why and not (other or fell):
         _refuse_earlier(workspace, path, log, whole)
         raise GroundedError(why, NextCommand("ingest", (str(path), "--data")))
-    passed = ""
-    if log and why and not other:
+    passed = cut
+    if log and why and not (other or cut):
         passed = exactly_misused(log, task, own) or other_clock(log, own.policy)
     if passed and candidate is None:
         raise _misused(path, own, passed)
-    slow = pace_of(log, task, own) if log and not other else None
+    slow = pace_of(log, task, own) if log and not (other or cut) else None
     if slow:  # a recording at another rate may look like one in another unit
         units = ()
-    elif log and not units and not other:
+    elif log and not (units or other or cut):
         units, by = unit_of(log, task, own)
     if log and units and why and rather_exchanged(log, task, own, units, by):
         units = ()
