@@ -135,6 +135,11 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler, white)):
         fit, without, more = _pruned(search, other, ruler, white)
         doubtful += more
+    if proposed.hypothesis.spread > 0:  # effects were found beside free parameters
+        other = own_numbers(search, fit, ruler)
+        if other is not fit:
+            fit, without, more = _pruned(search, other, ruler, white)
+            doubtful += more
     if not _likely(search, fit):
         fit, without, _ = _pruned(search, search.best_null(), ruler, white)
     if causes(fit) and not _seen(search, ruler, crude, fit):

@@ -8,11 +8,12 @@ from __future__ import annotations
 from itertools import combinations
 
 from grounded.diagnosis.hypotheses.explored import TIE
+from grounded.diagnosis.hypotheses.lookalike import one_thing
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import ParamFamily
+from grounded.effects import Effect, ParamFamily
 
 COUPLING = "coupling"
 SURE = 8.0  # nats (odds of 3,000 to 1) above which an effect counts as certain by evidence
@@ -22,25 +23,54 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
     """Replace effects by shifts of the model's parameters, if these tie and predict as well.
 
     A parameter declared uncertain, or an adopted delay, is more probably off than an equation
-    missing.
+    missing. One that is the effect itself, in any trial (`one_thing`), ties if it explains as much,
+    however far off it is: a drag that an earlier diagnosis had left at its bound, a third of its
+    value, became a state that "changes 216 % faster than modelled".
     """
     h, score = fit.hypothesis, search.score
     params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
+    own, same = {e.name: (e, v) for e, v in h.pairs}, dict[tuple[str, str], bool]()
     for name in [n for n in equations(fit) if n not in params] if h.spread == 0 else ():
         rest = {*h.names} - {name}
         sets = {tuple(sorted({*rest, param})) for param in params - rest}
 
+        def lacks(other: Fitted, name: str = name) -> float:
+            """Return the nats that another fit lacks; the price of what is the same counts not."""
+            nats = score(fit) - score(other)
+            for effect, values in other.hypothesis.pairs:
+                pair = effect.name, name
+                if effect.name in own:
+                    continue
+                if pair not in same:
+                    same[pair] = _is(search, effect, own[name][0])
+                if same[pair]:
+                    nats += search.price(*own[name]) - search.price(effect, values)
+            return nats
+
         def likeliest(sets: set[tuple[str, ...]] = sets) -> Fitted:
             exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
-            return max(exact, key=score, default=fit)
+            return min(exact, key=lacks, default=fit)
 
-        if score(fit) - score(likeliest()) < 2 * TIE:
+        for param in search.candidates:  # fits beside other effects may not have found its size
+            if param.name not in rest and _is(search, param, own[name][0]):
+                begun = {q.name: q.start for q in param.free}
+                start = (h.minus(name).plus(param, begun), fit.noise, fit.track)
+                search.refined([start], TO_THE_TOP)
+        if lacks(likeliest()) < 2 * TIE:
             search.finished([likeliest()], TO_THE_TOP)
         other = likeliest()
-        ties = other is not fit and score(fit) - score(other) < TIE
+        ties = other is not fit and lacks(other) < TIE
         if ties and not ruler.gain(other, fit).beyond(*BETTER):
             return own_numbers(search, other, ruler)
     return _calibrated_instead(search, fit, ruler)
+
+
+def _is(search: HypothesisSearch, param: Effect, effect: Effect) -> bool:
+    """Check whether an error of a parameter is the same as an effect in any trial."""
+    if not isinstance(param.family, ParamFamily):
+        return False
+    index = search.data.model.param_names.index(param.site.target)
+    return one_thing(search.predictor, index, effect)
 
 
 def with_mechanism(search: HypothesisSearch, fit: Fitted) -> Fitted | None:
