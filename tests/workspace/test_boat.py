@@ -8,6 +8,7 @@ import pytest
 
 from cli import grounded
 from facts import holding, holds
+from grounded import places
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.returned.by_motion import exchanged
 from grounded.trial import Trial
@@ -78,6 +79,24 @@ def test_roles_are_offered_as_the_equations_have_them(w):
         path_target("circle", Drive(), odd, 0.05)
     named = replace(odd, roles={**odd.roles, "speed": "u"})
     assert {"x", "y", "psi", "u"} == set(path_target("circle", Drive(), named, 0.05))
+
+
+def test_a_heading_without_a_declared_angle_is_one_all_the_same(w, tmp_path):
+    """Neither Coriolis forces nor a drift over the ground were tried: "no known effect"."""
+    model = w.base_model
+    bare = replace(model, angles=())
+    for one in (model, bare):
+        assert places.body_velocity(one) == ("u", "v") and places.plane(one) == ["x+y"]
+    assert places.undeclared_angles(bare) == ["psi"] and not places.undeclared_angles(model)
+    (tmp_path / "model.py").write_text(MODEL.replace('angles=("psi",),', ""))
+    trial, log = driven(w), tmp_path / "hand.csv"
+    table = np.column_stack([0.05 * np.arange(120), trial.states[:-1], trial.inputs])
+    names = [*model.state_names, *model.input_names]
+    np.savetxt(log, table, "%.6f", ",", header=",".join(["t", *names]), comments="")
+    folder = tmp_path / "begun"
+    made = grounded("init", folder, "--from", log, "--model", tmp_path / "model.py", "--yes")
+    told = " ".join((made.out + made.err).split())
+    assert made.code == 0 and holds(told, "psi is an angle", 'angles=("psi",)')
 
 
 @pytest.mark.parametrize("chosen", [False, True])

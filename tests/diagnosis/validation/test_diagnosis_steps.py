@@ -156,6 +156,19 @@ def test_what_ties_with_a_parameter_is_named_as_that(search):
     assert own_numbers.own_numbers(search, rubs, Coarse(0.0)) is rubs
 
 
+def test_a_parameter_that_is_the_effect_itself_ties_however_far_off_it_is(search, monkeypatch):
+    """A drag adopted at its bound became a state that "changes 216 % faster than modelled"."""
+    price = search.price
+    far = lambda e, v: price(e, v) + 60.0 * (e.name == "parameter:k")  # noqa: E731
+    monkeypatch.setattr(search, "price", far)
+    gain, rubs = fit_of(search, "input_gain:u"), fit_of(search, FRICTION)
+    assert search.score(gain) - search.score(fit_of(search, "parameter:k")) > 50
+    assert own_numbers.own_numbers(search, gain, Coarse(0.0)).hypothesis.names == ("parameter:k",)
+    assert own_numbers.own_numbers(search, rubs, Coarse(0.0)) is rubs
+    better = Coarse(3.0, largest=0.1)
+    assert own_numbers.own_numbers(search, gain, better) is gain
+
+
 @pytest.fixture(scope="module")
 def calibrated(search):
     """Friction and a gain that is the parameter k; friction alone with k free, as likely."""

@@ -18,6 +18,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import undeclared_angles
 from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units, states_time_unit
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
@@ -261,6 +262,7 @@ def _begin(
         }
     if own:
         notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, found))
+        notes = (*notes, *_turning(found))
     rates = velocities(found)
     table = mapping_toml(states, inputs, simulated=is_simulated(report), rates=rates)
 
@@ -417,6 +419,18 @@ def _unmeasured(states: Sequence[Guess], model: Model) -> tuple[str, ...]:
         f"the log need not hold {listed(pairs.values())}: once {listed(pairs)} "
         f"{'have paths' if len(pairs) > 1 else 'has a path'} in [log], use [estimate] in "
         "grounded.toml, and the smoother finds the rest",
+    )
+
+
+def _turning(model: Model) -> tuple[str, ...]:
+    """Return a note on states that are angles by the model's equations, but not declared so."""
+    if not (names := undeclared_angles(model)):
+        return ()
+    declared = ", ".join(f'"{name}"' for name in (*model.angles, *names))
+    are = "is an angle" if len(names) == 1 else "are angles"
+    return (
+        f"{listed(names)} {are} by the model's equations: declare angles=({declared},) in "
+        "model.py, or a log that wraps at pi shows a jump of 6.28 rad",
     )
 
 
