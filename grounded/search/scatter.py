@@ -236,8 +236,9 @@ def by_starts(history: Sequence[Tried]) -> bool:
         if _repeated(tried) and tried.starts is not None:
             costs, worth = tried.starts.costs(tried), np.array(tried.utilities)
             if np.isfinite(costs).all():
-                whole += float(np.var(worth)) * len(worth)
-                left += float(np.var(worth + costs)) * len(worth)
+                with np.errstate(all="ignore"):  # of diverged runs
+                    whole += float(np.var(worth)) * len(worth)
+                    left += float(np.var(worth + costs)) * len(worth)
     return left < LEFT * whole
 
 

@@ -40,16 +40,17 @@ class Starts:
         """
         starts = np.array([t.began for tried in (one, other) for t in tried.trials])
         middle, model = starts.mean(axis=0), self.planner.task.model
-        apart = any(
-            beyond_noise(
-                (trial,),
-                model.difference(trial.began, middle)[None],
-                tried.candidate.predicted_states[0],
-                tried.candidate.predicted_states,
-            ).any()
-            for tried in (one, other)
-            for trial in tried.trials
-        )
+        with np.errstate(all="ignore"):  # of diverged runs
+            apart = any(
+                beyond_noise(
+                    (trial,),
+                    model.difference(trial.began, middle)[None],
+                    tried.candidate.predicted_states[0],
+                    tried.candidate.predicted_states,
+                ).any()
+                for tried in (one, other)
+                for trial in tried.trials
+            )
         return self.cost(other) - self.cost(one) if apart else 0.0
 
     def cost(self, tried: Tried) -> float:
