@@ -375,13 +375,16 @@ def _start_unknown(before: Tried, after: Tried, history: Sequence[Tried]) -> boo
 def _of_start(before: Tried, after: Tried, history: Sequence[Tried]) -> float:
     """Return the model's part of a gain that is due to the start; 0 if alike, NaN if unknown.
 
-    Where no model was grounded on both, it is the planning model's (`Starts`).
+    It is the planning model's (`Starts`), which tells it of both; of the models that were grounded
+    on trials one may know only one of them. These tell it where the planning model can't.
     """
     found = _of_grounded(before, after, history)
-    if (not found or math.isnan(found)) and after.starts is not None and before.trials:
-        planned = after.starts.owed(after, before)
-        return planned if math.isfinite(planned) else found
-    return found
+    if after.starts is None or not before.trials:
+        return found
+    planned = after.starts.owed(after, before)
+    if not planned and found:  # NaN, too: they began apart
+        planned = after.starts.cost(before) - after.starts.cost(after)
+    return planned if math.isfinite(planned) else found
 
 
 def _of_grounded(before: Tried, after: Tried, history: Sequence[Tried]) -> float:

@@ -256,6 +256,10 @@ def test_what_a_start_is_worth_is_no_improvement():
     first = ran("c0001", "", -6.0, off=0.07)
     second = ran("c0002", "c0001", -3.9, off=0.0, as_run=-5.9)
     assert owed_to_start(first, second, [first, second]) == pytest.approx(1.9)
+    costs = {"c0001": 0.5, "c0002": -0.2}
+    planned = SimpleNamespace(owed=lambda *_: 0.0, cost=lambda one: costs[one.candidate.id])
+    known = replace(second, starts=planned)  # which knows both, and a grounded model only one
+    assert owed_to_start(first, known, [first, known]) == pytest.approx(0.7)
     told = by_starts(first, second, [first, second])
     assert told == "by the model, different start states alone reduced the cost by 32 %"
     found = last_improvement([first, second])

@@ -480,6 +480,22 @@ def test_commands_that_are_sent_late_are_told_from_a_log_that_has_them_late(w, t
         assert holds(told[0], f"logged {steps} late", "[log.span]") and not found.notes
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, named):
+    """A zero that a program set where its boat floated: "somebody drove", and no word of it."""
+    plan, dt, off = w.propose().candidate, w.task.dt, np.array([0.3, 0.0, -0.45])
+    runner, path = Runner(plan.policy), tmp_path / "run.csv"
+    with pytest.raises(GroundedError) as refused:
+        driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged + off))
+    told = "from another origin", "v 0.30 m/s and psi -0.45 rad", "as they are logged"
+    if not named:
+        assert holds(str(refused.value), *told, f"run {plan.id} again")
+        assert refused.value.then == NextCommand("next", ("LOG",))
+        return
+    found = w.ingest(path, candidate=plan.id)
+    assert holds(found.warnings[0], *told) and found.then.verb == "discard"
+
+
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
 def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
     """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""

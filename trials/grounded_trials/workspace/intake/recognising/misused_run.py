@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.model import Model
+from grounded.result import figure, listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import clipped
@@ -33,6 +35,7 @@ from grounded_trials.workspace.intake.locating.run_start import (
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
+ORIGIN = 0.05  # share of the commands' difference that offsets of states may leave
 MOSTLY = 0.9  # least share of the steps in which cut commands are near what is logged
 MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
@@ -80,6 +83,56 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
                 return f"they are {cut.told(own)}"
             if found := smoothed(task.model, own, run):
                 return f"they are {found.told(own)}"
+    return ""
+
+
+def other_origin(log: Recording, model: Model, own: Candidate) -> str:
+    """Return that a program passed its candidate states from another origin than the logged ones.
+
+    That is, two or more of them.
+
+    To first order, exact for states that are no angles, states that are off by d change a command
+    by the gains times d. Constant offsets that leave nothing of the difference are what it passed.
+
+    Args:
+        log: a log whose commands are not the candidate's.
+        model: with the units of the states.
+        own: the candidate.
+
+    Returns:
+        The end of a sentence about its commands; "" if no offsets explain them.
+    """
+    policy, n = own.policy, model.n
+    if policy.gain is None or (policy.state_names, policy.input_names) != log.names:
+        return ""
+    starts = [log.first, *log.openings[:TRIED]]
+    for begins in dict.fromkeys(log.on_step(policy, one) for one in starts):
+        trial = log.trial_from(begins)
+        if trial is None or min(trial.finite_steps, policy.horizon) < least_of(policy.horizon):
+            continue
+        run = commanded(policy, trial)
+        free = (run.sent > policy.low) & (run.sent < policy.high)
+        free &= (run.asked > policy.low) & (run.asked < policy.high)
+        off = ((run.sent - run.asked) / run.size)[free]
+        gains = (policy.gain[: len(free), :, :n] / run.size[:, None])[free]
+        if free.any(axis=1).sum() < FEW * n or float(np.median(np.abs(off))) < APART:
+            continue
+        by = np.linalg.lstsq(gains, off, rcond=1e-6)[0]
+        if float(np.median(np.abs(off - gains @ by))) > ORIGIN * float(np.median(np.abs(off))):
+            continue
+        does = np.abs(gains * by).max(axis=0) > ORIGIN * np.abs(off).max()
+        if does.sum() < 2:  # of one state, its sensor's zero may differ as well
+            continue
+        told = [
+            f"{name} {with_unit(figure(by[i], 2), unit)}"
+            for i, (name, unit) in enumerate(model.states.items())
+            if does[i]
+        ]
+        return (
+            f"they are what {own.id} sends on states from another origin, {listed(told)} beside "
+            "those in the log: does its program set a zero of its own, or take them from another "
+            "frame? Pass `runner.action` the states as they are logged"
+        )
     return ""
 
 

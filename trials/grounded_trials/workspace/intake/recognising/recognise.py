@@ -58,6 +58,7 @@ from grounded_trials.workspace.intake.recognising.misused_run import (
     cut_in,
     exactly_misused,
     misused_in,
+    other_origin,
 )
 from grounded_trials.workspace.intake.recognising.read_otherwise import (
     Misled,
@@ -218,6 +219,10 @@ def recognised(
         gone = passed and f"its commands are not what {ran} sends on the logged states: {passed}"
         hides = exchange or misled(log, task, own, swapped)
         hides = swap if other else None if turned or gone else hides
+        origin = ""
+        if log and why and not (units or pace or other or turned or gone or hides):
+            origin = other_origin(log, task.model, own)
+        gone = gone or (origin and f"its commands are not what {ran} sends: {origin}")
         also = turned or gone or (hides.said if hides else "")
         doubts = [seem if units else pace or also or why]
         if log and not (found and found.opens_alike):
@@ -283,6 +288,8 @@ def recognised(
     if named:
         raise _unreadable(path, ran, named, again)
     if log and not other and whole.inputs.any() and (how := misused_in(log, task, own)):
+        raise _misused(path, own, how)
+    if log and not other and (how := other_origin(log, task.model, own)):
         raise _misused(path, own, how)
     if guessed := sorted(_guessed(log)):  # the likeliest reason
         differs, _, rather = why.partition("; ")
