@@ -101,9 +101,9 @@ class Look:
         if self.log and seen.why and not seen.other and not (self.found and self.found.opens_alike):
             for at in self.log.openings[:1]:  # told beside the rest before it, any difference grows
                 trial = self.log.trial_from(self.log.on_step(own.policy, at))
-                told = judged(trial) if trial else None
-                if told and told.ran and seen.ran and told.ran.rms < seen.ran.rms:
-                    seen = replace(seen, why=told.why) if told.why and not told.other else seen
+                there = judged(trial) if trial else None
+                if there and there.ran and seen.ran and there.ran.rms < seen.ran.rms:
+                    seen = replace(seen, why=there.why) if there.why and not there.other else seen
         asked = read.log and not seen.other
         self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
         if self.fell and self.log:
