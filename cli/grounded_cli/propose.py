@@ -143,8 +143,9 @@ def _samples(candidate: Candidate, standing: Standing, task: Task) -> str:
     from grounded.search.feedback.sample_age import different, run_ages
 
     ages = run_ages(task, standing.history)
-    span = f"{1e3 * min(ages, default=0):.2g} to {1e3 * max(ages, default=0):.2g} ms"
-    old = with_unit(f"{1e3 * abs(candidate.sample_age):.2g}", "ms")
+    least, most = (float(f"{1e3 * f(ages, default=0):.2g}") for f in (min, max))
+    span = f"{least:g} to {most:g} ms"
+    old = with_unit(f"{float(f'{1e3 * abs(candidate.sample_age):.2g}'):g}", "ms")
     old += " old" if candidate.sample_age > 0 else " newer than in its log"
     if ages and different(task, min(ages), max(ages)):
         return f"{candidate.id} is planned for samples {old}; in the runs so far: {span}"

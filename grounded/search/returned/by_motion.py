@@ -21,6 +21,7 @@ from grounded.trial import Trial
 STARTS = 80  # samples to predict from
 AHEAD = 0.25, 0.5, 1.0  # [s] of the predictions; over a single one, a swing may fit a period late
 SURE = 2.0  # [nats] by which exchanged inputs must predict a run better, and earlier runs worse
+PLAIN = 1.0  # [nats] that a model may lack without calibration and still be used as it is
 MOST = 12  # number of pairs of inputs that are tried
 
 
@@ -84,13 +85,15 @@ def exchanged(planner: Planner, trial: Trial, before: Sequence[Trial]) -> Exchan
     return Exchanged((names[i], names[j]), trial.state_names[k], float(1 / shares[k]), shown)
 
 
-def fits(planner: Planner, trial: Trial) -> list[Fit]:
+def fits(planner: Planner, trial: Trial, *, as_it_is: bool = False) -> list[Fit]:
     """Return the fits of predictions of several lengths, shorter ones first; [] if none is known.
 
     Args:
         planner: plans with the model, and the effects adopted; its inputs arrive late by its own
             latency.
         trial: a run; only its part without gaps is used.
+        as_it_is: do not calibrate the model on the run. Calibration absorbs a part of what a wrong
+            command does; a crude model explains nothing without.
     """
     from grounded.effects.memory import shifted
 
@@ -104,8 +107,18 @@ def fits(planner: Planner, trial: Trial) -> list[Fit]:
     model, own = planner.plan.model, range(planner.task.model.n)
     acts = replace(lifted, inputs=arrives)
     each = [Ahead(model, acts, own, STARTS, (0.0,), horizon=one) for one in AHEAD]
+    gains = np.ones(model.m)
     with np.errstate(all="ignore"):
-        return [one.best([np.ones(model.m)]) for one in each if one.enough]
+        if as_it_is:
+            return [one.plain(gains) for one in each if one.enough]
+        return [one.best([gains]) for one in each if one.enough]
+
+
+def explains(planner: Planner, trials: Sequence[Trial]) -> bool:
+    """Return whether the model predicts runs about as well as it is as if calibrated on each."""
+    lacks = [score(fits(planner, one, as_it_is=True)) - score(fits(planner, one)) for one in trials]
+    known = [one for one in lacks if np.isfinite(one)]
+    return bool(known) and float(np.median(known)) < PLAIN
 
 
 def score(found: Sequence[Fit]) -> float:

@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from grounded.search.planner import Planner
-from grounded.search.returned.by_motion import fits, score
+from grounded.search.returned.by_motion import explains, fits, score
 from grounded.trial import Trial
 
 BEYOND = 1, 6  # steps beyond the lead or lag in question that are tried: a delay may be missing
@@ -42,10 +42,12 @@ def what_is_late(planner: Planner, trial: Trial, late: int, before: Sequence[Tri
         late: [steps], > 0.
         before: earlier runs, whose commands were in time.
     """
-    now = Shifted(planner, trial, late)
+    plain = explains(planner, before)
+    now = Shifted(planner, trial, late, as_it_is=plain)
     if (own := now.best) is None:
         return Late.EITHER
-    known = [by for one in before if (by := Shifted(planner, one, late).best) is not None]
+    earlier = [Shifted(planner, one, late, as_it_is=plain).best for one in before]
+    known = [by for by in earlier if by is not None]
     usual = float(np.median(known)) if known else 0.0
     clear, leads = now.missed(usual - late) - now.missed(usual), usual - own
     if leads > (1 - NEAR) * late and clear < -CLEAR:  # a cause comes before its effect
@@ -61,12 +63,16 @@ class Shifted:
         planner: plans with the model, and the effects adopted.
         trial: a run without gaps.
         most: the largest lead or lag of interest [steps].
+        as_it_is: do not calibrate the model on the run.
     """
 
-    def __init__(self, planner: Planner, trial: Trial, most: int) -> None:
+    def __init__(
+        self, planner: Planner, trial: Trial, most: int, *, as_it_is: bool = False
+    ) -> None:
         whole = trial.until(max(trial.finite_steps, 0))
         self.shifts = np.arange(-most - BEYOND[0], most + BEYOND[1] + 1)
-        self.scores = np.array([_missed(planner, whole, int(shift)) for shift in self.shifts])
+        each = [_shifted(whole, int(shift)) for shift in self.shifts]
+        self.scores = np.array([score(fits(planner, one, as_it_is=as_it_is)) for one in each])
 
     @property
     def best(self) -> float | None:
@@ -89,7 +95,7 @@ class Shifted:
         return float(np.interp(shift, self.shifts, self.scores))
 
 
-def _missed(planner: Planner, trial: Trial, shift: int) -> float:
-    """Return the calibrated model's errors [nats] with commands moved later by `shift` steps."""
+def _shifted(trial: Trial, shift: int) -> Trial:
+    """Return a trial with its commands moved later by `shift` steps."""
     at = np.clip(np.arange(len(trial.inputs)) - shift, 0, len(trial.inputs) - 1)
-    return score(fits(planner, replace(trial, inputs=trial.inputs[at])))
+    return replace(trial, inputs=trial.inputs[at])

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from grounded.search.candidate import Candidate
+from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.late_commands import Late, what_is_late
 from grounded.search.returned.who_drove import UNLIKE, follows, latest
 from grounded.trial import Trial
@@ -85,7 +87,11 @@ def lagging(workspace: Folder, trial: Trial) -> Lagging | None:
     task, (own, _) = workspace.task, workspace.candidate(trial.candidate)
     whole = trial.until(task.horizon)
     ran = follows(own.policy, whole, max(LATEST, latest(task)))
-    if ran is None or not (ran.alike and ran.late and ran.moved < UNLIKE):
+    if ran is None or not ran.alike:
+        return None
+    if not ran.late:
+        return _logged_late(workspace, own, whole)
+    if not ran.moved < UNLIKE:
         return None
     if ran.late < 0 or ran.age <= NOW * ran.late:
         return Lagging(own.id, ran.late, None, task.dt)
@@ -94,6 +100,20 @@ def lagging(workspace: Folder, trial: Trial) -> Lagging | None:
     if own.policy.gain is None and what is Late.PROGRAM:  # nor does the start show in its commands
         what = Late.EITHER
     return Lagging(own.id, ran.late, what, task.dt, tuple(one.id for one in before))
+
+
+def _logged_late(workspace: Folder, own: Candidate, run: Trial) -> Lagging | None:
+    """Return that a run whose samples seem to be steps old rather has its commands logged late.
+
+    Cut where its commands begin in the log, it is the same.
+    """
+    steps = round(sample_age(workspace.task, own, [run]) / workspace.task.dt)
+    if steps < 1:
+        return None
+    before = _in_time(workspace, run.id)
+    if what_is_late(workspace.planner, run, steps, before) is not Late.LOG:
+        return None
+    return Lagging(own.id, steps, Late.LOG, workspace.task.dt, tuple(one.id for one in before))
 
 
 def _in_time(workspace: Folder, but: str) -> list[Trial]:
