@@ -250,7 +250,7 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         )
         return (
             f"{candidate.base} with its gains reduced to {percent(share)}: its feedback made the "
-            f"inputs oscillate, {seconds}"
+            f"inputs swing, {seconds}"
         )
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)

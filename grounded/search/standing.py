@@ -28,11 +28,14 @@ from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, PART, Candidate, Tried, Way
 from grounded.search.certainty import (
     LUCK,
+    MANY,
     error_between,
     explained,
     few,
     judged,
     last_improvement,
+    runs_needed,
+    runs_to_show,
 )
 from grounded.search.scatter import Repeats
 from grounded.search.starts import Starts
@@ -470,6 +473,12 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
         else:
             lost += ", but none as good ran twice, so how much such runs differ is not known"
         sentence = f"{lost}: {made.id} is waiting for another trial{from_start}"
+        gap, whole = abs(doubt.gain_over(now.incumbent)), now.incumbent
+        if excused and whole.deviation > 0 and gap > 0 and runs_to_show(gap, whole) > MANY:
+            sentence += (
+                f". To show that difference takes {runs_needed(gap, whole)} of each of the two: if "
+                f"that is too many, stop with {best.id}"
+            )
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"

@@ -1,7 +1,8 @@
 """Detect feedback that makes inputs oscillate, and keep it at the strength that ran quietly.
 
 A limit cycle shows in a trial: an input swings about its plan, by the plan's range or more
-(`swings`), or goes from limit to limit (`between_limits`).
+(`swings`), or goes from limit to limit (`between_limits`). Noise that high gains carry swings an
+input, too, at all frequencies (`periodic`).
 
 An arm of a search swung, and its next candidate, with 44 % of the gains, ran quietly but lost: dry
 friction held it back. The step after it had all of the gains again, and ended in a limit cycle
@@ -34,6 +35,7 @@ from grounded.trial import Trial
 # fraction of an input's range within which it counts as at its limit; share of steps that is often
 NEAR, OFTEN = 0.01, 0.3
 SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
+NEARBY, PERIODIC = 2, 0.5  # frequencies beside the strongest, and their share in a limit cycle
 HALF = 0.5  # share of the strength that oscillated, if none weaker than that ran quietly
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
 HUGE = 1e100  # bound on the motion of a diverged run in a step, in the state's unit
@@ -67,6 +69,23 @@ def swings(made: Candidate, trial: Trial, range_: Array) -> Array:
     sizes = np.maximum(range_, np.abs(median(off)))
     each = zip(off.T, sizes, range_, strict=True)
     return np.array([_swings(one, size) if of > 0 else 0 for one, size, of in each])
+
+
+def periodic(values: Array) -> bool:
+    """Return whether a signal (T,) has much of its power near one frequency.
+
+    A limit cycle has; sensor noise that high gains make an input of has not. Short signals, whose
+    few frequencies can't tell, count as periodic.
+    """
+    known = values[np.isfinite(values)]
+    line = np.arange(len(known)) - 0.5 * (len(known) - 1)
+    level = known - known.mean()
+    level = level - line * float(line @ level) / max(float(line @ line), 1e-300)
+    power = np.abs(np.fft.rfft(level * np.hanning(len(level)))) ** 2
+    if not power.sum() > 0:
+        return False
+    k = int(np.argmax(power))
+    return bool(power[max(0, k - NEARBY) : k + NEARBY + 1].sum() > PERIODIC * power.sum())
 
 
 def plan_range(made: Candidate, task: Task) -> Array:

@@ -8,7 +8,7 @@ import pytest
 
 from grounded.plant import Noise, Plant
 from grounded.search import making
-from grounded.search.feedback.oscillation import calm_ranges, quiet_gains
+from grounded.search.feedback.oscillation import calm_ranges, periodic, quiet_gains
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
@@ -131,3 +131,12 @@ def test_a_plan_that_replays_swings_is_no_measure_of_them(told):
     _, sizes = calm_ranges(told.task, later)
     np.testing.assert_array_equal(sizes, np.ptp(told.first.predicted_inputs, axis=0))
     assert np.ptp(swung.predicted_inputs) > 1.5 * sizes[0]
+
+
+@pytest.mark.parametrize("cycle", [False, True])
+def test_noise_that_gains_carry_is_told_from_a_limit_cycle(cycle):
+    """17 swings of a boat's thruster "oscillated", by noise that `propose` had announced."""
+    rng, T = np.random.default_rng(0), 120
+    shaken = np.convolve(rng.normal(0, 0.12, T + 2), [0.3, 0.5, 0.3], "valid")
+    moves = 0.2 * np.sin(0.7 * np.arange(T)) + 0.3 * shaken if cycle else 1.6 * shaken
+    assert periodic(moves) == cycle

@@ -22,7 +22,7 @@ from grounded.frozen import Array
 from grounded.places import velocities
 from grounded.result import figure, listed, measured_alike
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.feedback.oscillation import SWINGS, calm_ranges, swings
+from grounded.search.feedback.oscillation import SWINGS, calm_ranges, periodic, swings
 from grounded.search.feedback.sample_age import PROBED, different, rates, sample_age
 from grounded.search.returned.clipped import clipped
 from grounded.search.returned.smoothed import smoothed
@@ -282,14 +282,18 @@ def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried
     ]
     if not told:
         return []
+    off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
+    cycles = any(periodic(off[:, i]) for i in np.flatnonzero(counts >= SWINGS))
+    did = "oscillate about the plan" if cycles else "swing about the plan, at no one frequency"
+    why = "" if cycles else ", as sensor noise does through high gains"
     others = [one for one in tried.trials if one.id != trial.id]
     calm = [one.id for one in others if not (swings(made, one, sizes) >= SWINGS).any()]
     if calm:
         return [
-            f"its feedback made {listed(told)} oscillate about the plan, but not in "
-            f"{ranges(calm)}: did the program or the robot differ?"
+            f"its feedback made {listed(told)} {did}, but not in {ranges(calm)}: did the program "
+            "or the robot differ?"
         ]
     return [
-        f"its feedback made {listed(told)} oscillate about the plan: the next candidates get "
-        "weaker feedback, or say if they can't"
+        f"its feedback made {listed(told)} {did}{why}: the next candidates get weaker feedback, or "
+        "say if they can't"
     ]
