@@ -58,7 +58,7 @@ class Lagging:
             return (
                 f"its program sent the commands of {name} {lag}: the robot moved with the commands "
                 f"as they are in the log, as in {ranges(self.earlier)}, so the log is right. Let "
-                f"it {passed}, and run {name} again"
+                f"it {passed}; discard this run and run {name} again"
             )
         if self.what is Late.EITHER:
             return (
