@@ -145,7 +145,7 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         meaning = VERDICTS.get(BEGUN if doubted else one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
             noted = any("discard" in note for note in one.notes)
-            warned = any("discard" in one or "again" in one for one in one.warnings)
+            warned = any("discard" in text or "again" in text for text in one.warnings)
             says = "note" if noted and not warned else "warning"
             meaning = f"; discard it, as the {says} says, or go on with it: `propose`"
         if passed and one.verdict in BEST:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import begun, listed, measured_alike, with_error
-from grounded.search.candidate import BY_STEP, LITTLE, PART, UNLIKE, run_or_stop
+from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE, run_or_stop
 from grounded.search.step.step_size import Step
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import LABEL, field, number, progress, remark, show, show_json
@@ -380,8 +380,10 @@ def _came_true(
     The gain is one of predictions, which may lack some of the sensor noise in a log (`lacks`). A
     prediction begins at [task] start; what it cost that runs began elsewhere is no error of it.
     """
+    from grounded.search.certainty import missed_by_start
+
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
-    began = [_by_start(one) for one in last]
+    began = [missed_by_start(one) for one in last]
     promises = [one.promised - cost for one, cost in zip(last, began, strict=True)]
     missed = [abs(promise - one.utility) for promise, one in zip(promises, last, strict=True)]
     whole = measured_alike([off for off in missed if math.isfinite(off)], "")
@@ -426,18 +428,6 @@ def _came_true(
     if blind or candidate.doubtful or not little:  # a note may say it
         return doubt
     return f"{doubt}. {run_or_stop(gain, best)}"
-
-
-def _by_start(tried: Tried) -> float:
-    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
-
-    A part of what the runs missed their prediction by; 0 if the model can't tell it, too.
-    """
-    if tried.starts is None or not math.isfinite(tried.utility):
-        return 0.0
-    cost = tried.starts.cost(tried)
-    small = abs(cost) < PART * abs(tried.promised - tried.utility)
-    return 0.0 if small or not math.isfinite(cost) else cost
 
 
 def _measured(workspace: Workspace) -> str:

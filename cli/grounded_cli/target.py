@@ -205,7 +205,8 @@ def command(
             f"{', '.join(f'{name} = {number(value)}' for name, value in rest.items())}. If runs "
             "begin elsewhere, change it and draw the target again"
         )
-    suggested = {name: float(f"{w:.6g}") for name, w in usual_weights(model, columns).items()}
+    each, at_end = usual_weights(model, columns), () if ended is None else ended.columns
+    suggested = {name: float(f"{w:.6g}") for name, w in each.items() if name not in at_end}
     shared = len({*position_names(model)} & {*columns}) > 1
     alike = ", coordinates of a position alike by the smaller of their ranges" * shared
     slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))

@@ -421,6 +421,19 @@ def cost_of_start(best: Tried, made: Candidate) -> float:
     return made.expected_of_base - made.base_as_run
 
 
+def missed_by_start(tried: Tried) -> float:
+    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
+
+    A part of what they missed its prediction by, which begins at [task] start. 0 if the model can't
+    tell it, too.
+    """
+    if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
+        return 0.0
+    cost = tried.starts.cost(tried)
+    small = abs(cost) < PART * abs(tried.promised - tried.utility)
+    return 0.0 if small or not math.isfinite(cost) else cost
+
+
 def began_apart(one: Tried, other: Tried) -> bool:
     """Return whether the trials of two candidates began apart.
 

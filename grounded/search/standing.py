@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import BY_STEP, LITTLE, PART, Candidate, Tried, Way
+from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import (
     LUCK,
     MANY,
@@ -34,6 +34,7 @@ from grounded.search.certainty import (
     few,
     judged,
     last_improvement,
+    missed_by_start,
     runs_needed,
     runs_to_show,
 )
@@ -368,7 +369,7 @@ def _restarted(history: tuple[Tried, ...], model: str) -> str:
     )
 
 
-def due(tried: Tried, best: Tried) -> float:
+def _due(tried: Tried, best: Tried) -> float:
     """Return the part of a loss to the best one that the start states explain by the model."""
     if tried.starts is None or not (tried.trials and best.trials):
         return 0.0
@@ -391,10 +392,8 @@ def let_down(ended: Standing, model: str) -> Standing:
         if made not in lost or made.doubtful:
             continue
         error, known = error_between(best, tried, ended.history)
-        loss, noise = (
-            best.utility - tried.utility - due(tried, best),
-            LUCK * error if known else 0.0,
-        )
+        loss = best.utility - tried.utility - _due(tried, best)
+        noise = LUCK * error if known else 0.0
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:
@@ -403,9 +402,8 @@ def let_down(ended: Standing, model: str) -> Standing:
     if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
         return ended
     gave = f"gave {figure(most.utility)}" if math.isfinite(most.utility) else "failed"
-    cost = most.starts.cost(most) if most.starts is not None and most.trials else 0.0
-    from_there = math.isfinite(cost) and abs(cost) > PART * abs(most.promised - most.utility)
-    said = figure(most.promised - cost * from_there) + " from where its runs began" * from_there
+    cost = missed_by_start(most)
+    said = figure(most.promised - cost) + " from where its runs began" * bool(cost)
     why = (
         f". But {most.candidate.id}, for which {said} was predicted, {gave}: the model is wrong "
         f"near {own}, and a diagnosis may show what it lacks"

@@ -5,6 +5,7 @@ And a cause that has a mechanism in place of a coupling, which has none.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
 
 from grounded.diagnosis.hypotheses.explored import TIE
@@ -29,21 +30,18 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
     """
     h, score = fit.hypothesis, search.score
     params = {e.name for e in search.candidates if e.known or isinstance(e.family, ParamFamily)}
-    own, same = {e.name: (e, v) for e, v in h.pairs}, dict[tuple[str, str], bool]()
+    own = {e.name: (e, v) for e, v in h.pairs}
     for name in [n for n in equations(fit) if n not in params] if h.spread == 0 else ():
         rest = {*h.names} - {name}
         sets = {tuple(sorted({*rest, param})) for param in params - rest}
 
-        def lacks(other: Fitted, name: str = name) -> float:
+        same = _same(search, own[name][0])
+
+        def lacks(other: Fitted, name: str = name, same: Mapping[str, Effect] = same) -> float:
             """Return the nats that another fit lacks; the price of what is the same counts not."""
             nats = score(fit) - score(other)
             for effect, values in other.hypothesis.pairs:
-                pair = effect.name, name
-                if effect.name in own:
-                    continue
-                if pair not in same:
-                    same[pair] = _is(search, effect, own[name][0])
-                if same[pair]:
+                if effect.name in same and effect.name not in own:
                     nats += search.price(*own[name]) - search.price(effect, values)
             return nats
 
@@ -51,8 +49,8 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
             exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
             return min(exact, key=lacks, default=fit)
 
-        for param in search.candidates:  # fits beside other effects may not have found its size
-            if param.name not in rest and _is(search, param, own[name][0]):
+        for param in same.values():  # fits beside other effects may not have found its size
+            if param.name not in rest:
                 begun = {q.name: q.start for q in param.free}
                 start = (h.minus(name).plus(param, begun), fit.noise, fit.track)
                 search.refined([start], TO_THE_TOP)
@@ -65,12 +63,15 @@ def own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
     return _calibrated_instead(search, fit, ruler)
 
 
-def _is(search: HypothesisSearch, param: Effect, effect: Effect) -> bool:
-    """Check whether an error of a parameter is the same as an effect in any trial."""
-    if not isinstance(param.family, ParamFamily):
-        return False
-    index = search.data.model.param_names.index(param.site.target)
-    return one_thing(search.predictor, index, effect)
+def _same(search: HypothesisSearch, effect: Effect) -> dict[str, Effect]:
+    """Return the errors of parameters that are the same as an effect in any trial, by name."""
+    names = search.data.model.param_names
+    return {
+        param.name: param
+        for param in search.candidates
+        if isinstance(param.family, ParamFamily)
+        and one_thing(search.predictor, names.index(param.site.target), effect)
+    }
 
 
 def with_mechanism(search: HypothesisSearch, fit: Fitted) -> Fitted | None:

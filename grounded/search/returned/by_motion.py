@@ -14,6 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
+from grounded.instruments.predictions.mistaken import Mistake
 from grounded.instruments.predictions.short_runs import Ahead, Fit
 from grounded.search.planner import Planner
 from grounded.trial import Trial
@@ -61,20 +62,22 @@ def exchanged(planner: Planner, trial: Trial, before: Sequence[Trial]) -> Exchan
         before: earlier runs; those that the exchange predicts better as well speak against it.
     """
     units = list(planner.task.model.inputs.values())
-    pairs = [pair for pair in combinations(range(len(units)), 2) if len({*_of(units, pair)}) == 1]
+    pairs = [(i, j) for i, j in combinations(range(len(units)), 2) if units[i] == units[j]]
     if not 0 < len(pairs) <= MOST:
         return None
     as_sent, least, best = fits(planner, trial), -SURE, None
     if not as_sent:
         return None
     for pair in pairs:
-        other = fits(planner, _swapped(trial, pair))
+        other = fits(planner, Mistake(inputs=pair).mended(trial))
         if other and (gain := score(other) - score(as_sent)) < least:
             least, best = gain, (pair, other)
     if best is None:
         return None
     (i, j), other = best
-    known = [(one.id, score(fits(planner, one)), _swapped(one, (i, j))) for one in before]
+    known = [
+        (one.id, score(fits(planner, one)), Mistake(inputs=(i, j)).mended(one)) for one in before
+    ]
     told = [(name, plain - score(fits(planner, turned))) for name, plain, turned in known]
     if any(gain > 0 for _, gain in told):
         return None
@@ -95,17 +98,15 @@ def fits(planner: Planner, trial: Trial, *, as_it_is: bool = False) -> list[Fit]
         as_it_is: do not calibrate the model on the run. Calibration absorbs a part of what a wrong
             command does; a crude model explains nothing without.
     """
-    from grounded.effects.memory import shifted
+    from grounded.effects.memory import late_inputs
 
     assert planner.plan.latency is not None
     lifted = planner.lift(trial.until(max(trial.finite_steps, 0)))
     if not len(lifted.inputs):
         return []
-    late = planner.plan.latency / trial.dt
-    sent = zip(lifted.inputs.T[:, None], lifted.inputs[0], late, strict=True)
-    arrives = np.vstack([shifted(u, np.array([held]), by) for u, held, by in sent]).T
+    sent, latency = lifted.inputs[None], planner.plan.latency
+    acts = replace(lifted, inputs=late_inputs(sent, sent[:, 0], latency, trial.dt)[0])
     model, own = planner.plan.model, range(planner.task.model.n)
-    acts = replace(lifted, inputs=arrives)
     each = [Ahead(model, acts, own, STARTS, (0.0,), horizon=one) for one in AHEAD]
     gains = np.ones(model.m)
     with np.errstate(all="ignore"):
@@ -124,13 +125,3 @@ def explains(planner: Planner, trials: Sequence[Trial]) -> bool:
 def score(found: Sequence[Fit]) -> float:
     """Return the mean error of fits [nats]; NaN without any."""
     return float(np.mean([one.score for one in found])) if found else float("nan")
-
-
-def _swapped(trial: Trial, pair: tuple[int, int]) -> Trial:
-    inputs = np.array(trial.inputs)
-    inputs[:, pair] = inputs[:, pair[::-1]]
-    return replace(trial, inputs=inputs)
-
-
-def _of(units: Sequence[str], pair: tuple[int, int]) -> list[str]:
-    return [units[k] for k in pair]

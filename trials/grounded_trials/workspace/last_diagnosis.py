@@ -107,7 +107,7 @@ def left_out(workspace: Folder) -> list[str]:
         f"{ranges(ids)} {'was' if len(ids) == 1 else 'were'} sampled every {was:g} s, [task] dt is "
         f"{dt:g} s now: fit, diagnose and the search leave {'it' if len(ids) == 1 else 'them'} "
         f"out. To use {'it' if len(ids) == 1 else 'them'}, `discard` and ingest the log again, or "
-        f"set dt back"
+        "set dt back"
         for was, ids in paced.items()
     ]
     if others:

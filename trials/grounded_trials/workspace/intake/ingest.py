@@ -158,8 +158,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     odd = tuple(one.told(trial, own=read.own) for one in faults)
     scaled = [name for one in faults for name in one.inputs]
     elsewhere = begun_elsewhere(workspace, trial)
-    other = "" if read.doubted else ran_otherwise(workspace, trial)
-    lag = lagging(workspace, interpolate_gaps(trial).trial) if trial.candidate else None
+    lag = lagging(workspace, trial)
+    other = "" if read.doubted else ran_otherwise(workspace, trial, lag)
     checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
     if lag and not other:
         checked = (*checked, lag.told())

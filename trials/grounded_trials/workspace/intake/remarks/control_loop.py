@@ -31,7 +31,7 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.lagging import lagging
+from grounded_trials.workspace.intake.remarks.lagging import Lagging
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 UNSENT = 5  # steps without a command that are fewer are sought where the run begins
@@ -43,12 +43,13 @@ NAMED = 2  # largest number of states that are named
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
 
-def ran_otherwise(workspace: Folder, trial: Trial) -> str:
+def ran_otherwise(workspace: Folder, trial: Trial, lag: Lagging | None) -> str:
     """Return the warning for a run whose program did not run its candidate as planned; or "".
 
     Args:
         workspace: the workspace with the task and the candidate.
         trial: the trial as stored.
+        lag: by how many steps its commands are off, see `lagging`.
     """
     if not trial.candidate:
         return ""
@@ -59,7 +60,7 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> str:
         return told
     if found := smoothed(workspace.base_model, own, whole):
         return f"its commands are {found.told(own)}, and run {own.id} again"
-    if (lag := lagging(workspace, whole)) and lag.again:
+    if lag and lag.again:
         return lag.told()
     return _predicted_ahead(workspace, own, whole)
 

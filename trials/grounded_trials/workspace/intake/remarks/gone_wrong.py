@@ -35,7 +35,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.lagging import EARLIER
+from grounded_trials.workspace.intake.remarks.lagging import EARLIER, lagging
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.read_before import paths_of, read_by
@@ -270,7 +270,9 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
         why = f"{name}: {said}{'' if said.endswith('?') else '.'} {unless}"
         return (why,), NextCommand("discard", (name,))
     told = [one.told(trial, own=own) for one in log_faults(workspace, trial)]
-    told += filter(None, [ran_otherwise(workspace, last.measured)])
+    told += filter(
+        None, [ran_otherwise(workspace, last.measured, lagging(workspace, last.measured))]
+    )
     begun = begun_elsewhere(workspace, last.measured)
     told += [begun.told] if begun and begun.again else []
     if not told:

@@ -13,7 +13,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.late_commands import Late, what_is_late
 from grounded.search.returned.who_drove import UNLIKE, follows, latest
-from grounded.trial import Trial
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import count, ranges
 from grounded_trials.workspace.folder import Folder
 
@@ -82,8 +82,11 @@ def lagging(workspace: Folder, trial: Trial) -> Lagging | None:
 
     Args:
         workspace: the workspace with the candidates and the earlier runs.
-        trial: a run, without gaps.
+        trial: as stored; None is returned for one that ran no candidate.
     """
+    if not trial.candidate:
+        return None
+    trial = interpolate_gaps(trial).trial
     task, (own, _) = workspace.task, workspace.candidate(trial.candidate)
     whole = trial.until(task.horizon)
     ran = follows(own.policy, whole, max(LATEST, latest(task)))
