@@ -290,6 +290,8 @@ def _seen(search: HypothesisSearch, ruler: Ruler, crude: Fitted, fit: Fitted) ->
         return True
     if search.tempering.factor > WHITE and gain.beyond(*SLIGHTLY):
         return search.score(fit) - search.score(search.best_null()) > LIKELY
+    if search.tempering.factor > WHITE and _closes_the_gap(search, crude, fit, gain):
+        return True
     sensed = all(isinstance(e.family, SensorFamily) for e in fit.hypothesis.effects)
     return sensed and search.score(fit) - search.score(search.best_null()) > LARGE_GAIN
 
@@ -375,7 +377,6 @@ def _pruned(
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
-        some = search.data.count > 1  # of one log, all pieces but one may miss a rare motion
         undone = counterparts(search.predictor, fit.hypothesis) or [
             n for n in fit.hypothesis.names if set_by_bound(search, fit, without[n], n)
         ]
@@ -389,9 +390,11 @@ def _pruned(
             or [
                 name
                 for name, less in without.items()
-                if gains[name].channels.max() < least
-                or (some and gains[name].mean < max(NO_HELP, SPECK * least / SLIGHT))
-                or not _pays(search, ruler, less, fit, white)
+                if not _pays(search, ruler, less, fit, white)
+                or (
+                    _of_no_account(search, gains[name], least)
+                    and not (white and _missed(search, fit, less, gains[name], least))
+                )
             ]
         )
         if not undone:  # what loses nothing is not needed, whatever its evidence
@@ -404,6 +407,40 @@ def _pruned(
         if nats > LIKELY and name in equations(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit, repeated[name], gains[name].alone))
         fit = without[name]
+
+
+def _of_no_account(search: HypothesisSearch, gain: Gain, least: float) -> bool:
+    """Check whether a cause gains next to nothing of what all causes gain.
+
+    In one log, the mean is not asked: all pieces but one may miss a rare motion.
+    """
+    some = search.data.count > 1
+    return bool(gain.channels.max() < least) or (
+        some and gain.mean < max(NO_HELP, SPECK * least / SLIGHT)
+    )
+
+
+def _missed(search: HypothesisSearch, fit: Fitted, less: Fitted, gain: Gain, least: float) -> bool:
+    """Check whether a cause of little account is missed, beside white innovations.
+
+    The mean over the channels hides what matters in one, such as a late sensor: there it counts, if
+    it is very likely. And a leftover that only the rest without it has is no gap that "no known
+    effect explains".
+    """
+    very_likely = search.score(fit) - search.score(less) > LARGE_GAIN
+    if gain.mean > 0 and very_likely and gain.channels.max() >= least:
+        return True
+    return _closes_the_gap(search, less, fit, gain)
+
+
+def _closes_the_gap(search: HypothesisSearch, less: Fitted, fit: Fitted, gain: Gain) -> bool:
+    """Check whether nothing is left with a fit, and predictions gain, where something is without.
+
+    Both leftovers are scored on trials that were held out.
+    """
+    likely = gain.mean > 0 and search.score(fit) - search.score(less) > SURE
+    predictor = search.predictor
+    return likely and bool(leftovers(predictor, less)) and not leftovers(predictor, fit)
 
 
 def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bool:

@@ -98,7 +98,8 @@ class Measured:
         Without repeats, the one-step noise is propagated by the model. It contains the error of the
         model, so the floor is an upper bound (`at_most`). Beside a leftover the scatter of repeats
         does as well, and the smaller of the two is the floor of its channel. Coloured noise is
-        taken as noise only in channels in which a flexible regression finds no structure.
+        taken as noise only in channels in which a flexible regression finds no structure. Few
+        repeats may scatter less than their sensors do, which no prediction of a reading can.
         """
         self.unsure = np.zeros((len(self.ruler.steps) + 1, 1))
         if self.exact and not self.is_white:  # white innovations are noise, and the repeat a copy
@@ -122,12 +123,25 @@ class Measured:
                 found[:, off] = np.where(less, own, found[:, off])
                 self.unsure = np.repeat(self.unsure, len(self.units), axis=1)
                 self.unsure[:, place] *= ~less
+        if scatter is not None and not self.exact:
+            found[:-1] = np.fmax(found[:-1], self.sensors())
         reached = [e.rms for _, e in self.ruler.measured]
         reached += [errors.rms for _, errors in self.flexible.values()]
         least = np.fmin.reduce(reached)
         if scatter is not None and np.isnan(found[-1]).all():
             least[-1] = np.nan  # repeats are too short for the floor of whole trials
         return np.fmin(found, least)[:, self.ruler.shown], source
+
+    def sensors(self) -> Array:
+        """Return the rms white noise of each state's sensor, (n,); 0 without samples.
+
+        It is the smaller of two estimates. That of the best fit contains errors of the model within
+        a step, and that of differences a motion that bends within few samples.
+        """
+        fitted = np.sqrt(self.best.noise.plain.measurement(1)[-1, 0])
+        rows = [len(trial.states) for trial in self.trials]
+        seen = np.average([trial.noise() ** 2 for trial in self.trials], axis=0, weights=rows)
+        return np.minimum(fitted, np.sqrt(seen))
 
     def white(self) -> dict[str, float]:
         """Return the p-value of white innovations, by channel."""
