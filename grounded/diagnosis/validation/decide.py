@@ -52,7 +52,7 @@ from grounded.diagnosis.validation.own_numbers import SURE, equations, own_numbe
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
-from grounded.effects import ParamFamily, SensorFamily
+from grounded.effects import ParamFamily, SensorDelayFamily, SensorFamily, SensorLagFamily
 
 RIVALS = 8  # likeliest hypotheses that are measured
 LEAST = 0.01  # smallest log gain of a cause in its best channel
@@ -393,7 +393,7 @@ def _pruned(
                 if not _pays(search, ruler, less, fit, white)
                 or (
                     _of_no_account(search, gains[name], least)
-                    and not (white and _missed(search, fit, less, gains[name], least))
+                    and not (white and _missed(search, fit, name, less, gains[name], least))
                 )
             ]
         )
@@ -420,15 +420,19 @@ def _of_no_account(search: HypothesisSearch, gain: Gain, least: float) -> bool:
     )
 
 
-def _missed(search: HypothesisSearch, fit: Fitted, less: Fitted, gain: Gain, least: float) -> bool:
+def _missed(
+    search: HypothesisSearch, fit: Fitted, name: str, less: Fitted, gain: Gain, least: float
+) -> bool:
     """Check whether a cause of little account is missed, beside white innovations.
 
-    The mean over the channels hides what matters in one, such as a late sensor: there it counts, if
-    it is very likely. And a leftover that only the rest without it has is no gap that "no known
-    effect explains".
+    A sensor that is late shows in its own channel only, which the mean over all channels hides:
+    there it counts, if it is very likely. And a leftover that only the rest without a cause has is
+    no gap "that no known effect explains".
     """
+    effect = next((e for e in fit.hypothesis.effects if e.name == name), None)
+    late = effect is not None and isinstance(effect.family, SensorDelayFamily | SensorLagFamily)
     very_likely = search.score(fit) - search.score(less) > LARGE_GAIN
-    if gain.mean > 0 and very_likely and gain.channels.max() >= least:
+    if late and very_likely and gain.mean > 0 and gain.channels.max() >= least:
         return True
     return _closes_the_gap(search, less, fit, gain)
 
