@@ -32,7 +32,7 @@ from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import SLIGHT, Decision
+from grounded.diagnosis.validation.decide import SLIGHT, Decision, closes_the_gap
 from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import Limits, identifiable, joints_without_input
@@ -108,6 +108,8 @@ class Writer:
         Or some state at some horizon gains much, and all do on average: a robot's side slip made
         its position's error a second ahead a fifth, and doubled that at the end of 46 s.
 
+        Or nothing is left with it, where a gap is without it.
+
         Or as many effects are likelier, and predict as well. What a longer search meets on its way
         may be the cause that a shorter one missed: a camera's delay, 30 nats likelier than the
         coupling that imitated it.
@@ -116,6 +118,8 @@ class Writer:
         more = ruler.gain(less, fit)
         much = more.mean > 0 and more.largest > MUCH
         if much or more.mean > SLIGHT * ruler.since_outset(fit):
+            return True
+        if closes_the_gap(self.search, ruler, less, fit):
             return True
         likelier = self.search.score(fit) > self.search.score(less) + CLAIM
         as_many = len(fit.hypothesis.effects) <= len(less.hypothesis.effects)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from grounded.diagnosis import writer as module
 from grounded.diagnosis.writer import Writer
 
 
@@ -17,18 +18,20 @@ def gain(mean):
 
 
 @pytest.mark.parametrize(
-    ("nats", "names", "mean", "replaces"),
+    ("nats", "names", "mean", "closes", "replaces"),
     [
-        (30.0, ("delay",), 0.0, True),  # a camera's, imitated by a coupling that was met first
-        (1.0, ("delay",), 0.0, False),  # the two tie
-        (30.0, ("delay",), -0.2, False),  # likelier, but predictions refuse it
-        (30.0, ("delay", "drag"), 0.0, False),  # a further effect has to be worth its name
-        (30.0, ("delay", "drag"), 0.3, True),
+        (30.0, ("delay",), 0.0, False, True),  # a camera's; a coupling that imitates it came first
+        (1.0, ("delay",), 0.0, False, False),  # the two tie
+        (30.0, ("delay",), -0.2, False, False),  # likelier, but predictions refuse it
+        (30.0, ("delay", "drag"), 0.0, False, False),  # one effect more has to be worth its name
+        (30.0, ("delay", "drag"), 0.3, False, True),
+        (30.0, ("delay", "drag"), 0.01, True, True),  # or what is told as a gap is gone with it
     ],
 )
 def test_as_many_effects_that_are_likelier_take_the_place_of_those_found_first(
-    nats, names, mean, replaces
+    monkeypatch, nats, names, mean, closes, replaces
 ):
+    monkeypatch.setattr(module, "closes_the_gap", lambda *_: closes)
     first, later = decided(0.0, "coupling"), decided(nats, *names)
     ruler = SimpleNamespace(
         gain=lambda before, after: gain(mean if after is later else -mean),

@@ -14,6 +14,7 @@ Noise, however coloured or heavy-tailed, gains nothing there. A correction that 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,8 @@ from grounded import places
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ruler import folds
+from grounded.diagnosis.validation.gain import Errors
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.result import per_second
@@ -30,6 +32,7 @@ from grounded.result import per_second
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
 PENALTIES = (3.0, 30.0)  # ridge: relative prior variances of the weights
 LAGS = (1, 2, 4, 7)  # steps
+COUNTS = (2.0, 0.03)  # scatters and log gain of predictions by a correction that is stated
 RHO_LAGS = 10  # autocorrelation lags of the test for white innovations
 
 
@@ -61,6 +64,20 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
             unit = data.model.states[name]
             found.append(Leftover(name, gain, size, per_second(unit), correction, step_gain))
     return sorted(found, key=lambda left: -left.gain)
+
+
+def corrections(
+    ruler: Ruler, fit: Fitted, left: Sequence[Leftover]
+) -> dict[str, tuple[Leftover, Errors]]:
+    """Return, by channel, the leftovers of a fit whose correction improves predictions."""
+    names, found = ruler.data.model.state_names, {}
+    for one in left:
+        rate = np.zeros((*one.correction.shape, len(names)))
+        rate[..., names.index(one.channel)] = one.correction
+        gain, errors = ruler.corrected(fit, rate)
+        if gain.beyond(*COUNTS):
+            found[one.channel] = one, errors
+    return found
 
 
 def flexible(predictor: Predictor, fit: Fitted) -> Array:

@@ -38,7 +38,7 @@ from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.joint_model import split
-from grounded.diagnosis.hypotheses.leftover import leftovers
+from grounded.diagnosis.hypotheses.leftover import corrections, leftovers
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.hypotheses.swaps import parted
@@ -290,7 +290,7 @@ def _seen(search: HypothesisSearch, ruler: Ruler, crude: Fitted, fit: Fitted) ->
         return True
     if search.tempering.factor > WHITE and gain.beyond(*SLIGHTLY):
         return search.score(fit) - search.score(search.best_null()) > LIKELY
-    if search.tempering.factor > WHITE and _closes_the_gap(search, crude, fit, gain):
+    if closes_the_gap(search, ruler, crude, fit):
         return True
     sensed = all(isinstance(e.family, SensorFamily) for e in fit.hypothesis.effects)
     return sensed and search.score(fit) - search.score(search.best_null()) > LARGE_GAIN
@@ -393,7 +393,7 @@ def _pruned(
                 if not _pays(search, ruler, less, fit, white)
                 or (
                     _of_no_account(search, gains[name], least)
-                    and not (white and _missed(search, fit, name, less, gains[name], least))
+                    and not _missed(search, ruler, fit, name, less, least)
                 )
             ]
         )
@@ -421,7 +421,7 @@ def _of_no_account(search: HypothesisSearch, gain: Gain, least: float) -> bool:
 
 
 def _missed(
-    search: HypothesisSearch, fit: Fitted, name: str, less: Fitted, gain: Gain, least: float
+    search: HypothesisSearch, ruler: Ruler, fit: Fitted, name: str, less: Fitted, least: float
 ) -> bool:
     """Check whether a cause of little account is missed, beside white innovations.
 
@@ -431,20 +431,27 @@ def _missed(
     """
     effect = next((e for e in fit.hypothesis.effects if e.name == name), None)
     late = effect is not None and isinstance(effect.family, SensorDelayFamily | SensorLagFamily)
-    very_likely = search.score(fit) - search.score(less) > LARGE_GAIN
+    late = late and search.tempering.factor > WHITE
+    very_likely, gain = search.score(fit) - search.score(less) > LARGE_GAIN, ruler.gain(less, fit)
     if late and very_likely and gain.mean > 0 and gain.channels.max() >= least:
         return True
-    return _closes_the_gap(search, less, fit, gain)
+    return closes_the_gap(search, ruler, less, fit)
 
 
-def _closes_the_gap(search: HypothesisSearch, less: Fitted, fit: Fitted, gain: Gain) -> bool:
-    """Check whether nothing is left with a fit, and predictions gain, where something is without.
+def closes_the_gap(search: HypothesisSearch, ruler: Ruler, less: Fitted, fit: Fitted) -> bool:
+    """Check whether predictions gain, and nothing is left with a fit where a gap is without it.
 
-    Both leftovers are scored on trials that were held out.
+    Beside white innovations only. Both leftovers are scored on trials that were held out, and the
+    first one is of a state whose errors matter, with a correction that improves predictions, as of
+    a gap that is told.
     """
-    likely = gain.mean > 0 and search.score(fit) - search.score(less) > SURE
-    predictor = search.predictor
-    return likely and bool(leftovers(predictor, less)) and not leftovers(predictor, fit)
+    likely = search.tempering.factor > WHITE and search.score(fit) - search.score(less) > SURE
+    if not likely or ruler.gain(less, fit).mean <= 0:
+        return False
+    left = leftovers(search.predictor, less)
+    left = [one for one in left if not ruler.negligible(less, one.channel)]
+    told = corrections(ruler, less, left) if left else {}
+    return bool(told) and not leftovers(search.predictor, fit)
 
 
 def _whole(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> bool:

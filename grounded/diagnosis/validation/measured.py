@@ -27,13 +27,12 @@ from grounded.diagnosis.error_report import (
     RunChange,
     Split,
 )
-from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
+from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.ahead import unseen
 from grounded.diagnosis.validation.credit import losses, ordered, shares
 from grounded.diagnosis.validation.decide import Decision, plain
-from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
 from grounded.diagnosis.validation.ruler import Ruler, repeated
 from grounded.diagnosis.validation.split import split
@@ -45,7 +44,6 @@ FAR = 3.0  # times the noise floor, above which a leftover is stated despite any
 WHITE = 0.01  # p-value below which the innovations are not white
 MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
 AWAY = 30.0  # times a state's measured range, above which a prediction has diverged
-COUNTS = (2.0, 0.03)  # scatters and log gain of a flexible correction that is stated
 
 
 class Measured:
@@ -68,7 +66,7 @@ class Measured:
         self.lost = losses(ruler, decision)
         self.credit = shares(ruler, decision, self.lost)
         self.left = leftovers(self.predictor, self.best)
-        self.flexible = self.corrections()
+        self.flexible = corrections(ruler, self.best, self.left)
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
         self.is_white = not self.left and min(told, default=0.0) * len(told) > WHITE
@@ -160,17 +158,6 @@ class Measured:
         each = [np.maximum(steps, first) for steps in self.ruler.steps]
         rows = [[of[int(k)][i] for i, k in enumerate(at)] for at in each]
         return np.array([*rows, np.full(len(first), np.nan)])
-
-    def corrections(self) -> dict[str, tuple[Leftover, Errors]]:
-        """Return, by channel, the leftovers whose correction improves predictions."""
-        names, found = self.data.model.state_names, {}
-        for left in self.left:
-            rate = np.zeros((*left.correction.shape, len(names)))
-            rate[..., names.index(left.channel)] = left.correction
-            gain, errors = self.ruler.corrected(self.best, rate)
-            if gain.beyond(*COUNTS):
-                found[left.channel] = left, errors
-        return found
 
     def prediction_error(self) -> tuple[RulerRow, ...]:
         """Return the table of prediction errors at 0.1, 0.5, 1 s and over the whole trial."""

@@ -1,7 +1,8 @@
 """Find when commands change in an uncut log: where its control steps begin, and what came before.
 
 If commands changed in the middle of grid steps, each would be up to half a step early or late, so
-the data start at a change. A recording that starts in motion does not contain the commands before
+the data start at a change. If they change at any time, as a driver's do, a step has their mean. A
+recording that starts in motion does not contain the commands before
 it, but a model with a delay needs them in the first steps. Such data start where the commands have
 been constant for a while. A robot that stands still until its first command had no command before,
 or one that keeps it at rest.
@@ -31,7 +32,9 @@ STILL_S = 0.2  # [s] shortest standstill
 STILL, NOISE = 2e-3, 4.0  # at rest: within this share of its range, and this multiple of its noise
 
 
-def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[float, float] | None:
+def phase_of(
+    changes: Floats, dt: float, late: Floats | None = None, *, whole_rows: bool = True
+) -> tuple[float, float] | None:
     """Return the phase within a step at which commands change, and its uncertainty.
 
     If table rows and commands have different periods, each change is seen late by another part of
@@ -41,6 +44,8 @@ def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[fl
         changes: (K,) times at which a change was seen, from the beginning of a step [s].
         dt: control step [s].
         late: (K,) largest delay with which each change may have been seen [s]; None: no delay.
+        whole_rows: whether a change may be seen late by a whole row, as that of a program that
+            sends when a row is written. Else changes at either of two rows are in no step.
 
     Returns:
         The latest possible phase, -dt / 2 to dt / 2, and by how much earlier it may be [s]; None if
@@ -51,7 +56,7 @@ def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[fl
     if late is not None and 0 < np.median(late) <= COARSEST * dt:
         tried = changes[np.unique(np.linspace(0, len(changes) - 1, TRIED).astype(int))]
         after = (changes - tried[:, None] + TOUCH * dt) % dt  # (tried, K)
-        fits = after < late + 2 * TOUCH * dt
+        fits = after < late + 2 * TOUCH * dt * whole_rows
         best = int(np.argmax(fits.sum(axis=1)))
         if fits[best].mean() >= IN_ROWS:
             room = (late - after[best])[fits[best]].min() + TOUCH * dt
@@ -112,8 +117,8 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
     return max((held_rows(s.t, s.y) for s in shared), default=0.0)
 
 
-def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, str]:
-    """Return by how much to move the start of data [ns], and a warning, "" for none.
+def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, bool]:
+    """Return by how much to move the start of data [ns], and whether commands change in steps.
 
     Args:
         inputs: the commands.
@@ -127,20 +132,13 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) 
     found, first = np.unique(at, return_index=True)
     here = found >= start - round(dt * 0.5e9)
     later, late = found[here], late[first][here]
-    known, moved, warning = phase_of((later - start) * 1e-9, dt, late * 1e-9), 0, ""
+    known, moved = phase_of((later - start) * 1e-9, dt, late * 1e-9, whole_rows=False), 0
     phase = known and known[0]
     if phase is not None and abs(phase) >= MOVED * dt:
         moved = round((phase if phase > 0 else phase + dt) * 1e9)
-    elif phase is None and len(later) > FEW:
-        apart = float(np.median(np.diff(later))) * 1e-9
-        if apart > dt / 2:  # with more frequent changes a step has their mean
-            warning = (
-                f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
-                f"{dt / 2:.3g} s early or late, and an identified delay is no more accurate"
-            )
     if unknown:
         moved = _steady(inputs, found, start, moved, dt)
-    return moved, warning
+    return moved, phase is not None or len(later) <= FEW
 
 
 def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:

@@ -4,7 +4,9 @@
     input k = value held at t_k + dt / 2        zero-order hold, at the middle of the step
 
 Inputs are taken at the middle because a command's stamp scatters around its t_k: taken at t_k,
-every late one would appear a whole step later.
+every late one would appear a whole step later. Commands of data that change in no steps, as those
+of a driver or of a faster program, are taken as their mean over the step: the value at its middle
+would be up to half a step early or late, and most often early if rows are half a step apart.
 
 Gaps, clocks that jump and clocks that differ are refused, since they hide what happened. Everything
 else is counted and reported.
@@ -161,17 +163,17 @@ def to_grid(
     tracked = [samples[name] for name in states if how[name] == "linear"]
     still = rest is not None and stands_still(tracked, rates, start)
     unknown = rest is not None and not still and in_motion(sent, start, rest)
-    moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, unknown)
+    moved, in_steps = (0, True) if rest is None else first_step(sent, start, dt, unknown)
     start += moved
     stop = min(until, _end(span, series, start, origin, until))
     count = _steps(start, stop, dt, steps, origin, stamped_otherwise(samples.values(), dt))
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
     times = {name: grid if name in states else middle for name in names}
-    columns = [
-        (whole[name].linear if how[name] == "linear" else whole[name].hold)(at, dt, start)
-        for name, at in times.items()
-    ]
+    if not in_steps:
+        how |= {n: "mean" for n in inputs if samples[n].spec.resample is None}
+    sampled = {"linear": Samples.linear, "hold": Samples.hold, "mean": Samples.mean}
+    columns = [sampled[how[name]](whole[name], at, dt, start) for name, at in times.items()]
 
     def told() -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
         reports = tuple(
@@ -179,7 +181,7 @@ def to_grid(
             for (name, at), column in zip(times.items(), columns, strict=True)
         )
         stairs = staircases(tracked, start, int(grid[-1]), dt)
-        return reports, (*warnings_of(reports, late), *filter(None, (uneven,)), *stairs)
+        return reports, (*warnings_of(reports, late), *stairs)
 
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:

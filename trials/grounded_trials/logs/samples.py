@@ -136,6 +136,26 @@ class Samples:
             self._refuse(self.t[i[k]], at[k], limits[k], origin)
         return self.y[i]
 
+    def mean(self, at: Ints, dt: float, origin: int) -> Floats:
+        """Return the mean of the held value over the step about each time; raises as `hold` does.
+
+        Args:
+            at: (M,) middles of the steps [ns].
+            dt: control step [s].
+            origin: the trial's start, for messages [ns].
+        """
+        held, half = self.hold(at, dt, origin), round(dt * 0.5e9)
+        since = (self.t - self.t[0]) * 1e-9
+        total = np.concatenate([[0.0], np.cumsum(self.y[:-1] * np.diff(since))])
+        edges = []
+        for edge in (at - half, at + half):
+            i = np.maximum(np.searchsorted(self.t, edge, "right") - 1, 0)
+            edges.append(total[i] + self.y[i] * ((edge - self.t[0]) * 1e-9 - since[i]))
+        changes = np.concatenate([[0], np.cumsum(np.diff(self.y) != 0)])
+        seen = np.searchsorted(self.t, [at - half, at + half - 1], "right") - 1
+        begun, ended = changes[np.maximum(seen, 0)]
+        return np.where(begun == ended, held, (edges[1] - edges[0]) / (2e-9 * half))
+
     def leading_to(self, at: int) -> Lead | None:
         """Return what the samples of the second before a time [ns] say of the value there.
 
