@@ -265,10 +265,36 @@ def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
 
 
 def test_data_whose_commands_do_not_change_in_steps_stay_where_they_are() -> None:
-    often = grid(pose(np.sin), held(0.005, 0.0), rest=np.zeros(1))
-    assert often.moved_s == 0 and often.warnings == ()  # a step has their mean
-    odd = grid(pose(np.sin), held(0.035, 0.0), rest=np.zeros(1))
-    assert odd.moved_s == 0 and holds(odd.warnings[0], "0.035 s", "0.05 s", "0.025 s")
+    for change in (0.005, 0.035):
+        found = grid(pose(np.sin), held(change, 0.0), rest=np.zeros(1))
+        assert found.moved_s == 0 and found.warnings == ()
+        t = np.arange(0.0, 2.0, 0.005).reshape(-1, 10)  # the rows of each step
+        mean = np.floor(t / change + 1e-9).mean(axis=1)
+        np.testing.assert_allclose(found.inputs[:40, 0], mean, atol=1e-9)
+
+
+def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
+    """A command that a driver changes at any row, at least so many seconds apart, at 100 Hz."""
+    rng, t = np.random.default_rng(2), np.arange(0.0, 20.0, 0.025)
+    at = np.cumsum(rng.choice(rows, 60)) * every
+    return series(t, np.searchsorted(at, t + 1e-9, "right") % 5, SignalSpec("/x.u", "log", **spec))
+
+
+def test_a_driver_s_commands_are_neither_early_nor_late() -> None:
+    """A boat's delay of 0.12 s was 0.152: rows of half a step, commands at any of them."""
+    x = pose(np.sin)
+    x = series(np.arange(-0.5, 21.0, 0.025), np.zeros(860), x.spec)
+    u = driven(np.array([7, 8, 9]), 0.025)
+    found = grid(x, u, rest=np.zeros(1)).inputs[:, 0]
+    rows = u.values.reshape(-1, 2)[: len(found)]
+    assert (np.diff(rows, axis=1) != 0).sum() > 10  # many in the middle of a step
+    assert found[: len(rows)] == pytest.approx(rows.mean(axis=1))
+    # of commands in steps, and of a candidate's run, each step has one that was sent
+    steps = driven(np.array([8, 10]), 0.025)
+    for each, how in ((steps, {"rest": np.zeros(1)}), (u, {})):
+        assert set(grid(x, each, **how).inputs[:, 0]) <= set(u.values)
+    asked = driven(np.array([7, 8, 9]), 0.025, resample="hold")
+    assert set(grid(x, asked, rest=np.zeros(1)).inputs[:, 0]) <= set(u.values)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.messages import Floats
+from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.command_steps import (
     first_step,
     in_motion,
@@ -148,7 +148,9 @@ def to_grid(
     check_clocks({n: series[n] for n in (*names, *span.signals())})
     samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
     check_overlap([samples[n] for n in states], [samples[n] for n in inputs])
-    how = {n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names}
+    how: dict[str, str] = {
+        n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names
+    }
     for name in names:
         if how[name] == "linear":
             samples[name].check_linear(dt)
@@ -172,7 +174,11 @@ def to_grid(
     times = {name: grid if name in states else middle for name in names}
     if not in_steps:
         how |= {n: "mean" for n in inputs if samples[n].spec.resample is None}
-    sampled = {"linear": Samples.linear, "hold": Samples.hold, "mean": Samples.mean}
+    sampled: dict[str, Callable[[Samples, Ints, float, int], Floats]] = {
+        "linear": Samples.linear,
+        "hold": Samples.hold,
+        "mean": Samples.mean,
+    }
     columns = [sampled[how[name]](whole[name], at, dt, start) for name, at in times.items()]
 
     def told() -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
