@@ -139,7 +139,7 @@ class Measured:
         fitted = np.sqrt(self.best.noise.plain.measurement(1)[-1, 0])
         rows = [len(trial.states) for trial in self.trials]
         seen = np.average([trial.noise() ** 2 for trial in self.trials], axis=0, weights=rows)
-        return np.minimum(fitted, np.sqrt(seen))
+        return np.asarray(np.minimum(fitted, np.sqrt(seen)))
 
     def white(self) -> dict[str, float]:
         """Return the p-value of white innovations, by channel."""
