@@ -18,6 +18,7 @@ from grounded.search.scatter import (
     beyond_noise,
     by_pieces,
     by_states,
+    explained_by_starts,
     noise_cost,
     noise_missed,
     with_errors,
@@ -74,6 +75,7 @@ def judged(
             continue
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
         tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone, starts=starts)
+        tried = replace(tried, placed=explained_by_starts((*history, tried)))
         better = incumbent is None or tried.utility > incumbent.utility
         if better and not failed:
             tried = replace(tried, accepted=True)

@@ -221,7 +221,7 @@ class Repeats:
 
 def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
     """Return the candidates, each with the standard deviation of a run of similar utility."""
-    near, placed = Repeats(history).near, by_starts(history)
+    near, placed = Repeats(history).near, explained_by_starts(history)
     each = [(tried, near(tried.utility)) for tried in history]
     return tuple(
         replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats, placed=placed)
@@ -229,7 +229,7 @@ def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
     )
 
 
-def by_starts(history: Sequence[Tried]) -> bool:
+def explained_by_starts(history: Sequence[Tried]) -> bool:
     """Return whether where runs began is most of what repeats scatter by, as the model tells."""
     whole = left = 0.0
     for tried in history:

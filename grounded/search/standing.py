@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
-from grounded.result import Result, document, figure, html_table, spread
+from grounded.result import Result, document, figure, html_table, percent, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import (
     LUCK,
@@ -477,12 +477,27 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
                 f". To show that difference takes {runs_needed(gap, whole)} of each of the two: if "
                 f"that is too many, stop with {best.id}"
             )
+        else:
+            sentence += _or_stop(doubt.candidate, whole)
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"
     else:
         return None
     return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
+
+
+def _or_stop(doubted: Candidate, best: Tried) -> str:
+    """Return what is at stake in another run for a loss in doubt, and how to stop; "" for much."""
+    share = max(doubted.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
+    if share >= LITTLE or best.is_unsteady:
+        return ""
+    own = best.candidate.id
+    promise = f"{percent(share)} of what {own} costs" if share > 0 else f"nothing over {own}"
+    return (
+        f". {doubted.id} promises {promise}: if that is not worth another run, stop with {own}, "
+        "the best so far (`export best`)"
+    )
 
 
 def _waiting(now: Standing, model: str) -> Tried | None:

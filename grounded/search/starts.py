@@ -36,8 +36,11 @@ class Starts:
     def owed(self, one: Tried, other: Tried) -> float:
         """Return the part of the difference of two mean utilities that is due to the starts.
 
-        It is 0 if all runs began alike, and NaN if the model can't tell it.
+        It is 0 if all runs began alike, and NaN if the model can't tell it. Where repeats bear out
+        that their starts are most of what runs scatter by, no two runs began alike.
         """
+        if one.placed or other.placed:
+            return self.cost(other) - self.cost(one)
         starts = np.array([t.began for tried in (one, other) for t in tried.trials])
         middle, model = starts.mean(axis=0), self.planner.task.model
         with np.errstate(all="ignore"):  # of diverged runs

@@ -16,7 +16,7 @@ from grounded.search.scatter import (
     PIECES,
     Repeats,
     by_pieces,
-    by_starts,
+    explained_by_starts,
     noise_cost,
     noise_missed,
     sensor_noise,
@@ -248,5 +248,5 @@ def test_runs_that_scatter_by_where_they_began_are_none_that_another_policy_stea
         starts = SimpleNamespace(costs=lambda _, e=explained: e)
         made = SimpleNamespace(id="c0001", base="")
         (one,) = with_errors([Tried(made, (None,) * 3, worth, True, starts=starts)])
-        assert one.placed == placed and by_starts([one]) == placed
+        assert one.placed == placed and explained_by_starts([one]) == placed
         assert replace(one, deviation=2.0).is_unsteady == (not placed)

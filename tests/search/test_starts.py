@@ -7,6 +7,7 @@ import pytest
 
 from facts import holds
 from grounded.plant import Plant
+from grounded.search.candidate import Candidate, Tried
 from grounded.search.certainty import to_settle
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
@@ -118,6 +119,39 @@ def test_the_candidate_whose_start_matters_more_is_run_again(story):
     assert to_settle(best, twice, 9) is best  # where starts scatter, it was asked for without end
     policy = doubt.candidate.policy
     assert worth_of_start(PLANNER, policy, OFF) < 0 == worth_of_start(PLANNER, policy, 0 * OFF)
+
+
+def test_where_starts_are_known_to_be_what_runs_scatter_by_none_is_taken_as_alike(
+    monkeypatch, story
+):
+    """A run that began 78 mm off "lost by no more than noise may explain"."""
+    monkeypatch.setattr("grounded.search.starts.beyond_noise", lambda *_: np.array([False]))
+    now = story.run(1, OFF)
+    best, doubt = now.history
+    assert Starts(PLANNER).owed(doubt, best) == 0.0
+    placed = replace(doubt, placed=True)
+    costs = [Starts(PLANNER).cost(one) for one in (best, placed)]
+    assert Starts(PLANNER).owed(placed, best) == pytest.approx(costs[0] - costs[1]) != 0.0
+    assert not now.history[1].placed  # no repeat bears that out yet
+    assert story.run(1, 0.3 * OFF).history[1].placed
+
+
+def test_another_run_for_a_loss_in_doubt_says_what_is_at_stake(story, monkeypatch):
+    """The last two of a boat's six runs were for 2.6 % of what its best one cost."""
+    now = story.run(1, worse=0.05)
+    best = now.incumbent
+    assert now.outstanding is not None and "stop with" not in now.sentence  # promises much
+    for promise, told in (
+        (0.026, "c0002 promises 2.6 % of what c0001"),
+        (-0.1, "nothing over c0001"),
+    ):
+        over = promise * -best.utility
+        monkeypatch.setattr(Candidate, "promised_over", lambda made, other, gain=over: gain)
+        assert holds(
+            story.now.sentence, told, "worth another run, stop with c0001", "(`export best`)"
+        )
+    monkeypatch.setattr(Tried, "is_unsteady", True)  # another policy may be steadier
+    assert "stop with" not in story.now.sentence
 
 
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
