@@ -274,10 +274,12 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
         policy = f"and {rest:.3g} to the policy"
         if rest < 0:
             policy = f"without which {other} would be ahead by {-rest:.3g}"
+        if not rest > SHOWN * (error if freedom else 0.0):
+            policy += ": which of the two is better is open"
         return (
             f"the last gain, of {after.candidate.id} over {other}, is {measured} as measured, and "
             f"that counts; by the model, {start:.3g} of it is due to where their runs began, "
-            f"{policy}. Another run of {other}, from [task] start, would show which is better"
+            f"{policy}"
         )
     if freedom and error and _start_unknown(before, after, history):
         return (

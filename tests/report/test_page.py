@@ -259,8 +259,9 @@ def test_a_calibrated_model_is_not_called_crude(car):
     assert findings.plain == "crude model" and not findings.effects
     name, value = next(iter(findings.nominal.items()))
     other = replace(findings, nominal={**findings.nominal, name: 2 * value + 1})
-    assert other.plain == "calibrated model"
-    assert replace(other, effects=("dead_zone:u",)).plain.startswith("calibrated model without")
+    assert other.plain == "model with its present parameters"
+    both = replace(other, effects=("dead_zone:u",)).plain
+    assert both == "model with its present parameters, without effects"
 
 
 def test_errors_at_the_end_are_told_with_their_noise(cart):

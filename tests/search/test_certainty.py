@@ -315,6 +315,10 @@ def test_a_lead_that_lucky_starts_explain_is_told_so():
     assert chance(first, led, [first, led]) < chance(first, fair, [first, fair])
     assert "0.9 of it is due to where" in last_improvement([first, led])
     assert "probability" not in last_improvement([first, led])  # which took all for a gain
+    # "another run of c0001 would show which is better" stood beside a next command that ran c0003
+    assert last_improvement([first, led]).endswith("which of the two is better is open")
+    clear = last_improvement([ran("c0001", (-5.0, -5.01)), ran("c2", (-2.0,), owed=1.0)])
+    assert clear.endswith("and 2.01 to the policy")
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=0.01)])
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=np.nan)])
 

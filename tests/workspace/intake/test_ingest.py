@@ -182,7 +182,7 @@ def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later
         moved[0, 1] += off * np.ptp(moved[:, 1])  # a state without weight
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         told += [ingest_log(w, tmp_path / "t.mcap", "c0001").warnings]
-    later = "after 3 runs, offsets that are usual spoil no run"
+    later = "after 3 runs, a start is compared with where the others began"
     assert [any(later in one for one in warnings) for warnings in told] == [True, True, False]
     assert not any("started with" in one for one in told[2])
 

@@ -128,7 +128,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             "average runs ([search] repeats), to see smaller gains"
         )
     elif max(placed.runs) < FEWEST:
-        does += f" (after {FEWEST + 1} runs, offsets that are usual spoil no run)"
+        does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
         whole = _changes(workspace, trial, off)
