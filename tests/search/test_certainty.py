@@ -318,7 +318,7 @@ def test_a_lead_that_lucky_starts_explain_is_told_so():
     # "another run of c0001 would show which is better" stood beside a next command that ran c0003
     assert last_improvement([first, led]).endswith("which of the two is better is open")
     clear = last_improvement([ran("c0001", (-5.0, -5.01)), ran("c2", (-2.0,), owed=1.0)])
-    assert clear.endswith("and 2.01 to the policy")
+    assert clear.endswith("and 2 to the policy")
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=0.01)])
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=np.nan)])
 
