@@ -13,8 +13,10 @@ from grounded.errors import GroundedError
 Array = NDArray[np.float64]
 MEDIAN = 0.6745  # median of |x| of a standard normal x
 ORDERS = (2, 3, 4, 5)  # orders of differences
-FLAT = 0.85  # least ratio of the last two orders of differences of noise
+FLAT = 0.85  # least ratio of estimates of noise by differences of different orders, but the first
 COLOURED = 1.2  # ratio of differences of every second sample and of neighbours: more is no chance
+FALLS, CLEARLY, LEAST = 0.15, 1.2, 1.07  # how neighbours' estimates fall with the order, see below
+SLOWER = 2.9  # the ratio of a sensor that is slower than the log
 
 
 def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
@@ -84,12 +86,18 @@ def resampled_noise(states: Array) -> Array:
 
     A sample halfway between two of the sensor has half the noise of each of its neighbours, whose
     differences so show as little as 0.4 of it. Those of every second sample show all of it; they
-    count where they are noise and no motion: where a higher order hardly makes them less.
+    count where they are noise and no motion: where higher orders hardly change them, and where
+    those of neighbours fall with the order. The more neighbours share, the less noise there is at
+    high frequencies: if they show 0.6 or 0.4 of it, the second order has 1.3 or 1.4 times the noise
+    of the fifth. A fast motion in steps, such as an aircraft's roll, has the same at all orders.
     """
     near, apart = _by_orders(states, 1), _by_orders(states, 2)
     white, found = _seen(near), _seen(apart)
-    level = apart[-1] > FLAT * apart[-2]
-    return np.where(level & (found > COLOURED * white), found, white)
+    level = apart[1:].min(axis=0) > FLAT * apart[1:].max(axis=0)
+    more = found / np.maximum(white, 1e-300)
+    falls = near[0] > np.minimum(1 + FALLS * (more - 1), CLEARLY) * near[-1]
+    falls &= (near[-1] < LEAST * white) | (more > SLOWER)
+    return np.where(level & falls & (more > COLOURED), found, white)
 
 
 def _by_orders(states: Array, stride: int) -> Array:

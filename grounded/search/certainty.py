@@ -118,7 +118,7 @@ def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[st
         since: ids of the candidate and of all later ones.
     """
     made = tried.candidate
-    missed = noise_missed(task, made, noises.before(since))
+    missed = noise_missed(task, made, noises.before(since, made.seen))
     cost = noise_cost(task, made.policy, noises.now) if tried.trials else 0.0
     return replace(tried, noise_cost=cost, noise_missed=missed)
 

@@ -144,10 +144,18 @@ class NoiseSoFar:
         """The noise by the latest trials, (n,)."""
         return self._at(len(self.trials))
 
-    def before(self, candidates: Collection[str]) -> Array:
-        """Return the noise by the trials before the first of candidates; if none, by that one."""
+    def before(self, candidates: Collection[str], seen: Collection[str] = ()) -> Array:
+        """Return the noise by the trials before the first of candidates; if none, by that one.
+
+        Args:
+            candidates: ids of a candidate and of those that were made later.
+            seen: ids of the search's trials when the candidate was made, after which trials are
+                none of its promise, such as a log that is data only.
+        """
         ran = (k for k, trial in enumerate(self.trials) if trial.candidate in candidates)
-        return self._at(max(1, next(ran, len(self.trials))))
+        count = next(ran, len(self.trials))
+        last = [k + 1 for k, trial in enumerate(self.trials[:count]) if trial.id in seen]
+        return self._at(last[-1] if last else max(1, count))
 
     def _at(self, count: int) -> Array:
         if count not in self._found:

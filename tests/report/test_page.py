@@ -261,7 +261,7 @@ def test_a_calibrated_model_is_not_called_crude(car):
     other = replace(findings, nominal={**findings.nominal, name: 2 * value + 1})
     assert other.plain == "model with its present parameters"
     both = replace(other, effects=("dead_zone:u",)).plain
-    assert both == "model with its present parameters, without effects"
+    assert both == "model with its present parameters, without adopted effects"
 
 
 def test_errors_at_the_end_are_told_with_their_noise(cart):

@@ -220,6 +220,20 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
     assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0
 
 
+def test_a_fast_motion_is_no_noise_of_an_interpolated_log():
+    """An aircraft's roll rate: 0.0065 rad/s at rest, 0.027 counted, which cost a promise 0.19."""
+    rng, dt, roll = np.random.default_rng(4), 0.01, 0.0
+    holds = [np.full(rng.integers(3, 12), rng.uniform(-0.6, 0.6)) for _ in range(90)]
+    rates = []
+    for aileron in np.concatenate(holds)[:600]:
+        rates.append(roll)
+        for _ in range(10):  # it settles within two steps of 0.1 s
+            roll += dt * (4.0 * aileron - 6.5 * roll)
+    log = (np.array(rates) + 0.0065 * rng.standard_normal(600))[:, None]
+    white = white_noise(log)[0]
+    assert resampled_noise(log)[0] == white < 0.012 < white_noise(log[::2])[0]
+
+
 @pytest.mark.parametrize("gaps", [False, True])
 def test_the_noise_of_all_columns_is_that_of_each_alone(gaps):
     log = np.random.default_rng(5).standard_normal((60, 4)).cumsum(axis=0)

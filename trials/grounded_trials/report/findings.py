@@ -156,7 +156,9 @@ class Findings:
         model = "model with its present parameters" if changed else "model"
         if self.effects:  # the diagnosis's "calibrated" is another: the best one without effects
             return (
-                f"{model} without adopted effects" if not changed else f"{model}, without effects"
+                f"{model} without adopted effects"
+                if not changed
+                else f"{model}, without adopted effects"
             )
         return model if changed else "crude model"
 

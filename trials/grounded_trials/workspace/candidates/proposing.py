@@ -197,7 +197,7 @@ def propose_in(workspace: Folder) -> Proposed:
             proposal = replace(proposal, notes=(*proposal.notes, note))
     noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
     same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
-    noise = noises.before([candidate.id])
+    noise = noises.before([candidate.id], candidate.seen)
     cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
     whole = noise_cost(workspace.task, candidate.policy, noise)
     predicted = off_target_of(workspace.task, [candidate.predicted_run])
