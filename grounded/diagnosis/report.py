@@ -25,7 +25,7 @@ from grounded.diagnosis.error_report import (
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.ruler_words import contested
+from grounded.diagnosis.ruler_words import objection
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.instruments.finding import Finding, late_effects
 from grounded.result import Document, number
@@ -297,7 +297,14 @@ class Diagnosis(Document):
     @property
     def contested(self) -> bool:
         """Whether the claim should not be adopted, because some predictions get worse with it."""
-        return contested(self.prediction_error, self.agreement, self.effects)
+        return bool(self.objection)
+
+    @property
+    def objection(self) -> str:
+        """Why the claim should not be adopted; "" if it may be."""
+        ties = [group for group in self.indistinguishable if group not in self.equivalent]
+        gap = any(one.above for one in self.leftover)
+        return objection(self.prediction_error, self.agreement, self.effects, ties, gap=gap)
 
     @property
     def no_cause(self) -> bool:

@@ -16,6 +16,7 @@ NAMED = 3  # channels named in one sentence
 MATTERS = 0.05  # share of the crude model's error below which a remaining error is given as a share
 HALF, MORE = 0.5, 0.2  # improvements: below HALF 1 s ahead and MORE of it over whole trials
 COMPARABLE = 0.2  # difference of two improvements, as shares, that hardly matters
+LITTLE = 0.1  # mean share of the errors below which a claim that ties gains too little to adopt
 SHOWS = 0.1  # relative change below which a channel is not named
 REPEATED = "the scatter of the repeats holds what the model misses in each as well"
 COUNTS = 0.03  # relative change below which a loss is not compared with gains elsewhere
@@ -186,30 +187,50 @@ def _losses(rows: Sequence[RulerRow]) -> list[tuple[float, RulerRow, str]]:
     ]
 
 
-def contested(
-    rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
-) -> bool:
-    """Check whether adopting the claimed effects is unwise."""
-    return bool(objection(rows, agreement, effects))
-
-
 def objection(
-    rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
+    rows: Sequence[RulerRow],
+    agreement: Sequence[Agreement],
+    effects: Sequence[str],
+    ties: Sequence[Sequence[str]] = (),
+    *,
+    gap: bool = False,
 ) -> str:
     """Return a clause on why adopting the claimed effects is unwise; "" if it is not.
 
     It is if predictions lose more than they gain, or get worse somewhere while the trials disagree
-    about the effects' values.
+    about the effects' values; also if all of them tie with others and gain little beside a gap that
+    remains: a heading that an aircraft's sideslip moves was told as an old log.
+
+    Args:
+        rows: held-out prediction errors, a row per horizon.
+        agreement: whether the trials agree on each value.
+        effects: the claimed effects.
+        ties: groups of effects that further trials could tell apart.
+        gap: whether a gap remains.
     """
     if not effects:
         return ""
     if outweighed(rows):
         return "predictions get worse with what is claimed"
+    tied = [name for name in effects if any(name in group for group in ties)]
+    if gap and len(tied) == len(effects) and _gains_little(rows):
+        rivals = dict.fromkeys(n for group in ties for n in group if n not in effects)
+        return (
+            f"beside the gap that remains, {listed(tied)} gain{'s' * (len(tied) == 1)} little and "
+            f"can't be told from {' or '.join(rivals)}"
+        )
     differ = dict.fromkeys(one.effect for one in agreement if not one.agrees)
     names = [name for name in differ if name in effects]
     if not names or not worsened(rows):
         return ""
     return f"the trials disagree on {listed(names)}, and some predictions get worse"
+
+
+def _gains_little(rows: Sequence[RulerRow]) -> bool:
+    """Check whether the errors of the furthest horizon shrink by less than LITTLE on average."""
+    row = furthest(rows)
+    gains = [] if row is None else [gain for gain in _gains(row).values() if math.isfinite(gain)]
+    return bool(gains) and sum(gains) < LITTLE * len(gains)
 
 
 def floor(row: RulerRow | None) -> str:

@@ -137,7 +137,10 @@ def verdict(
         return _said("none", text, *once, first=first)
     apart = _apart(per_trial, agreement)
     open_gap = any(one.above for one in remainder)
-    causes = _causes(claims, ranking, credit, identified, apart, open_gap, adopted, combinations)
+    ties = {name for group in groups if open_gap and group not in same for name in group}
+    causes = _causes(
+        claims, ranking, credit, identified, apart, open_gap, adopted, combinations, ties
+    )
     told = clauses(
         [one.of for one in credit],
         causes,
@@ -241,8 +244,12 @@ def _causes(
     open_gap: bool = False,
     adopted: Collection[str] = (),
     combinations: Sequence[Combination] = (),
+    ties: Collection[str] = (),
 ) -> tuple[str, ...]:
-    """Return one clause per cause, the largest first; `open_gap`: a gap remains beside them."""
+    """Return one clause per cause, the largest first.
+
+    Beside a gap that remains (`open_gap`), nothing is said as if sure of those with `ties`.
+    """
     from grounded.diagnosis.validation.claims import has_size
     from grounded.diagnosis.validation.motions import KNOWN
 
@@ -262,7 +269,10 @@ def _causes(
             text += counted(effects[one.of], acting)
             if one.share < BARELY and one.of in claims.held_up:
                 text += f", without which {listed(claims.held_up[one.of])} would end at a bound"
-            text += OPEN * (open_gap and one.of.startswith("parameter:"))
+            if one.of in ties:
+                text += OPEN_TIE
+            else:
+                text += OPEN * (open_gap and one.of.startswith("parameter:"))
             text += GIVEN.format(listed(rests.get(one.of, ()))) * (one.of in rests)
             text += UNSURE * (not has_size(effects[one.of], values[one.of], KNOWN))
             text += f", {apart[one.of]}" if one.of in apart else ""
@@ -432,6 +442,7 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
 
 BARELY = 0.01  # share of the improvement below which a claim needs another reason
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
+OPEN_TIE = ", unless the gap that remains or what ties with it is the reason"
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"
 
 

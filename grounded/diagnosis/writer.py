@@ -168,7 +168,9 @@ class Writer:
         told = {one.effect for one in seen}.union(*groups)
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
-        worse = objection(rows, agreement, named)
+        ties = [group for group in groups if group not in same]
+        gap = any(one.above for one in remainder)
+        worse = objection(rows, agreement, named, ties, gap=gap)
         lost, ended = self.unrepeatable(), at_bounds(self.claims)
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))

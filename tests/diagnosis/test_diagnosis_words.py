@@ -29,7 +29,6 @@ from grounded.diagnosis.report import (
     Unconfirmed,
 )
 from grounded.diagnosis.ruler_words import (
-    contested,
     explained,
     improvement,
     in_doubt,
@@ -124,10 +123,10 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
     whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)
     alike, unlike = (Agreement("delay:u", "d", agrees=agrees) for agrees in (True, False))
-    assert contested((short, whole), (alike,), ("delay:u",))
-    assert not contested((short, whole), (alike,), ())
-    assert not contested((short,), (alike,), ("delay:u",))
-    assert contested((short,), (unlike,), ("delay:u",))
+    assert objection((short, whole), (alike,), ("delay:u",))
+    assert not objection((short, whole), (alike,), ())
+    assert not objection((short,), (alike,), ("delay:u",))
+    assert objection((short,), (unlike,), ("delay:u",))
     claims = _claiming(Library().effect("coulomb_friction:v", cart_task().model))
     assert next_trial(claims, "", ()).endswith("adopt the claimed effects.")
     why = objection((short,), (unlike,), ("delay:u",))
@@ -158,12 +157,24 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     assert "bounds in the model file" not in said
 
 
+def test_what_ties_and_gains_little_beside_a_gap_is_not_to_be_adopted():
+    """An aircraft's sideslip: "the log of the heading is 0.187 s old", which it was not."""
+    little, much = (row({"x": 2.0, "v": 1.0}, {"x": x, "v": 1.0}) for x in (1.7, 0.5))
+    pair, own = ("sensor_delay:psi", "coupling:p<-phi"), ("sensor_delay:psi",)
+    why = objection((little,), (), own, [pair], gap=True)
+    assert holds(why, "sensor_delay:psi gains little", "can't be told from coupling:p<-phi")
+    assert not objection((little,), (), own, [pair])  # nothing else is wrong
+    assert not objection((much,), (), own, [pair], gap=True)
+    assert not objection((little,), (), own, gap=True)
+    assert not objection((little,), (), (*own, "delay:u"), [pair], gap=True)
+
+
 def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():
     short = row({"x": 0.2, "v": 0.1}, {"x": 0.05, "v": 0.3})
     whole = row({"x": 2.0, "v": 0.5}, {"x": 3.0, "v": 0.6}, whole_trial=True, horizon_s=60.0)
     assert not outweighed((short,))
     assert outweighed((short, whole)) and "worse for x" in worsened((short, whole))
-    assert contested((short, whole), (), ("delay:u",))
+    assert objection((short, whole), (), ("delay:u",))
     assert not outweighed((replace(short, drowned=True), replace(whole, with_effects=whole.crude)))
 
 
