@@ -141,12 +141,12 @@ def _show(
     _instruments(found.preflight, inputs)
     for text in caveats(found):
         show(field("caveats", text))
+    if found.prediction_error:
+        rows, header = error_table(found, whole_trials=details)
+        show("\n" + table(rows, header))
+        adopted = "model.py: without what was adopted; now: with it; " * ("now" in header)
+        _note(f"{adopted}open loop, {held_out(found)}")
     if not found.no_cause:
-        if found.prediction_error:
-            rows, header = error_table(found, whole_trials=details)
-            show("\n" + table(rows, header))
-            adopted = "model.py: without what was adopted; now: with it; " * ("now" in header)
-            _note(f"{adopted}open loop, {held_out(found)}")
         _effects(found, details=details)
     _places(found, details=details)
     if details:

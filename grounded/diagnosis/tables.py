@@ -50,6 +50,9 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
             del columns[key]
+    if diagnosis.no_cause:  # values of one short log say nothing of another
+        columns.pop("calibrated", None)
+        del columns["with_effects"]
     told_rows = (*ahead, *(whole if whole_trials or not ahead else ()))
     pairs = [
         [_cell(row, key, name) for key in ("crude", "with_effects")]
@@ -57,7 +60,7 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
         for name in row.unit_by_channel
     ]
     if not diagnosis.verdict.causes and all(now == then for now, then in pairs):
-        del columns["with_effects"]  # nothing is claimed: the same figures once more
+        columns.pop("with_effects", None)  # nothing is claimed: the same figures once more
     rows: list[Cells] = []
     for row in told_rows:
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"

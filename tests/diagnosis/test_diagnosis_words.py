@@ -213,7 +213,9 @@ def test_predictions_that_run_away_are_compared_with_nothing():
     assert worsened((second, replace(whole, with_effects={"x": 9e5, "v": 0.4}))) == ""
     assert "x" in runaway((second, whole)) and not runaway((second,))
     named = SimpleNamespace(causes=("parameter:k",))
-    table, _ = error_table(SimpleNamespace(prediction_error=(second, whole), verdict=named))
+    table, _ = error_table(
+        SimpleNamespace(no_cause=False, prediction_error=(second, whole), verdict=named)
+    )
     assert next(cells[1:-1] for cells in table if "whole" in cells[0]) == ("diverges",) * 3
     assert holds(rest((second, replace(whole, runs_away={}))), "x", "100 times", "whole trials")
 
@@ -227,7 +229,9 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
     quick = row({"x": 0.2}, {"x": 0.08})
     assert telling((quick, whole)) is quick and "80 mm" in improvement((quick, whole))
     for rows, told in (((second, whole), True), ((quick, whole), False)):  # as in the sentence
-        found = SimpleNamespace(prediction_error=rows, verdict=SimpleNamespace(causes=("b",)))
+        found = SimpleNamespace(
+            no_cause=False, prediction_error=rows, verdict=SimpleNamespace(causes=("b",))
+        )
         table, _ = error_table(found, whole_trials=False)
         assert any("whole trial" in cells[0] for cells in table) is told
     assert telling((whole,)) is None and telling(()) is None
@@ -238,8 +242,12 @@ def test_the_same_figures_are_not_shown_twice():
     alike = row({"x": 0.02518153, "v": 0.5}, {"x": 0.02518557, "v": 0.5})
     better = row({"x": 0.02518153, "v": 0.5}, {"x": 0.024, "v": 0.5})
     for one, causes, columns in ((alike, (), 1), (better, (), 2), (alike, ("b",), 2)):
-        found = SimpleNamespace(prediction_error=(one,), verdict=SimpleNamespace(causes=causes))
+        found = SimpleNamespace(
+            no_cause=False, prediction_error=(one,), verdict=SimpleNamespace(causes=causes)
+        )
         assert len({"crude", "now", "as diagnosed"} & {*error_table(found)[1]}) == columns
+        found.no_cause = True  # of one short log: how well the model predicts, and no more
+        assert "as diagnosed" not in error_table(found)[1] and "crude" in error_table(found)[1]
 
 
 def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():

@@ -96,9 +96,9 @@ def gained(
         equal = len(ends) > len({*ends})  # as printed: that says nothing beside others
         (same if equal else parts).append(f"{what} by {' instead of '.join(ends)}")
     parts = parts or same
-    held = "" if row.held_out != "no" else ", not held out"
-    ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
-    return f"{ahead} {who} misses {listed(parts)}." if parts else ""
+    held = "" if row.held_out != "no" else " (not held out)"
+    ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}"
+    return f"{ahead} {who} misses {listed(parts)}{held}." if parts else ""
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
