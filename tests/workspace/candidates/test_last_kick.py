@@ -54,9 +54,12 @@ def test_a_plan_that_rests_against_a_force_is_no_kick(tmp_path):
     assert "one sample" not in told and "--hold" not in told
 
 
-@pytest.mark.parametrize("turned", [0.0, 0.008])
-def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(turned):
-    """A robot docked within 0.6 mrad, by the last sample, and stood there turned by 7.5 mrad."""
+@pytest.mark.parametrize(("turned", "noise"), [(0.0, 0.0), (0.008, 0.0), (0.0, 0.003)])
+def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(turned, noise):
+    """A robot docked within 0.6 mrad, by the last sample, and stood there turned by 7.5 mrad.
+
+    An aircraft's roll was off by as much in one sample of a second, by its sensor's noise.
+    """
     task = rover_task()
     weights = replace(task.reward, terminal=np.array([100.0, 100.0, 300.0]))
     T, rest = task.horizon, 12
@@ -64,6 +67,8 @@ def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(t
     task = replace(task, reward=weights, target=target[: T + 1])
     states = np.vstack([task.target, np.repeat(task.target[-1:], rest, 0)])
     states[T + 3 :, 2] += turned
+    states[:, 2] += noise * np.random.default_rng(1).standard_normal(len(states))
+    states[T, 2] = task.target[-1, 2]
     inputs = np.zeros((len(states) - 1, 2))
     names = task.model.state_names, task.model.input_names
     run = Trial(states, inputs, task.dt, *names)

@@ -32,6 +32,7 @@ from grounded_trials.workspace.off_target import (
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 DEAR = 0.2  # of the run's cost: what its end would cost more where the robot came to be after it
+SURE = 3.0  # standard deviations of the noise by which the farthest of some samples is off
 REACHED = 0.05  # of the target's extent: a plan that ends farther away does not reach it
 LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
 SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
@@ -130,9 +131,10 @@ def moved_on(planner: Planner, whole: Trial) -> Drift | None:
         off, way = _from_target(task, whole.states[: last + 1], states)
         far, dear = np.linalg.norm(off, axis=1), off**2 @ task.reward.terminal[states]
         worst = end + int(np.argmax(far[end:]))
-        away = not k and far[worst] > max(AWAY * way, 2 * far[end])
+        surely = far[worst] - SURE * np.linalg.norm(whole.noise()[states])  # one of many samples
+        away = not k and surely > max(AWAY * way, 2 * far[end])
         more = 0.0 if rate else dear[worst] - dear[end]
-        if away or (far[worst] > 2 * far[end] and more > cost):
+        if away or (surely > 2 * far[end] and more > cost):
             break
     else:
         return None
