@@ -12,6 +12,8 @@ from grounded.model import Model
 from grounded.places import true_values
 from grounded.trial import Trial
 
+FOLLOWS = 0.4  # of what the model misses of a log in a step, by which the true values follow
+
 
 def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
     """Return the settled memories of inputs under constant inputs a, by `input_family`."""
@@ -89,7 +91,10 @@ def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
 def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None = None) -> Array:
     """Return the memory states along a recorded trial, (T + 1, wrapped.n - base.n).
 
-    They start at `memory_start` and follow the logged states and the received commands.
+    They start at `memory_start` and follow the logged states and the received commands. True values
+    behind late or filtered logs would drift away from these where they are integrals (a heading, a
+    place), since a crude model misses their rates. So they follow their logs: what the model misses
+    of a log moves its true values by FOLLOWS of it, as an observer does (Luenberger 1964).
 
     Args:
         wrapped: the model with memory.
@@ -102,10 +107,15 @@ def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None =
         held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
         inputs = late_inputs(inputs[None], held[None], latency, trial.dt)[0]
     found = [now := memory_start(wrapped, base, trial)]
+    behind = true_values(wrapped.state_names, wrapped.state_names[base.n :])
+    memories, logged = np.array([*behind], int) - base.n, np.array([*behind.values()], int)
     for t in range(trial.steps):
         x = np.concatenate([trial.states[t], now])[None]
         after = wrapped.system.step(x, inputs[t][None], wrapped.values, trial.dt)
         now = after[0, base.n :]
+        if behind:
+            missed = base.difference(trial.states[t + 1], after[0, : base.n])[logged]
+            now[memories] += FOLLOWS * np.where(np.isfinite(missed), missed, 0.0)
         found.append(now)
     return np.array(found).reshape(trial.steps + 1, wrapped.n - base.n)
 
