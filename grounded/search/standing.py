@@ -393,7 +393,7 @@ def let_down(ended: Standing, model: str) -> Standing:
             continue
         error, known = error_between(best, tried, ended.history)
         loss = best.utility - tried.utility - _due(tried, best)
-        noise = LUCK * error if known else 0.0
+        noise = max(LUCK * error if known else 0.0, tried.noise_cost)  # a plan may replay a log's
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:

@@ -159,3 +159,30 @@ def test_a_friction_is_found_behind_a_late_log():
     found = gr.diagnose(model, lifted, options)
     assert found.verdict.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("state", "name", "values"),
+    [("psi", "sensor_delay:psi", {"d": 0.12}), ("v", "sensor_lag:v", {"tau": 0.1})],
+)
+def test_true_values_behind_a_late_log_do_not_drift_away_from_it(state, name, values):
+    """An aircraft's roll was estimated 0.12 rad beside its log after 12 s, and every step lost."""
+    model = Model(
+        states={state: "rad" if state == "psi" else "m/s"},
+        inputs={"u": "1"},
+        params={"g": Param(1.0, "1", 0.5, 2.0)},
+        derivative=lambda s, a, p: {state: p.g * a.u},
+    )
+    rng, steps = np.random.default_rng(0), 400
+    u = np.repeat(rng.uniform(-1, 1, steps // 10), 10)
+    late = [(name, values)]
+    real = built(late, model.with_values({"g": 1.2}))
+    z = [np.zeros(real.n)]
+    for value in u:
+        z.append(real.system.step(z[-1][None], np.array([[value]]), real.values, DT)[0])
+    log = np.array(z)[:, :1] + 0.004 * rng.standard_normal((steps + 1, 1))
+    trial = Trial(log, u[:, None], DT, (state,), ("u",), start_inputs=np.zeros(1))
+    true = real.state_names.index(f"{state}_true")
+    off = memory_of(built(late, model), model, trial)[:, true - 1] - np.array(z)[:, true]
+    alone = 0.2 * DT * np.cumsum(u)  # what the model misses
+    assert np.abs(off).max() < 0.3 * np.abs(alone).max()
