@@ -10,6 +10,7 @@ from typing import Any
 from grounded.result import Document, measured_alike, number, percent, with_unit
 
 ABOVE = 1.3  # times the noise floor, above which a leftover is stated
+WIDE = 2.0  # times the noise floor, above which a leftover puts claims that gain little in doubt
 SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
 AT_MOST = "repeats, at most"  # source of a noise floor that holds errors of the model as well
 BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
@@ -362,6 +363,11 @@ class Remainder(Document):
     def above(self) -> bool:
         """Whether the error is clearly above the floor."""
         return not (self.floor > 0 and self.error <= ABOVE * self.floor)
+
+    @property
+    def wide(self) -> bool:
+        """Whether the error is so far above the floor that what is claimed may stand in for it."""
+        return self.error > WIDE * self.floor > 0
 
     def sentence(self) -> str:
         """Return it as one clause."""

@@ -303,8 +303,14 @@ class Diagnosis(Document):
     def objection(self) -> str:
         """Why the claim should not be adopted; "" if it may be."""
         ties = [group for group in self.indistinguishable if group not in self.equivalent]
-        gap = any(one.above for one in self.leftover)
-        return objection(self.prediction_error, self.agreement, self.effects, ties, gap=gap)
+        return objection(
+            self.prediction_error,
+            self.agreement,
+            self.effects,
+            ties,
+            gap=any(one.above for one in self.leftover),
+            wide=any(one.wide for one in self.leftover),
+        )
 
     @property
     def no_cause(self) -> bool:

@@ -194,12 +194,14 @@ def objection(
     ties: Sequence[Sequence[str]] = (),
     *,
     gap: bool = False,
+    wide: bool = False,
 ) -> str:
     """Return a clause on why adopting the claimed effects is unwise; "" if it is not.
 
     It is if predictions lose more than they gain, or get worse somewhere while the trials disagree
-    about the effects' values; also if all of them tie with others and gain little beside a gap that
-    remains: a heading that an aircraft's sideslip moves was told as an old log.
+    about the effects' values; also if they gain little beside a gap that remains, and all of them
+    tie with others or the gap is wide: a heading that an aircraft's sideslip moves was told as an
+    old log, and its roll rate as shaken.
 
     Args:
         rows: held-out prediction errors, a row per horizon.
@@ -207,18 +209,18 @@ def objection(
         effects: the claimed effects.
         ties: groups of effects that further trials could tell apart.
         gap: whether a gap remains.
+        wide: whether it is `Remainder.wide`.
     """
     if not effects:
         return ""
     if outweighed(rows):
         return "predictions get worse with what is claimed"
     tied = [name for name in effects if any(name in group for group in ties)]
-    if gap and len(tied) == len(effects) and _gains_little(rows):
+    if gap and (wide or len(tied) == len(effects)) and _gains_little(rows):
         rivals = dict.fromkeys(n for group in ties for n in group if n not in effects)
-        return (
-            f"beside the gap that remains, {listed(tied)} gain{'s' * (len(tied) == 1)} little and "
-            f"can't be told from {' or '.join(rivals)}"
-        )
+        apart = f" and can't be told from {' or '.join(rivals)}" * bool(rivals)
+        gains = f"gain{'s' * (len(effects) == 1)} little"
+        return f"beside the gap that remains, {listed(effects)} {gains}{apart}"
     differ = dict.fromkeys(one.effect for one in agreement if not one.agrees)
     names = [name for name in differ if name in effects]
     if not names or not worsened(rows):

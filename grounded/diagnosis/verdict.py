@@ -170,6 +170,7 @@ def verdict(
             words.append(f"A gap remains: {left}; no more than {most} {looked} looked for.")
     elif remainder:
         words.append(unexplained)
+        words += [STAND_IN] * any(one.wide for one in remainder)
     elif above := rest(rows):
         words.append(sentence([above]))
     if one_motion and (remainder or seen):
@@ -440,6 +441,7 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
     return f"{meaning(effect, now)} ({name}: {values})"
 
 
+STAND_IN = "While that gap remains, what is named above may stand in for what is missing."
 BARELY = 0.01  # share of the improvement below which a claim needs another reason
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 OPEN_TIE = ", unless the gap that remains or what ties with it is the reason"

@@ -166,6 +166,9 @@ def test_what_ties_and_gains_little_beside_a_gap_is_not_to_be_adopted():
     assert not objection((little,), (), own, [pair])  # nothing else is wrong
     assert not objection((much,), (), own, [pair], gap=True)
     assert not objection((little,), (), own, gap=True)
+    why = objection((little,), (), ("periodic:p",), gap=True, wide=True)
+    assert holds(why, "beside the gap that remains, periodic:p gains little")
+    assert not objection((much,), (), ("periodic:p",), gap=True, wide=True)
     assert not objection((little,), (), (*own, "delay:u"), [pair], gap=True)
 
 
