@@ -40,6 +40,7 @@ MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
 NEARLY = 0.4  # largest part of an adopted delay by which states that were predicted ahead miss it
 NAMED = 2  # largest number of states that are named
+LARGE, MUCH_MORE = 0.2, 4.0  # swings, of an input's limits; of the cost that was predicted
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
 
@@ -261,6 +262,33 @@ def _late_velocities(task: Task, own: Candidate, trial: Trial, old: Array) -> Ar
     return np.where(some, ages[1], 0.0) if left[1] < RATHER * left[0] else old
 
 
+def _wavering(task: Task, tried: Tried, trial: Trial) -> list[str]:
+    """Return a warning on a run that cost far more than predicted as its inputs went to and fro.
+
+    By less than the plan's range, which one pulse may have: an aircraft's aileron went from limit
+    to limit at the end of a run that cost 72 times what was predicted, and nothing said why.
+    """
+    made, model = tried.candidate, task.model
+    if not task.utility(trial) < MUCH_MORE * tried.promised < 0:
+        return []
+    size = LARGE * (task.high - task.low)
+    off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
+    counts = swings(made, trial, np.where(np.isfinite(size), size, 0.0))
+    some = [i for i in np.flatnonzero(counts >= SWINGS) if periodic(off[:, i])]
+    if not some:
+        return []
+    told = listed(
+        f"{model.input_names[i]} about its plan ({counts[i]} swings of more than "
+        f"{with_unit(figure(size[i], 2), model.inputs[model.input_names[i]])})"
+        for i in some
+    )
+    return [
+        f"its feedback moved {told}, and the run cost far more than predicted: with what the model "
+        "lacks, such a feedback may make the robot oscillate. Diagnose with this run; a larger "
+        "[reward] input_change makes the feedback weaker"
+    ]
+
+
 def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried]) -> list[str]:
     """Return a warning that names the inputs that oscillated in a run; [] if none did.
 
@@ -282,7 +310,7 @@ def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried
         for i in np.flatnonzero(counts >= SWINGS)
     ]
     if not told:
-        return []
+        return _wavering(task, tried, trial)
     off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
     cycles = any(periodic(off[:, i]) for i in np.flatnonzero(counts >= SWINGS))
     did = "oscillate about the plan" if cycles else "swing about the plan, at no one frequency"
