@@ -49,6 +49,25 @@ def test_gentler_gains_promise_no_gain_and_steps_from_them_say_why_they_are_gent
         assert ("as low as ran without oscillating" in _what(step, None, task)) == told
 
 
+@pytest.mark.parametrize(
+    ("replayed", "runs", "told"), [(0.007, 1, True), (0.003, 1, False), (0.007, 2, False)]
+)
+def test_a_gain_below_the_noise_that_a_plan_replays_is_told_as_that(replayed, runs, told):
+    """A rover's model was right; its first step promised 0.0049, and lost by 0.004 each time."""
+    made = SimpleNamespace(
+        id="c0001", base="", model="m", predicted_utility=-0.0117, doubtful=False
+    )
+    trials = tuple(SimpleNamespace(id=f"t000{k}") for k in range(1, runs + 1))
+    best = Tried(made, trials, (-0.0144,) * runs, True)
+    step = SimpleNamespace(
+        id="c0002", way="", predicted_utility=-0.0097, likely_off=0.0, doubtful=False
+    )
+    step.promised_over = lambda other: 0.0049
+    now = SimpleNamespace(incumbent=best, history=(best,))
+    said = _came_true(step, [best], now, 0.002, replayed)
+    assert ("less than the sensor noise that it replays costs, 0.007000" in said) == told
+
+
 def test_how_old_samples_are_is_one_short_sentence(monkeypatch):
     """Its four clauses took four readings, and one candidate's age was not that of the next run."""
     made = SimpleNamespace(id="c0003", base="c0002", sample_age=0.0093)
