@@ -29,7 +29,7 @@ def test_swings_below_the_plan_s_range_are_told_beside_a_cost_far_above_the_pred
 ):
     """An aircraft's aileron went from limit to limit, 72 times the predicted cost: not a word."""
     run = drive(TASK, Plant(TASK.model), made)
-    wave = size * np.sin(0.9 * np.arange(run.steps))[:, None]
+    wave = size * np.cos(0.9 * np.arange(run.steps))[:, None]
     states = np.array(run.states)
     states[1:, 0] += 2.0 * cost
     trial = replace(run, states=states, inputs=made.predicted_inputs + wave, id="t0001")
