@@ -114,6 +114,8 @@ def _next(found: Inspected) -> str:
     """Return the lines that say what to do with the file."""
     from grounded_trials.store.own_files import TRIAL
 
+    if found.log_table and found.mapped:
+        return f"# your [log] has all of these already. next: {typed(found.then)}"
     if found.log_table:
         return f"# next: put this table into grounded.toml, then: {typed(found.then)}"
     line = next_line(found.then)

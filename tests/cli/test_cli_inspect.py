@@ -7,6 +7,7 @@ import pytest
 
 from cli import grounded, plain
 from facts import holds
+from grounded_trials.workspace.folder import Folder
 from reported import cart, copied
 from shared_data import data, needs_data
 from workspaces import make
@@ -61,6 +62,16 @@ def test_a_foreign_log_ends_with_a_table_that_can_be_pasted(tmp_path):
     table = tomllib.loads(done.out[done.out.index("# for grounded.toml") :])
     assert table["log"]["input"]["throttle"]["path"] == "/throttle_1.data"
     assert re.search(r"header .*\d\.\d ms", done.out)
+    model = Folder(folder).base_model
+    lost = [n for n in model.state_names if n not in table["log"].get("state", {})]
+    sent = [n for n in model.input_names if n not in table["log"].get("input", {})]
+    file = folder / "grounded.toml"
+    file.write_text(file.read_text() + done.out[done.out.index("# for grounded.toml") :])
+    more = "".join(f'\n[log.state.{name}]\npath = "/{name}.data"\n' for name in lost)
+    more += "".join(f'\n[log.input.{name}]\npath = "/{name}.data"\n' for name in sent)
+    file.write_text(file.read_text() + more)  # as a user maps what was not found
+    done = grounded("-C", folder, "inspect", log)
+    assert last(done).startswith("# your [log] has all of these already. next: grounded")
 
 
 @needs_data

@@ -18,7 +18,7 @@ from grounded.policy import Policy
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import multiplied
-from grounded.search.returned.other_scale import NEARLY, UNITS, units_tried
+from grounded.search.returned.other_scale import CENTI, NEARLY, UNITS, units_tried
 from grounded.search.returned.who_drove import (
     CLEAR,
     DECISIVE,
@@ -193,7 +193,9 @@ def ways(model: Model, own: Candidate, *, unsent: bool, over: bool = False) -> I
         f"they are the feed-forward of {name} alone, {WITHOUT}",
     )
     tried = set[tuple[tuple[str, ...], float]]()
-    for group, factor in units_tried(model):
+    tries = [*units_tried(model)]  # of logs: none is in hundreds of metres, but programs use cm
+    tries += [(group, 1 / factor) for group, factor in tries if factor == CENTI]
+    for group, factor in tries:
         if (names := tuple(group), factor) in tried or not {*names} <= {*model.state_names}:
             continue
         tried.add((names, factor))

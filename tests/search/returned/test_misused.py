@@ -37,6 +37,7 @@ def driven(task, made, states=lambda x: x, times=lambda t: t, seed=0):
 WAYS = {
     "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, ("psi", "degrees", "pass rad")),
     "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, ("x", "y", "mm", "pass m")),
+    "cm": ({"states": lambda x: x * [100, 100, 1]}, ("x and y", "in cm", "pass m")),
     "order": ({"states": lambda x: x[[1, 0, 2]]}, ("x and y", "order")),
     "last first": ({"states": lambda x: x[[2, 0, 1]]}, ("order psi, x, y", "order x, y, psi")),
     "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),

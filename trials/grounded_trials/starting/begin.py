@@ -466,6 +466,8 @@ def _start(model: Model, stood: Mapping[str, float] | None, states: Sequence[Gue
         return "empty, that is 0, where it stood in the log's first rows"
     lost = [guess.name for guess in states if not guess.path]
     why = f"no rest is seen without {listed(lost)} in the log" if lost else "the log shows no rest"
+    if not lost and not any(unit.endswith("/s") for unit in model.states.values()):
+        why = "whether it rested in the log is not known while no state is a speed by its unit"
     return f"empty, {why}: enter where a run begins in [task] start"
 
 

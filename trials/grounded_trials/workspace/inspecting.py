@@ -26,6 +26,7 @@ class Inspected(Result):
     outside: bool = False  # inspected outside any workspace
     ran_nothing: bool = False  # no candidate was proposed yet that it could have run
     odd: tuple[str, ...] = ()  # suspicious entries of the workspace's [log]
+    mapped: bool = False  # the workspace's [log] has all states and inputs already
 
     @property
     def format(self) -> str:
@@ -113,4 +114,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     mapping = workspace.log_mapping
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
     odd += wide_joints(states, model.states, joints, report)
-    return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids(), odd=odd)
+    here = {*mapping.states, *mapping.inputs} if mapping else set()
+    mapped = {*model.states, *model.inputs} <= here
+    ran_nothing = not workspace.candidate_ids()
+    return Inspected(str(log), report, table, ran_nothing=ran_nothing, odd=odd, mapped=mapped)

@@ -12,11 +12,16 @@ import pytest
 from facts import holds
 from grounded import Model, Reward, Task
 from grounded.policy import Policy
+from grounded.search.returned.clipped import Clipped
 from grounded.search.returned.who_drove import evidence, follows
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.locating.run_start import recording
-from grounded_trials.workspace.intake.recognising.misused_run import exactly_misused, misused_in
+from grounded_trials.workspace.intake.recognising.misused_run import (
+    _was_sent,
+    exactly_misused,
+    misused_in,
+)
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])
@@ -165,3 +170,13 @@ def test_an_opening_at_the_limit_is_no_opening(tilt):
     sent[100:] *= -1
     found = follows(own.policy, Trial(states, sent, DT, *NAMES))
     assert not found.alike and found.until_s >= 1.0 and found.opens == (tilt < 0.5)
+
+
+@pytest.mark.parametrize(
+    ("side", "at", "sent"), [(-1, 0.0, False), (1, 0.0, False), (1, 2.0, True), (-1, -2.0, True)]
+)
+def test_commands_that_were_not_sent_after_a_run_are_no_cut(side, at, sent):
+    """A boat's x and y in cm: "cut inside [limits] in 92.3 % of the steps (left at 0)"."""
+    own, log = candidate(HAND), SimpleNamespace(past=np.zeros(1))
+    name = own.policy.input_names[0]
+    assert _was_sent(own, Clipped({name: {side: at}}, 0.9), log) == sent

@@ -220,7 +220,7 @@ def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, k
     )
     assert holds(told, "force = 0 N", "runner.done(t)")
     assert ("[task] start" in told) is holds_it
-    assert ("no constant input does" in told) is not holds_it
+    assert ("no constant input holds all" in told) is not holds_it
     assert ("force = 1.5 N would" in told) is (knows and holds_it)
     assert "terminal" not in told and "--hold" not in told
 

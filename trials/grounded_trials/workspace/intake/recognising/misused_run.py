@@ -17,7 +17,7 @@ from grounded.model import Model
 from grounded.result import figure, listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
-from grounded.search.returned.clipped import clipped
+from grounded.search.returned.clipped import Clipped, clipped
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.smoothed import smoothed
@@ -79,7 +79,7 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
             plain = follows(own.policy, run, latest(task))
             if plain and not plain.beyond and (told := misused(task, own, run, plain, acts=acts)):
                 return told
-            if cut := clipped(own, run):
+            if (cut := clipped(own, run)) and _was_sent(own, cut, log):
                 return f"they are {cut.told(own)}"
             if found := smoothed(task.model, own, run):
                 return f"they are {found.told(own)}"
@@ -153,18 +153,23 @@ def cut_in(log: Recording, own: Candidate, found: Start | None) -> str:
     starts = [*([found.seconds] if found else []), log.first, *log.openings[:TRIED]]
     for begins in dict.fromkeys(log.on_step(own.policy, one) for one in starts):
         if (trial := log.trial_from(begins)) and (cut := clipped(own, trial)):
+            if not _was_sent(own, cut, log):
+                continue
             run = trial.until(min(trial.finite_steps, own.policy.horizon))
-            (low, high), held = cut.bounds(own), log.past
-            if ((low >= held) & (low > own.policy.low)).any() or (
-                (high <= held) & (high < own.policy.high)
-            ).any():
-                continue  # nothing was sent there, as before a run and after it
+            low, high = cut.bounds(own)
             within = replace(own.policy, low=low, high=high)
             sent, fit = commanded(within, run), follows(within, run, 0)
             near = (np.abs(sent.asked - sent.sent) <= NEAR * sent.size).all(axis=1)
             if near.mean() >= MOSTLY or (fit and fit.alike):
                 return f"they are {cut.told(own)}"
     return ""
+
+
+def _was_sent(own: Candidate, cut: Clipped, log: Recording) -> bool:
+    """Return whether cut commands were sent at all, unlike those before a run and after it."""
+    (low, high), held = cut.bounds(own), log.past
+    above = (low >= held) & (low > own.policy.low)
+    return not (above | ((high <= held) & (high < own.policy.high))).any()
 
 
 def _steps_of(log: Recording, own: Candidate) -> tuple[float, Trial]:

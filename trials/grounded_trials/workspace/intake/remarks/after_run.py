@@ -217,7 +217,7 @@ def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
     would = f" (by the model {own} would)" * bool(own)
     then = "Switch to a controller that holds it as soon as `runner.done(t)` is true"
     if lost:  # such as a boat in a current from the side
-        would = " (and by the model no constant input does)"
+        would = " (and by the model no constant input holds all its states as they were then)"
     else:
         then += (
             "; or, if the robot may have the input that holds it before the run too, set that in "
