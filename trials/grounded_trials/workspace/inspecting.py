@@ -114,7 +114,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     mapping = workspace.log_mapping
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
     odd += wide_joints(states, model.states, joints, report)
-    here = {*mapping.states, *mapping.inputs} if mapping else set()
-    mapped = {*model.states, *model.inputs} <= here
+    known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
+    mapped = {*model.states, *model.inputs} <= known
     ran_nothing = not workspace.candidate_ids()
     return Inspected(str(log), report, table, ran_nothing=ran_nothing, odd=odd, mapped=mapped)
