@@ -296,21 +296,14 @@ class Diagnosis(Document):
 
     @property
     def contested(self) -> bool:
-        """Whether the claim should not be adopted, because some predictions get worse with it."""
+        """Whether the claim should not be adopted, see `objection`."""
         return bool(self.objection)
 
     @property
     def objection(self) -> str:
         """Why the claim should not be adopted; "" if it may be."""
         ties = [group for group in self.indistinguishable if group not in self.equivalent]
-        return objection(
-            self.prediction_error,
-            self.agreement,
-            self.effects,
-            ties,
-            gap=any(one.above for one in self.leftover),
-            wide=any(one.wide for one in self.leftover),
-        )
+        return objection(self.prediction_error, self.agreement, self.effects, ties, self.leftover)
 
     @property
     def no_cause(self) -> bool:

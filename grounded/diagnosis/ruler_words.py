@@ -6,7 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import AT_MOST, RulerRow, beside_noise, doubt_of, furthest
+from grounded.diagnosis.error_report import (
+    AT_MOST,
+    Remainder,
+    RulerRow,
+    beside_noise,
+    doubt_of,
+    furthest,
+)
 from grounded.result import listed, measured_alike, number
 
 if TYPE_CHECKING:
@@ -192,9 +199,7 @@ def objection(
     agreement: Sequence[Agreement],
     effects: Sequence[str],
     ties: Sequence[Sequence[str]] = (),
-    *,
-    gap: bool = False,
-    wide: bool = False,
+    left: Sequence[Remainder] = (),
 ) -> str:
     """Return a clause on why adopting the claimed effects is unwise; "" if it is not.
 
@@ -208,15 +213,15 @@ def objection(
         agreement: whether the trials agree on each value.
         effects: the claimed effects.
         ties: groups of effects that further trials could tell apart.
-        gap: whether a gap remains.
-        wide: whether it is `Remainder.wide`.
+        left: the leftovers beside them.
     """
     if not effects:
         return ""
     if outweighed(rows):
         return "predictions get worse with what is claimed"
-    tied = [name for name in effects if any(name in group for group in ties)]
-    if gap and (wide or len(tied) == len(effects)) and _gains_little(rows):
+    gap, wide = any(one.above for one in left), any(one.wide for one in left)
+    tied = all(any(name in group for group in ties) for name in effects)
+    if gap and (wide or tied) and _gains_little(rows):
         rivals = dict.fromkeys(n for group in ties for n in group if n not in effects)
         apart = f" and can't be told from {' or '.join(rivals)}" * bool(rivals)
         gains = f"gain{'s' * (len(effects) == 1)} little"

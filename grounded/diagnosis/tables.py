@@ -47,20 +47,19 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
         columns["crude"] = "now"
     if any(row.floor_bound for row in ahead):
         columns["noise_floor"] = "noise, at most"
+    few = diagnosis.no_cause  # values of one short log say nothing of another
     for key in ("outset", "calibrated"):
-        if not any(getattr(row, key) for row in ahead):
+        if not any(getattr(row, key) for row in ahead) or (few and key == "calibrated"):
             del columns[key]
-    if diagnosis.no_cause:  # values of one short log say nothing of another
-        columns.pop("calibrated", None)
-        del columns["with_effects"]
     told_rows = (*ahead, *(whole if whole_trials or not ahead else ()))
     pairs = [
         [_cell(row, key, name) for key in ("crude", "with_effects")]
         for row in told_rows
         for name in row.unit_by_channel
     ]
-    if not diagnosis.verdict.causes and all(now == then for now, then in pairs):
-        columns.pop("with_effects", None)  # nothing is claimed: the same figures once more
+    same = not diagnosis.verdict.causes and all(now == then for now, then in pairs)
+    if few or same:  # nothing is claimed: the same figures once more
+        del columns["with_effects"]
     rows: list[Cells] = []
     for row in told_rows:
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"

@@ -169,8 +169,7 @@ class Writer:
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         ties = [group for group in groups if group not in same]
-        gap, wide = any(one.above for one in remainder), any(one.wide for one in remainder)
-        worse = objection(rows, agreement, named, ties, gap=gap, wide=wide)
+        worse = objection(rows, agreement, named, ties, remainder)
         lost, ended = self.unrepeatable(), at_bounds(self.claims)
         moved, parameters = how_many(predictor), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))

@@ -161,15 +161,16 @@ def test_what_ties_and_gains_little_beside_a_gap_is_not_to_be_adopted():
     """An aircraft's sideslip: "the log of the heading is 0.187 s old", which it was not."""
     little, much = (row({"x": 2.0, "v": 1.0}, {"x": x, "v": 1.0}) for x in (1.7, 0.5))
     pair, own = ("sensor_delay:psi", "coupling:p<-phi"), ("sensor_delay:psi",)
-    why = objection((little,), (), own, [pair], gap=True)
+    left, wide = ([Remainder("x", error=e, floor=1.0)] for e in (1.5, 3.0))
+    why = objection((little,), (), own, [pair], left)
     assert holds(why, "sensor_delay:psi gains little", "can't be told from coupling:p<-phi")
     assert not objection((little,), (), own, [pair])  # nothing else is wrong
-    assert not objection((much,), (), own, [pair], gap=True)
-    assert not objection((little,), (), own, gap=True)
-    why = objection((little,), (), ("periodic:p",), gap=True, wide=True)
+    assert not objection((much,), (), own, [pair], left)
+    assert not objection((little,), (), own, [], left)
+    why = objection((little,), (), ("periodic:p",), [], wide)
     assert holds(why, "beside the gap that remains, periodic:p gains little")
-    assert not objection((much,), (), ("periodic:p",), gap=True, wide=True)
-    assert not objection((little,), (), (*own, "delay:u"), [pair], gap=True)
+    assert not objection((much,), (), ("periodic:p",), [], wide)
+    assert not objection((little,), (), (*own, "delay:u"), [pair], left)
 
 
 def test_whole_trials_that_get_worse_are_contested_whatever_one_state_loses_sooner():

@@ -11,7 +11,7 @@ under every other noise structure, are compared by the `ruler`:
     2. A cause is dropped if predictions without it are as good within their scatter, or to half a
        per cent of their errors in the mean (other trials gain nothing by it). A further
        effect with very high evidence, beside white innovations only, is dropped only if predictions
-       gain nothing.
+       gain nothing. What would leave a gap stays, and a late sensor that its own channel shows.
     3. An effect that a parameter's shift undoes is dropped; the parameter alone describes both. So
        is one whose size is set by a parameter's bound.
        A likely effect stays without which the model's parameters would end at their bounds, if
@@ -22,7 +22,8 @@ under every other noise structure, are compared by the `ruler`:
     5. The remaining effects must be likelier than none.
     6. A hypothesis is not claimed if predictions hardly gain in any channel at any horizon, except
        sensors' faults with very high evidence, which need not matter for what comes next, and
-       likely causes beside white innovations whose small gain is far beyond its scatter.
+       likely causes beside white innovations whose small gain is far beyond its scatter, or
+       without which a gap is left.
     7. A likely effect that was dropped is reported as doubtful; perhaps too few trials show it.
 
 A cause is an effect or the calibration of the model's own parameters.

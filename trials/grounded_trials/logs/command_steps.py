@@ -2,10 +2,9 @@
 
 If commands changed in the middle of grid steps, each would be up to half a step early or late, so
 the data start at a change. If they change at any time, as a driver's do, a step has their mean. A
-recording that starts in motion does not contain the commands before
-it, but a model with a delay needs them in the first steps. Such data start where the commands have
-been constant for a while. A robot that stands still until its first command had no command before,
-or one that keeps it at rest.
+recording that starts in motion does not contain the commands before it, but a model with a delay
+needs them in the first steps. Such data start where the commands have been constant for a while. A
+robot that stands still until its first command had no command before, or one that keeps it at rest.
 """
 
 from __future__ import annotations

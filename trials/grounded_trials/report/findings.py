@@ -153,14 +153,10 @@ class Findings:
     def plain(self) -> str:
         """The name of the task's model, which contains no adopted effects."""
         changed = any(self.values[name] != value for name, value in self.nominal.items())
-        model = "model with its present parameters" if changed else "model"
-        if self.effects:  # the diagnosis's "calibrated" is another: the best one without effects
-            return (
-                f"{model} without adopted effects"
-                if not changed
-                else f"{model}, without adopted effects"
-            )
-        return model if changed else "crude model"
+        without = "without adopted effects"
+        if changed:  # the diagnosis's "calibrated" is another: the best one without effects
+            return "model with its present parameters" + f", {without}" * bool(self.effects)
+        return f"model {without}" if self.effects else "crude model"
 
     @property
     def values(self) -> dict[str, float]:

@@ -262,26 +262,39 @@ def _late_velocities(task: Task, own: Candidate, trial: Trial, old: Array) -> Ar
     return np.where(some, ages[1], 0.0) if left[1] < RATHER * left[0] else old
 
 
+def _off_plan(made: Candidate, trial: Trial) -> Array:
+    """Return how far a run's inputs are off a candidate's plan, (T, m)."""
+    return trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
+
+
+def _counted(
+    task: Task, counts: Array, sizes: Array, some: Sequence[int], how: str = ""
+) -> list[str]:
+    """Return some inputs with their swings, as `force (7 swings of more than 2.0 N)`."""
+    inputs = [*task.model.inputs.items()]
+    return [
+        f"{name}{how} ({counts[i]} swings of more than {with_unit(figure(sizes[i], 2), unit)})"
+        for i in some
+        for name, unit in [inputs[i]]
+    ]
+
+
 def _wavering(task: Task, tried: Tried, trial: Trial) -> list[str]:
     """Return a warning on a run that cost far more than predicted as its inputs went to and fro.
 
     By less than the plan's range, which one pulse may have: an aircraft's aileron went from limit
     to limit at the end of a run that cost 72 times what was predicted, and nothing said why.
     """
-    made, model = tried.candidate, task.model
+    made = tried.candidate
     if not task.utility(trial) < MUCH_MORE * tried.promised < 0:
         return []
     size = LARGE * (task.high - task.low)
-    off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
     counts = swings(made, trial, np.where(np.isfinite(size), size, 0.0))
-    some = [i for i in np.flatnonzero(counts >= SWINGS) if periodic(off[:, i])]
+    off = _off_plan(made, trial)
+    some = [i for i in np.flatnonzero(counts >= SWINGS).tolist() if periodic(off[:, i])]
     if not some:
         return []
-    told = listed(
-        f"{model.input_names[i]} about its plan ({counts[i]} swings of more than "
-        f"{with_unit(figure(size[i], 2), model.inputs[model.input_names[i]])})"
-        for i in some
-    )
+    told = listed(_counted(task, counts, size, some, " about its plan"))
     return [
         f"its feedback moved {told}, and the run cost far more than predicted: with what the model "
         "lacks, such a feedback may make the robot oscillate. Diagnose with this run; a larger "
@@ -300,19 +313,15 @@ def swung(task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried
     """
     if tried is None or tried.candidate.policy.gain is None:
         return []
-    made, model = tried.candidate, task.model
+    made = tried.candidate
     ids = [one.candidate.id for one in history]
     sizes = calm_ranges(task, history)[ids.index(made.id)]
     counts = swings(made, trial, sizes)
-    told = [
-        f"{model.input_names[i]} ({counts[i]} swings of more than "
-        f"{with_unit(figure(sizes[i], 2), model.inputs[model.input_names[i]])})"
-        for i in np.flatnonzero(counts >= SWINGS)
-    ]
-    if not told:
+    some = np.flatnonzero(counts >= SWINGS).tolist()
+    if not some:
         return _wavering(task, tried, trial)
-    off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
-    cycles = any(periodic(off[:, i]) for i in np.flatnonzero(counts >= SWINGS))
+    told, off = _counted(task, counts, sizes, some), _off_plan(made, trial)
+    cycles = any(periodic(off[:, i]) for i in some)
     did = "oscillate about the plan" if cycles else "swing about the plan, at no one frequency"
     why = "" if cycles else ", as sensor noise does through high gains"
     others = [one for one in tried.trials if one.id != trial.id]
