@@ -430,13 +430,15 @@ def _came_true(
     said = number(candidate.predicted_utility)
     scale = " in the model" * (number(candidate.predicted_utility - lacks) != said)
     promise = f"{text}; this one promises a gain of {number(gain)}{scale}"
+    then = ","
     if len(best.trials) == 1 and gain < replayed:
+        then = ", and"
         promise += f", less than the sensor noise that it replays costs, {number(replayed)}"
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
-    doubt = f"{promise}, less than such an error"
+    doubt = f"{promise}{then} less than such an error"
     if not gain < max(missed):
-        doubt = f"{promise}, less than its likely error, {number(candidate.likely_off)}"
+        doubt = f"{promise}{then} less than its likely error, {number(candidate.likely_off)}"
     blind = missed[-1] > MISSED * abs(last[-1].utility)
     little = gain < LITTLE * abs(best.utility) and not best.is_unsteady
     if blind or candidate.doubtful or not little:  # a note may say it
