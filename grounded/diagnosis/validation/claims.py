@@ -247,13 +247,12 @@ class Claims:
             same = [o for o in self.like_parameters if o.effect == name and o.share > SAME]
             if same:
                 found.append((name, *(one.like for one in same[:2])))
-        whole = self.search.score(self.best)
         said = {name for group in found for name in group}
         as_likely = [
             names[0]
             for (_, spread, names), f in self.search.fits.items()
             if self.blamed and len(names) == 1 and spread == 0 and not parametric(f)
-            if whole - self.search.score(f) < TIE and names[0] not in said
+            if names[0] not in said and self._as_likely(f)
         ]
         if as_likely:
             first = self.data.model.param_names[self.blamed[0].index]
@@ -338,11 +337,8 @@ class Claims:
         (mainly those of the parameters) differ by less than TIE.
         """
         score, best = self.search.score, self.best
-        imitated = fit is with_mechanism(self.search, best)
-        if score(best) - score(fit) < TIE or imitated:
-            # predictions may have refused one that is likelier
-            likelier = score(fit) - score(best) > TIE and self.ruler.held_out
-            return not (likelier and self.ruler.gain(fit, best).beyond(*BETTER))
+        if fit is with_mechanism(self.search, best) or score(best) - score(fit) < TIE:
+            return self._not_refused(fit)
         if not self.ruler.held_out or not self._one_thing(name, other):
             return False
         b = self.search.tempering.factor
@@ -350,6 +346,16 @@ class Claims:
         unlike = abs(known - other_known) > TIE
         gains = (self.ruler.gain(fit, best), self.ruler.gain(best, fit))
         return not unlike and not any(gain.beyond(*BETTER) for gain in gains)
+
+    def _as_likely(self, fit: Fitted) -> bool:
+        """Check whether a fit is as likely as the claim, or likelier and predicts as well."""
+        return self.search.score(self.best) - self.search.score(fit) < TIE and self._not_refused(fit)
+
+    def _not_refused(self, fit: Fitted) -> bool:
+        """Check that a fit is no likelier than the claim, or that predictions don't refuse it."""
+        likelier = self.search.score(fit) - self.search.score(self.best) > TIE
+        refused = likelier and self.ruler.held_out
+        return not (refused and self.ruler.gain(fit, self.best).beyond(*BETTER))
 
     def _one_thing(self, name: str, other: str) -> bool:
         """Check whether two effects are equivalent with other values of the free parameters."""

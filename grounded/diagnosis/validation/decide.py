@@ -71,6 +71,7 @@ AMOUNTS = 0.1  # a rival's advantage must be this part of what the likeliest gai
 FAR = 1.5  # of at most this log gain (errors down to a quarter) if it has another noise structure
 LIKELY = 10.0  # nats from which a dropped effect is reported as doubtful
 HARDLY = 0.1  # fraction of a parameter's prior below which it counts as unchanged
+RUINS = -2.0  # mean log gain of a cause with which predictions diverge: errors are 7 times larger
 REFIT = 12  # iterations after a cause was removed
 
 
@@ -387,6 +388,7 @@ def _pruned(
             undone
             or [n for n, count in repeated.items() if count]
             or [n for n in equations(fit) if is_nowhere(fit, search.data, n)]
+            or [n for n, gain in gains.items() if gain.mean < RUINS]
             or of_no_size(search.predictor, fit, folds(search.data))
             or [
                 name

@@ -32,7 +32,8 @@ FAR = 0.1
 SURE = 3.0  # the start must also be off by this many times sensor noise, and earlier starts' rms
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
-SPOILT = 0.2  # share of the run's cost by which the start changes it too much
+SPOILT = 0.2  # share of the run's cost by which the start changes it too much,
+UNKNOWN = 0.5  # and by which it does before other runs tell how the robot is placed
 ALIKE = 0.05  # difference of two changes of a utility, relative, that is not told
 ALWAYS = 3  # runs that begin alike, from which on they always do
 
@@ -59,8 +60,10 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     It spoils the utility if by the model it changes much of it, or by more than the run lost to the
     best candidate. A change below the scatter of single runs spoils nothing. Offsets as
     other starts have them (`placing`) are unavoidable: a repeat would begin no nearer, and the
-    search allows for what they cost. Of a run that left [safety],
-    only the part before counts: a robot on the floor makes every start seem near.
+    search allows for what they cost. Before other runs tell, a start spoils a run if it explains
+    most of what it cost: a boat that was always placed to 5 cm had its first three runs discarded.
+    Of a run that left [safety], only the part before counts: a robot on the floor makes every start
+    seem near.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
@@ -95,17 +98,20 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
     lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
     spoils, tolerated, usually_so = list[int](), list[int](), list[int]()
+    unknown = max(placed.runs) < FEWEST
     repeats = _to_repeat(workspace, trial)
     for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         explains = 0 < lost < -changes
         if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
-            (usually_so if usual_off[i] else spoils).append(i)
+            counts = unknown and abs(changes) < UNKNOWN * cost
+            (tolerated if counts else usually_so if usual_off[i] else spoils).append(i)
         elif not usual_off[i] or share[i] > MUCH:
             tolerated.append(i)
     if not (spoils or tolerated or usually_so):
         return None
     where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usually_so, *tolerated))
+    whole = _changes(workspace, trial, off)
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
     if repeats:
         why = "where its runs began explains"
@@ -124,14 +130,15 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         does = (
             f"The starts of {min(placed.runs[usually_so])} other runs are off by {usually} (rms): "
             "this is no unusual one, and the run counts; by the model its start changes its "
-            f"utility by {_changes(workspace, trial, off):+.3g}. Place the robot more exactly, or "
+            f"utility by {whole:+.3g}. Place the robot more exactly, or "
             "average runs ([search] repeats), to see smaller gains"
         )
-    elif max(placed.runs) < FEWEST:
+    elif unknown:
         does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
+        if abs(whole) > max(scatter, SPOILT * cost):
+            does = f"By the model its whole start changes its utility by {whole:+.3g}. {does}"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
-        whole = _changes(workspace, trial, off)
         names = listed(task.model.state_names[i] for i in spoils)
         change = f"{names} change{'s' * (len(spoils) == 1)} its utility by {changes:+.3g}"
         if not math.isclose(changes, whole, rel_tol=ALIKE):
