@@ -349,7 +349,9 @@ class Claims:
 
     def _as_likely(self, fit: Fitted) -> bool:
         """Check whether a fit is as likely as the claim, or likelier and predicts as well."""
-        return self.search.score(self.best) - self.search.score(fit) < TIE and self._not_refused(fit)
+        return self.search.score(self.best) - self.search.score(fit) < TIE and self._not_refused(
+            fit
+        )
 
     def _not_refused(self, fit: Fitted) -> bool:
         """Check that a fit is no likelier than the claim, or that predictions don't refuse it."""

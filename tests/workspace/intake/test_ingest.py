@@ -166,7 +166,7 @@ def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
     moved = np.array(ran.states)
     moved[0] += np.array([np.sqrt(cost / len(ran.states) / 10), np.ptp(moved[:, 1])])
     write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-    monkeypatch.setattr(initial_state, "_changes", lambda *a: -0.5 * cost * bool(a[2][0]))
+    monkeypatch.setattr(initial_state, "_changes", lambda *a: -0.6 * cost * bool(a[2][0]))
     found = ingest_log(w, tmp_path / "t.mcap", "c0001")
     (told,) = [one for one in found.warnings if "the run started with" in one]
     assert holds(told, "x = ", "v = ", "By the model x changes", "`discard t0001`")

@@ -29,7 +29,7 @@ def run(w):
 
 
 def placed(w, tmp_path, ran, off):
-    """Ingest a run that began `off` away, which the model is said to make worth half its cost."""
+    """Ingest a run that began `off` away."""
     moved = np.array(ran.states)
     moved[0, 0] += off
     write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
@@ -39,7 +39,7 @@ def placed(w, tmp_path, ran, off):
 def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, monkeypatch):
     """Runs 7 and 9 cm off were to be discarded, one after the other, by a rig that does 5 cm."""
     ran, *_ = read_trial(run(w))
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.5 * w.task.utility(ran))
+    monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.9 * w.task.utility(ran))
     first = placed(w, tmp_path, ran, 0.15)
     assert any("`discard t0001`" in one and "`propose` goes on" in one for one in first.warnings)
     for off in (-0.13, 0.11):
@@ -52,6 +52,19 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     (told,) = [one for one in found.warnings if "the run started with" in one]
     assert holds(told, "starts of 3 other runs are off by 0.13 m in x (rms)", "the run counts")
     assert found.then.verb == "propose"
+
+
+def test_a_first_start_that_changes_part_of_its_cost_counts(w, tmp_path, monkeypatch):
+    """A boat's runs 1 to 3 were to be discarded for 6, 3 and 6 cm: so it is placed."""
+    ran, *_ = read_trial(run(w))
+    changes = 0.35 * w.task.utility(ran)
+    monkeypatch.setattr(initial_state, "_changes", lambda *_: changes)
+    for off in (0.2, -0.15):
+        found = placed(w, tmp_path, ran, off)
+        (told,) = [one for one in found.warnings if "the run started with" in one]
+        assert holds(told, f"its whole start changes its utility by {changes:+.3g}. The run counts")
+        assert "after 3 runs" in told and found.then.verb != "discard"
+        w.forget()
 
 
 def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, tmp_path):
