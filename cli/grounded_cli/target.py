@@ -104,6 +104,7 @@ def command(
         swing_up,
     )
     from grounded_trials.workspace.candidates.at_rest import rest_of_trials
+    from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
     from grounded_trials.workspace.candidates.rest_at_end import NOISY, names_told, rest_at_end
     from grounded_trials.workspace.candidates.standstill import read_at_start
     from grounded_trials.workspace.off_target import (
@@ -279,6 +280,9 @@ def command(
     if limited := limits_of_log(workspace.config):
         remark("note", limited)
     then = NextCommand("propose")
+    if lost := unmapped(workspace):
+        remark("note", f"{lost}: map that before `propose`, which plans for all inputs")
+        then = INSPECT
     if weighed := _weighed(free, reward):
         remove = f"remove the weight of {listed(weighed)} from [reward] in grounded.toml"
         show("")

@@ -102,6 +102,14 @@ def test_a_start_in_motion_or_after_few_samples_is_the_first_row() -> None:
     assert slow["x"] == pytest.approx(0.14, abs=0.02)
 
 
+def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
+    """A robot reset from y = 8 m to 0 a quarter of a second before its run "began" at 0.51 m."""
+    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
+    assert not grid(reset, command(0.5)).start_states  # seven samples after it
+    told = grid(reset, command(0.9)).start_states
+    assert told["x"] == pytest.approx(0.0, abs=0.03)
+
+
 def test_a_start_is_no_mean_while_a_speed_is_off_zero() -> None:
     """A slow drift hides in the noise of a position, but not in that of its speed."""
     speeds = {"x": noisy(lambda t: 0.05 * t, 4), "v": noisy(lambda t: 0.05 + 0 * t, 5)}

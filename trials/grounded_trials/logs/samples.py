@@ -25,6 +25,7 @@ STILL_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value 
 # within these. Largest std of the line's end, by a sample's noise.
 WHITE, BETTER = (1.3, 1.6), 0.7
 OFF, SURE = 4.0, 3.0  # std by which the value itself may differ, and from which a motion shows
+JUMP = 0.9  # share of the squares of all steps from which a single one is a jump, and no noise
 JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
@@ -160,10 +161,13 @@ class Samples:
         """Return what the samples of the second before a time [ns] say of the value there.
 
         None if that is no better than the sample there: with few samples, or if these scatter more
-        about a straight line than from one to the next, as those of a robot that moves do.
+        about a straight line than from one to the next, as those of a robot that moves do. What was
+        before a jump, as of a simulator that was reset, says nothing.
         """
         before = (self.t <= at) & (self.t > at - round(STILL_S * 1e9))
         t, y = 1e-9 * (self.t[before] - at), self.y[before]
+        while len(y) >= FEWEST and (steps := np.diff(y) ** 2).max() > JUMP * steps.sum():
+            t, y = t[steps.argmax() + 1 :], y[steps.argmax() + 1 :]
         if len(y) < FEWEST:
             return None
         tilt, level = np.polyfit(t, y, 1)

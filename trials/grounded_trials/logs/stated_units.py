@@ -56,6 +56,7 @@ _OF = {  # units as multiples of another unit, which may be a product
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
 )
+_SENT = re.compile(r"(?<=[./])(?:cmd|command|commanded|desired|target|setpoint|ref)_(?=[a-zA-Z])")
 _SHORT = ("s", "V", "A", "N", "C")  # may be part of a name as well: `vel_N`
 _NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what may follow a name
 TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m"}  # of a joint
@@ -139,14 +140,14 @@ def without_unit(path: str) -> str:
 
 
 def without_role(path: str) -> str:
-    """Return a message path without the suffix of a command, as in `steering_pct_cmd`."""
+    """Return a path without what marks a command, as in `steering_pct_cmd` and `/csv.cmd_v`."""
     whole = _NUMBER.sub("", path)
-    bare = _ROLES.sub("", whole)
+    bare = _ROLES.sub("", _SENT.sub("", whole))
     return path if bare == whole or bare.endswith((".", "/")) else bare
 
 
 def bare_command(path: str) -> str:
-    """Return a message path without unit and command suffix, in either order."""
+    """Return a message path without its unit and what marks a command, in either order."""
     return without_role(without_unit(without_role(path)))
 
 

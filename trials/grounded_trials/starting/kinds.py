@@ -21,7 +21,7 @@ from grounded_trials.logs.inspection.inspect_guess import (
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
-from grounded_trials.logs.stated_units import factor_between, unit_in_name
+from grounded_trials.logs.stated_units import bare_command, factor_between, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
 from grounded_trials.starting.skeletons import (
     BALANCE,
@@ -59,6 +59,8 @@ OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
 FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
 SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # angle of a load on a trolley
+SPEEDS = ("v", "vel", "speed", "velocity", "linear", "lin_vel", "v_x", "vx")
+TURNS = ("w", "omega", "turn", "turn_rate", "yaw_rate", "angular", "ang_vel", "wz", "r")
 AFLOAT = re.compile(r"thruster|propeller|(^|[/._])(usv|wamv|boat|vessel)([/._\d]|$)")
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
@@ -239,6 +241,8 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
     if both:
         return "differential", f"it has the commands {' and '.join(both)}, and a heading"
+    if sent := _speed_and_turn(log):
+        return "rover", f"it has the commands {' and '.join(sent)}, and a heading"
     if command := _balancing(log):
         return "balance", f"it has a pitch, a position or speed, and one command, {command}"
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
@@ -319,6 +323,13 @@ def _both_sides(log: LogReport) -> tuple[str, ...]:
         if COMMANDED.search(left.lower()) or EFFORT.search(left.lower()):  # /left/thrust
             return "left", "right"
     return ()
+
+
+def _speed_and_turn(log: LogReport) -> tuple[str, ...]:
+    """Return the names of a speed command and of a turn rate command; () without a heading."""
+    sent = {bare_command(path).rpartition(".")[2].lower(): n for n, path in sent_in(log).items()}
+    pairs = [(sent.get(v, ""), sent.get(w, "")) for v in SPEEDS for w in TURNS]
+    return next((pair for pair in pairs if all(pair)), ()) if _headed(log) else ()
 
 
 def _balancing(log: LogReport) -> str:

@@ -65,6 +65,7 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "yaw_rate": ("angular.z", "angular_velocity.z", "yaw_rate"),
     "delta": ("steering_angle", "delta", "steering"),
     "steering": ("steering", "steering_angle", "steer", "delta", "angular.z"),
+    "turn": ("turn", "angular.z", "angular_velocity.z", "turn_rate", "yaw_rate", "omega", "w"),
     "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
     "thrust": ("thrust", "force.z", "throttle"),
     "brake": ("brake",),
@@ -91,6 +92,7 @@ _NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheel
     "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
 )
 _WORD = re.compile(r"[a-z]+")
+_FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
 
 
@@ -307,7 +309,7 @@ def _score(
     plain = bare_command if is_input else without_unit
     bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
     apart = _HUMP.sub("_", field.path[len(topic.topic) :]).lower().strip('".')
-    ways = {inside, bare, apart, in_english(inside), in_english(bare)}
+    ways = {inside, bare, apart, in_english(inside), in_english(bare), _FLAT.sub(r".\1.", inside)}
     best = max(_fit(called, one, topic.topic.lower()) for one in ways)
     folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
     if is_input and inside in ("data", "value") and set(called) & set(folders):
