@@ -13,6 +13,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.result import listed
+from grounded.search.certainty import student
 from grounded.search.returned.who_drove import LEAST
 from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
@@ -23,17 +24,18 @@ from grounded_trials.workspace.candidates.standing_without import standing_witho
 from grounded_trials.workspace.candidates.standstill import SAME, standstills
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import began_elsewhere
-from grounded_trials.workspace.placing import FEWEST, placing
+from grounded_trials.workspace.placing import FEWEST, Placing, placing
 from grounded_trials.workspace.user_files.config import FILE
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
 # without weight along the way, share of its range in the run
 FAR = 0.1
 SURE = 3.0  # the start must also be off by this many times sensor noise, and earlier starts' rms
+UNLIKE = 0.99865  # the same for the rms of few starts, as a probability by Student's t
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much,
-UNKNOWN = 0.5  # and by which it does before other runs tell how the robot is placed
+UNKNOWN = 0.5  # and by which it does while too few other runs tell how the robot is placed
 ALIKE = 0.05  # difference of two changes of a utility, relative, that is not told
 ALWAYS = 3  # runs that begin alike, from which on they always do
 
@@ -91,7 +93,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     with np.errstate(all="ignore"):
         share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    usual_off = np.abs(off) <= SURE * np.nan_to_num(placed.rms)
+    usual_off, perhaps = np.abs(off) <= SURE * np.nan_to_num(placed.rms), _perhaps(off, placed)
     if not told.any():
         return None
     real = abs(task.utility(trial))
@@ -102,10 +104,11 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     repeats = _to_repeat(workspace, trial)
     for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        explains = 0 < lost < -changes
+        explains = 0 < lost < -changes and not repeats
         if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
-            counts = unknown and abs(changes) < UNKNOWN * cost
-            (tolerated if counts else usually_so if usual_off[i] else spoils).append(i)
+            open_ = (unknown or perhaps[i]) and abs(changes) < UNKNOWN * cost
+            usual = usual_off[i] or (open_ and not unknown)
+            (usually_so if usual else tolerated if open_ else spoils).append(i)
         elif not usual_off[i] or share[i] > MUCH:
             tolerated.append(i)
     if not (spoils or tolerated or usually_so):
@@ -127,11 +130,13 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             f"{task.model.state_names[i]}"
             for i in usually_so
         )
+        usual = usual_off[usually_so].all()
+        why = "this is no unusual one" if usual else "they are too few to call this one unusual"
         does = (
             f"The starts of {min(placed.runs[usually_so])} other runs are off by {usually} (rms): "
-            "this is no unusual one, and the run counts; by the model its start changes its "
-            f"utility by {whole:+.3g}. Place the robot more exactly, or "
-            "average runs ([search] repeats), to see smaller gains"
+            f"{why}, and the run counts; by the model its start changes its utility by "
+            f"{whole:+.3g}. Place the robot more exactly, or average runs ([search] repeats), "
+            "to see smaller gains"
         )
     elif unknown:
         does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
@@ -152,6 +157,16 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     return Begun(
         f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
     )
+
+
+def _perhaps(off: Array, placed: Placing) -> Array:
+    """Return in which states a start may be off as other runs' starts are, (n,) bool.
+
+    Of two other starts the rms says little: a boat that is placed to 5 cm began 5 and 14 mm off,
+    and 77 mm were "unusual".
+    """
+    pairs = zip(np.abs(off), placed.rms, placed.runs, strict=True)
+    return np.array([r > 0 and student(x / r, float(n)) <= UNLIKE for x, r, n in pairs], bool)
 
 
 def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
