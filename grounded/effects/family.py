@@ -259,6 +259,10 @@ class LossFamily(Family):
 class RateFamily(Family):
     """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates.
 
+    It acts half before and half after the model's step, the second half where that half itself
+    leads: with both at the states where they begin, a drag's error is of first order in dt.
+    `dry`: it does not grow with its target, which the second half may bring to rest: then that acts
+    where it begins.
     `parts`: if not 0, it acts on the mean rate of each of so many parts of the step, instead of
     half before and half after the step,
 
@@ -273,6 +277,7 @@ class RateFamily(Family):
     needs_own: bool = False
     parts: int = 0
     brakes: bool = False
+    dry: bool = False
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,7 @@ coulomb_friction = RateFamily(
         site.target: -c["c"] * np.tanh(s[site.target] / c["width"])
     },
     brakes=True,
+    dry=True,
 )
 
 quadratic_drag = RateFamily(
@@ -129,6 +130,7 @@ stiction = RateFamily(
     lookalikes=("stall", "dead_zone", "coulomb_friction"),
     rate=_stiction_rate,
     needs_own=True,
+    dry=True,
 )
 
 FAMILIES = (viscous_friction, coulomb_friction, quadratic_drag, stiction)

@@ -6,7 +6,8 @@ One control step of the wrapped model, for commands held over the step:
     f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
     own    = (f(s, u_eff) - s) / dt               the model's own mean rate over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
-    s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
+    s2     = s1 + dt/2 rate(s1)
+    s+     = s1 + dt/2 rate(s2)                   ... and half after it (Strang): second order in dt
     s+     = s + h (own + rate(s))                families that limit a rate, h = dt / parts
     s+     = V_c(f(V_-c(s))) + dt c               a medium that moves with c (`medium`)
     y+     = measure(s+),  s = recover(y)         sensor families
@@ -322,6 +323,7 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     base, instant, clocks = plain_step(model), _instant(model), _clocks(effects)
     limits = [e for e in effects if _family(e).parts]
     rates = [e for e in effects if not _family(e).parts]
+    soft, dry = ([e for e in rates if _family(e).dry == one] for one in (False, True))
     needs_own = any(_family(e).needs_own for e in rates)
     tied = {n: k for n in model.state_names if (k := partner(model, n))}
 
@@ -331,7 +333,13 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
         own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
         state = _kicked(start, _added(rates, start, a, own, now, p, dt), dt)
         after, own = _through(limits, base, state, a, p, dt, now)  # own: mean over this step
-        final = _kicked(after, _added(rates, after, a, own, then, p, dt), dt)
+        last = _added(rates, after, a, own, then, p, dt)
+        if soft:
+            there = _kicked(after, last, dt)
+            last = _added(soft, there, a, own, then, p, dt)
+            for n, rate in _added(dry, after, a, own, then, p, dt).items():
+                last[n] = last[n] + rate if n in last else rate
+        final = _kicked(after, last, dt)
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's, effects included
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)

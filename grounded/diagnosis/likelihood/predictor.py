@@ -238,7 +238,12 @@ class Predictor(SentOnce):
         after, mean = self.limited(h, start, u, t)
         if needs_own:  # mean over this step: second order, and stable for a stiff model
             own = self.named(mean)
-        result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
+        last = self.added_rate(rates, after, u, t + dt, own)
+        soft, dry = ([r for r in rates if r[0].family.dry == one] for one in (False, True))
+        if soft:
+            last = self.added_rate(soft, after + 0.5 * dt * last, u, t + dt, own)
+            last += self.added_rate(dry, after, u, t + dt, own)
+        result = after + 0.5 * dt * last
         for i, j in self.tied():  # a carried heading rate is the heading's rate, effects included
             found = []
             for s, when in ((x, t), (result, t + dt)):
