@@ -64,7 +64,7 @@ def by_candidate(candidate, room):
     words = ["export", identity, "--runner", "-o", str(room / "policy.npz")]
     workspace = str(candidate.parents[1])
     program = [sys.executable, "-c", "from grounded_cli.main import main; main()", "-C", workspace]
-    subprocess.run([*program, *words], check=True, stdout=sys.stderr)
+    subprocess.run([*program, *words], check=True, stdout=subprocess.DEVNULL)  # for a person
     sys.path.insert(0, str(room))
     from grounded_runner import load
 

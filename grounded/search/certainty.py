@@ -271,16 +271,17 @@ def last_improvement(history: Sequence[Tried], again: str = "") -> str:
     if start:
         other, rest = before.candidate.id, gain - start
         measured = f"{gain:.3g}" + (f" +- {error:.2g}" if freedom and error else "")
-        policy = f"and {rest:.3g} to the policy"
+        said = f"is {measured} as measured, which the search goes by; by the model,"
         if rest < 0:
-            policy = f"without which {other} would be ahead by {-rest:.3g}"
+            why = f"{said} {other} would be ahead by {-rest:.3g} from the same start"
+        else:
+            why = (
+                f"{said} {start:.3g} of it is due to where their runs began and {rest:.3g} to the "
+            )
+            why += "policy"
         if not rest > SHOWN * (error if freedom else 0.0):
-            policy += ": which of the two is better is open"
-        return (
-            f"the last gain, of {after.candidate.id} over {other}, is {measured} as measured, and "
-            f"that counts; by the model, {start:.3g} of it is due to where their runs began, "
-            f"{policy}"
-        )
+            why += ": which of the two is better is open"
+        return f"the last gain, of {after.candidate.id} over {other}, {why}"
     if freedom and error and _start_unknown(before, after, history):
         return (
             f"the last gain in utility is {with_error(gain, error)} by the scatter of repeats, but "

@@ -1010,6 +1010,20 @@ def test_who_goes_on_after_steps_that_lost_is_told_of_a_diagnosis(tmp_path, monk
     assert not any("2 steps were lost" in note for note in notes), notes
 
 
+def test_data_beside_a_search_leave_the_waiting_candidate_next(tmp_path, monkeypatch):
+    """The log of a run that went wrong was kept as data: `diagnose`, with the boat on the water."""
+    monkeypatch.chdir(tmp_path)
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    first = w.propose().candidate
+    by_hand = record(w, tmp_path / "hand.csv", first.policy, 0.5)
+    assert last(grounded("-C", w.folder, "ingest", "--data", by_hand)).endswith("diagnose")
+    w.ingest(record(w, tmp_path / "c0001.csv", first.policy, 0.0, seed=1), candidate="c0001")
+    waits = w.propose().candidate.id
+    other = record(w, tmp_path / "wrong.csv", first.policy, 0.3)
+    told = last(grounded("-C", w.folder, "ingest", "--data", other))
+    assert waits == "c0002" and told.endswith("grounded run")
+
+
 def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_adopted(
     tmp_path, monkeypatch
 ):

@@ -186,12 +186,21 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
     """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
+    Data beside a search whose candidate waits leave that next: the log of a run that went wrong was
+    kept as data, and a diagnosis was next, with the robot on the water.
+
     Args:
         workspace: the workspace that has stored the log.
         verdict: `Ingested.verdict`.
         now: the standing of the search including the log; None for data.
     """
-    if now is None or verdict == "probe":
+    if verdict == "probe":
+        return DIAGNOSE
+    if now is None:
+        with suppress(GroundedError):  # a task that can't be planned, of which data say nothing
+            ran = any(one.candidate for one in workspace.task_trials())
+            if ran and (now := standing_in(workspace)).phase == "await-trial":
+                return another_trial(workspace, now)
         return DIAGNOSE
     if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
         return next_command(workspace, now, found, usable_ids(workspace))
