@@ -78,7 +78,7 @@ def command(
     """
     workspace = open_workspace()
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosing import unheld_in
+    from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
     from grounded_trials.workspace.last_diagnosis import left_out
 
     first, second = map(names_in, compare or ("", ""))
@@ -107,7 +107,7 @@ def command(
             engine=engine,
             progress=tell,
         )
-    for note in [] if trials or first else left_out(workspace):
+    for note in [*([] if trials or first else left_out(workspace)), *unwritten_in(workspace)]:
         remark("note", note)
     if json_:
         show_json(found.to_json())

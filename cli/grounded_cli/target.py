@@ -281,7 +281,7 @@ def command(
         remark("note", limited)
     then = NextCommand("propose")
     if lost := unmapped(workspace):
-        remark("note", f"{lost}: map that before `propose`, which plans for all inputs")
+        remark("note", f"{lost}: `propose` plans for all inputs, so map all of them first")
         then = INSPECT
     if weighed := _weighed(free, reward):
         remove = f"remove the weight of {listed(weighed)} from [reward] in grounded.toml"

@@ -36,6 +36,7 @@ from grounded_trials.starting.skeletons import (
     arm,
     drone,
 )
+from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
 Units = Mapping[str, str]  # unit of a number by its path
@@ -154,7 +155,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     turned = {s: found[s] for s in states if unit.get(s) == "rad"}
     return Skeleton(
         "generic",
-        "Numbers that follow the inputs with a lag: replace them by your robot's equations",
+        f"Numbers that follow the inputs with a lag: {PLACEHOLDER}",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
         {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,

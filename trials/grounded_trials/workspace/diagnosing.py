@@ -22,6 +22,7 @@ from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_whe
 from grounded_trials.workspace.identity import ROWS
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
@@ -258,6 +259,21 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     from grounded.instruments.kinematics.rows import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials))
+
+
+def unwritten_in(workspace: Folder) -> list[str]:
+    """Return a note if model.py still has what `init` wrote for a robot of unknown kind."""
+    file = workspace.config.model.file
+    gains = [p.value for name, p in workspace.base_model.params.items() if name.startswith("gain_")]
+    if not file or not gains or any(gains):
+        return []
+    if PLACEHOLDER not in (workspace.folder / file).read_text(encoding="utf-8"):
+        return []
+    return [
+        f"{file} has what `init` wrote for a robot of unknown kind, where no input changes a "
+        "state: what is found stands in for your robot's equations. Write these first, and "
+        "diagnose again"
+    ]
 
 
 def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:

@@ -1,0 +1,67 @@
+"""What a rover's table calls its commands: a speed and a turn rate, in words of many teams."""
+
+import numpy as np
+import pytest
+
+from cli import grounded, plain
+from grounded_trials import Workspace
+from grounded_trials.starting.begin import begin
+from grounded_trials.workspace.diagnosing import unwritten_in
+from grounded_trials.workspace.folder import Folder
+
+
+def table(path, names):
+    """A rover's drive with the columns t, x, y, yaw, v, omega, and two commands."""
+    t = np.arange(0, 20, 0.05)
+    speed, turn = 0.4 + 0.2 * np.sign(np.sin(0.9 * t)), 0.8 * np.sign(np.sin(1.3 * t))
+    v, omega, yaw, x, y = (np.zeros(len(t)) for _ in range(5))
+    for k in range(len(t) - 1):
+        v[k + 1] = v[k] + 0.05 * (speed[k] - v[k]) / 0.3
+        omega[k + 1] = omega[k] + 0.05 * (turn[k] - omega[k]) / 0.2
+        yaw[k + 1] = yaw[k] + 0.05 * omega[k]
+        x[k + 1] = x[k] + 0.05 * v[k] * np.cos(yaw[k])
+        y[k + 1] = y[k] + 0.05 * v[k] * np.sin(yaw[k])
+    columns = (t, x, y, yaw, v, omega, speed, turn)
+    np.savetxt(path, np.column_stack(columns), "%.6f", ",", header=",".join(names), comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("measured", "sent"),
+    [
+        (("v", "omega"), ("cmd_v", "cmd_omega")),
+        (("v [m/s]", "yaw_rate [rad/s]"), ("cmd_v [m/s]", "cmd_w [rad/s]")),
+        (("v", "omega"), ("v_cmd", "w_cmd")),
+        (("speed", "yaw_rate"), ("v_ref", "w_ref")),
+        (("v", "omega"), ("cmd_vel.linear.x", "cmd_vel.angular.z")),
+    ],
+)
+def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent):
+    """Of `x, y, yaw, v, omega, cmd_v, cmd_omega`: "the kind of robot is unknown"."""
+    log = table(tmp_path / "drive.csv", ("time", "x", "y", "yaw", *measured, *sent))
+    done = begin(tmp_path / "w", log)
+    assert done.kind == "rover" and done.then.verb == "ingest"
+    found = {g.name: g.path for g in (*done.states, *done.inputs)}
+    word = [name.partition(" ")[0].replace(".", "_") for name in sent]
+    assert [found["speed"], found["turn"]] == [f"/csv.{name}" for name in word]
+    assert all(found[name] for name in ("v", "omega", "x", "y", "psi"))
+
+
+def test_a_target_beside_unmapped_inputs_leads_to_the_log(tmp_path):
+    """`target` named `propose` next, which refuses to plan for inputs that [log] lacks."""
+    log = table(tmp_path / "drive.csv", ("time", "x", "y", "yaw", "v", "omega", "p_one", "p_two"))
+    begin(tmp_path / "w", log, kind="rover")
+    done = grounded("-C", tmp_path / "w", "target", "circle", "--size", 1, "--speed", 0.4)
+    assert done.code == 0 and done.out.split()[-3::2] == ["inspect", "LOG"]
+    assert "[log] maps no 'speed' and 'turn'" in plain(done.err)
+
+
+def test_the_equations_of_no_robot_are_told_as_that(tmp_path):
+    """`diagnose` of what `init` filled in ended with `adopt`, and no word on the equations."""
+    log = table(tmp_path / "drive.csv", ("time", "a", "b", "c", "d", "e", "p_one", "p_two"))
+    assert begin(tmp_path / "w", log).kind == "generic"
+    (told,) = unwritten_in(Folder(tmp_path / "w"))
+    assert "Write these first" in told
+    model = Workspace(tmp_path / "w").folder / "model.py"
+    model.write_text(model.read_text().replace("replace them by your robot's equations", "mine"))
+    assert not unwritten_in(Folder(tmp_path / "w"))
