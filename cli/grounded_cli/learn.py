@@ -72,6 +72,7 @@ def command(trials: int | None, json_: bool) -> None:
 
 def narrated(workspace: Workspace, trials: int | None = None) -> Status:
     """Run the learning loop and print a line for each trial."""
+    told = dict[str, str]()
     with stages() as tell:
 
         def each(candidate: Candidate, found: Ingested) -> None:
@@ -83,8 +84,14 @@ def narrated(workspace: Workspace, trials: int | None = None) -> Status:
                 f"{number(candidate.predicted_utility):>9}  real {number(found.utility):>9}  "
                 f"{tinted(found.verdict)}"
             )
+            told[candidate.id] = found.verdict
 
         status = workspace.learn(trials, progress=tell, each=each)
+    now = {t.candidate.id: t.verdict() for t in status.standing.history}
+    if sure := [n for n, then in told.items() if (then, now.get(n)) == ("maybe better", "better")]:
+        from grounded_trials.wording import ranges
+
+        remark("note", f"{ranges(sure)}: maybe better when run, better by what repeats told since")
     for note in status.notes:
         remark("note", note)
     return status
