@@ -266,7 +266,7 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert holds(found, "2.1", "1.9", "0.2", "c0001") and "probability" not in found
     worse = replace(second, utilities=(-4.4, -4.3))  # the policy lost, the start made up for it
     told = last_improvement([first, worse])
-    assert holds(told, "c0002 over c0001", "that counts", "without which c0001", "0.255")
+    assert holds(told, "c0002 over c0001", "which the search goes by", "c0001 would be ahead", "0.255")
     here = ran("c0001", "", -6.0, off=0.0)
     assert owed_to_start(here, second, [here, second]) == 0.0
     assert "probability" in last_improvement([here, second])
