@@ -231,10 +231,15 @@ def explained(before: Tried, after: Tried, history: Sequence[Tried]) -> str:
     "" if it is better with probability SURE or, while nothing similar was repeated, if the gain is
     `clear`.
     """
-    sure = chance(before, after, history)
+    sure, gain = chance(before, after, history), after.utility - before.utility
     if sure < SURE:
+        error, freedom = error_between(before, after, history)
+        if error and student(gain / error, freedom) >= SURE:
+            return "where the runs began may explain"
         return "the scatter of repeats may explain"
     if math.isnan(sure) and not clear(before, after, history):
+        if before.utility < CLEAR * after.utility:
+            return "where the runs began may explain"
         return "how much runs scatter is not known, and may explain"
     return ""
 

@@ -266,7 +266,9 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert holds(found, "2.1", "1.9", "0.2", "c0001") and "probability" not in found
     worse = replace(second, utilities=(-4.4, -4.3))  # the policy lost, the start made up for it
     told = last_improvement([first, worse])
-    assert holds(told, "c0002 over c0001", "which the search goes by", "c0001 would be ahead", "0.255")
+    assert holds(
+        told, "c0002 over c0001", "which the search goes by", "c0001 would be ahead", "0.255"
+    )
     here = ran("c0001", "", -6.0, off=0.0)
     assert owed_to_start(here, second, [here, second]) == 0.0
     assert "probability" in last_improvement([here, second])
@@ -319,6 +321,11 @@ def test_a_lead_that_lucky_starts_explain_is_told_so():
     assert "probability" not in last_improvement([first, led])  # which took all for a gain
     # "another run of c0001 would show which is better" stood beside a next command that ran c0003
     assert last_improvement([first, led]).endswith("which of the two is better is open")
+    # a lead of 1.81 beside a scatter of 0.058, of which the first one's start cost 1.85
+    first, led = ran("c0001", (-3.7,)), ran("c2", (-1.85, -1.87), owed=1.85)
+    assert explained(first, led, [first, led]) == "where the runs began may explain"
+    even = ran("c2", (-3.69, -3.71))
+    assert explained(first, even, [first, even]) == "the scatter of repeats may explain"
     clear = last_improvement([ran("c0001", (-5.0, -5.01)), ran("c2", (-2.0,), owed=1.0)])
     assert clear.endswith("and 2 to the policy")
     assert "began" not in last_improvement([first, ran("c2", (-4.9,), owed=0.01)])

@@ -38,6 +38,10 @@ WAYS = {
     "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, ("psi", "degrees", "pass rad")),
     "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, ("x", "y", "mm", "pass m")),
     "cm": ({"states": lambda x: x * [100, 100, 1]}, ("x and y", "in cm", "pass m")),
+    "compass": (
+        {"states": lambda x: x * [1, 1, -1]},
+        ("psi is passed", "opposite sign: pass it with the sign that the log has"),
+    ),
     "order": ({"states": lambda x: x[[1, 0, 2]]}, ("x and y", "order")),
     "last first": ({"states": lambda x: x[[2, 0, 1]]}, ("order psi, x, y", "order x, y, psi")),
     "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),

@@ -36,6 +36,7 @@ MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much,
 UNKNOWN = 0.5  # and by which it does while too few other runs tell how the robot is placed
+TOLD = 0.05  # the same from which the change is told of a start that spoils nothing
 ALIKE = 0.05  # difference of two changes of a utility, relative, that is not told
 ALWAYS = 3  # runs that begin alike, from which on they always do
 
@@ -138,9 +139,10 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             f"{whole:+.3g}. Place the robot more exactly, or average runs ([search] repeats), "
             "to see smaller gains"
         )
-    elif unknown:
-        does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
-        if abs(whole) > max(scatter, SPOILT * cost):
+    else:
+        if unknown:
+            does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
+        if abs(whole) > max(scatter, TOLD * cost):
             does = f"By the model its whole start changes its utility by {whole:+.3g}. {does}"
     if spoils:
         changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
