@@ -9,7 +9,7 @@ derivatives by each free value of the effects and each shift of a parameter. The
 columns at once. Of a delayed sensor, r_t is the residual of the sample that shows the state at t
 (`delays`). The Jacobian contains the model and the added rates of the effects,
 
-    F_h = (1 + dt/2 A_1) F (1 + dt/2 A_0),     A = d rate / d x at the start, at the end
+    F_h = (1 + dt/2 A_1 (1 + dt/2 A_1)) F (1 + dt/2 A_0),   A = d rate / d x at start and end
 
 An added rate that depends on the state (a coupling, a friction) propagates errors as the model
 does. Without it, noise of one state would appear unexplained in another. Effects in proportion to

@@ -25,7 +25,10 @@ def with_effects(
     half, mean = 0.5 * data.dt, (F - one) / data.dt
     first = rate_slopes(predictor, h, x, u, data.time, mean)
     direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
-    later = F + half * direct @ F
+    soft = direct
+    if any(e.family.dry for e, _ in rates_of(h)):
+        soft = rate_slopes(predictor, h, after, u, data.time + data.dt, None, soft=True)
+    later = F + half * (direct + half * soft @ direct) @ F  # where the second half leads
     if any(e.family.needs_own for e, _ in rates_of(h)):
         # the model's own rate used at the end is the step's mean, a function of the start
         later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
@@ -88,6 +91,7 @@ def rate_slopes(
     of_own: Array | None,
     *,
     now: bool = False,
+    soft: bool = False,
 ) -> Array:
     """Return the slope of the added rates in the state, (L, B, n, n) [1/s], at x (L, B, n).
 
@@ -99,8 +103,10 @@ def rate_slopes(
         t: times (L, B) [s].
         of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: held constant.
         now: use instantaneous rates, limits included, instead of means over the step.
+        soft: without dry frictions.
     """
     rates, data = [*rates_of(h), *(limits_of(h) if now else [])], predictor.data
+    rates = [(e, v) for e, v in rates if not (soft and e.family.dry)]
     n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
     if not rates:
         return np.zeros((*x.shape, n))
