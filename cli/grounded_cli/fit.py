@@ -85,6 +85,8 @@ def command(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
+    if done.rows_s:
+        show("\n".join(lines(_rows(done.rows_s), "  ", "  ")))
     if found.at_bounds:
         show("\n".join(lines(_stopped(found.at_bounds), "  ", "  ")))
     if done.not_fitted:
@@ -110,6 +112,14 @@ def _not_fitted(delays: Sequence[str]) -> str:
         f"{listed(delays)} kept {'its' if len(delays) == 1 else 'their'} d, which the intervals "
         "take as exact: they are too narrow; `grounded fit --latency` fits one delay of all inputs "
         "in its place"
+    )
+
+
+def _rows(row: float) -> str:
+    """Say why the interval of a delay is as wide as it is."""
+    return (
+        f"interval of a delay: the {row:.3g} s between rows of the log to each side, which do not "
+        "say when in between a command was sent"
     )
 
 

@@ -25,6 +25,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import ELSEWHERE, folded, placed, rendered
+from grounded_trials.workspace import fitting
 from grounded_trials.workspace.adoptable import diagnosed_again
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.diagnosing import _deeper, _in_vain
@@ -1111,7 +1112,9 @@ def test_a_gap_that_the_verdict_states_is_not_repeated_when_the_search_has_ended
     assert contested.contested and "To learn more" not in nothing_to_do(contested, "c0001")
 
 
-def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_exact(tmp_path):
+def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_exact(
+    tmp_path, monkeypatch
+):
     folder = make(tmp_path / "w").folder
     grounded("-C", folder, "learn", "--trials", "2")
     late, bent = {"name": "delay:force", "d": 0.02}, {"name": "dead_zone:force", "c": 0.01}
@@ -1131,3 +1134,12 @@ def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_ex
     apply_fit(Workspace(folder), Workspace(folder).fit().fit)
     (effect,) = Workspace(folder).config.model.effects
     assert effect["d"] == pytest.approx(found["value"], rel=1e-6)
+    # "0.0584 .. 0.0592" of rows 0.05 s apart, beside +- 0.025 in the diagnosis
+    exact = grounded("-C", folder, "fit", "--json").json["params"]["delay_force_d"]
+    monkeypatch.setattr(fitting, "row_interval", lambda *_: 0.05)
+    wide = grounded("-C", folder, "fit", "--json").json
+    assert wide["rows_s"] == 0.05 and fitted["rows_s"] == 0.0
+    known = wide["params"]["delay_force_d"]
+    assert known["low"] == pytest.approx(exact["low"] - 0.05)
+    assert known["high"] == pytest.approx(exact["high"] + 0.05)
+    assert "the 0.05 s between rows" in " ".join(grounded("-C", folder, "fit").out.split())

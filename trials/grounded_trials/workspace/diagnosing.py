@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from grounded.progress import duration
 from grounded.result import begun
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
-from grounded_trials.workspace.identity import ROWS
+from grounded_trials.workspace.identity import row_interval
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
@@ -103,7 +103,7 @@ def diagnose_in(
         named=tuple(trial.id for trial in used) if trials or compare else (),
         compared=tuple(compare),
         without=tuple(without),
-        rows_s=_row_interval(workspace, {trial.id for trial in used + others}),
+        rows_s=row_interval(workspace.whole_trials(), {trial.id for trial in used + others}),
     )
     began = time.monotonic()
     found = diagnose(
@@ -190,12 +190,6 @@ def _deeper(found: Diagnosis, took: float) -> str:
         f"Or look for more causes before adopting these: `{rendered(then)}`, which takes {least} "
         f"or more (this diagnosis took {duration(took)})."
     )
-
-
-def _row_interval(workspace: Folder, trials: Collection[str]) -> float:
-    """Return the largest interval of rows in the tables of these trials, see `Gridded` [s]."""
-    logs = [one for one in workspace.whole_trials() if one.stored.id in trials]
-    return max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
 
 
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:

@@ -7,6 +7,7 @@ predicts better, so that a fit without effect is not suggested again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +19,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import estimated_in
+from grounded_trials.workspace.identity import estimated_in, row_interval
 from grounded_trials.workspace.last_diagnosis import fittable, ids_of, write_fit
 from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
@@ -26,6 +27,7 @@ from grounded_trials.workspace.user_files.config import set_in_model, set_latenc
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
+    from grounded.fit.result import FittedValue
     from grounded.instruments.finding import Finding
 
 
@@ -39,6 +41,7 @@ class Fitted(Result):
     then: NextCommand  # the command to type next
     not_fitted: tuple[str, ...] = ()  # adopted delays that the intervals take as exact
     trials: tuple[str, ...] = ()  # the trials that were fitted
+    rows_s: float = 0.0  # rows of a table, between which a command was sent; in delays' intervals
 
     def summary(self) -> str:
         """Return the fitted values."""
@@ -50,6 +53,7 @@ class Fitted(Result):
             "applied": self.applied,
             "trials": list(self.trials),
             "not_fitted": list(self.not_fitted),
+            "rows_s": self.rows_s,
             "preflight": [one.to_json() for one in self.preflight],
         }
 
@@ -74,6 +78,8 @@ def fit_in(
     found, seen = fit_trials(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
+    row = row_interval(workspace.whole_trials(), ids_of(used))
+    found, widened = _as_known(workspace, found, row)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
         write_fit(workspace, used, found)
@@ -81,6 +87,7 @@ def fit_in(
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
+    fitted = partial(fitted, rows_s=row * widened)
     if apply and not np.isfinite(found.loglik):
         raise GroundedError(f"nothing was written: {found.sentence}", then=after_fit(workspace))
     if apply and found.worse:
@@ -92,6 +99,22 @@ def fit_in(
         return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))
     apply_fit(workspace, found)
     return fitted(applied=True, then=to_plan(workspace))
+
+
+def _as_known(workspace: Folder, found: Fit, row: float) -> tuple[Fit, bool]:
+    """Return a fit with delays' intervals widened by the interval of table rows [s]; if one was.
+
+    A row that repeats a command does not say if that was sent just then or up to a row before.
+    """
+    late = [n for n in found.params if n in _adopted_delays(workspace) or n.startswith("latency")]
+    if not (row and late):
+        return found, False
+
+    def wider(e: FittedValue) -> FittedValue:
+        return replace(e, std=math.hypot(e.std, row / 2), low=e.low - row, high=e.high + row)
+
+    params = {n: wider(e) if n in late else e for n, e in found.params.items()}
+    return replace(found, params=params), True
 
 
 def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -343,3 +343,9 @@ def other_task(task: Task, made: Candidate) -> str:
     if other:
         told.append(f"a start at {listed(other)} then")
     return "; ".join(told) or "another target, reward or feedback"
+
+
+def row_interval(stored: Iterable[StoredTrial], trials: Collection[str]) -> float:
+    """Return the largest interval of rows in the tables of some trials, see `Gridded` [s]."""
+    logs = [one for one in stored if one.stored.id in trials]
+    return max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
