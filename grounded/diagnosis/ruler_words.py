@@ -314,10 +314,11 @@ def rest(rows: Sequence[RulerRow]) -> str:
     times, share, name, row = max(found, key=lambda one: one[:3])
     when = _when(row)
     noise = "the most that can be noise" if row.floor_bound else "the noise"
-    text = f"the state {name} is still off by {float(f'{times:.2g}'):,g} times {noise} {when}"
+    still, noise = f"the state {name} is still off by", f"{float(f'{times:.2g}'):,g} times {noise}"
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
-        return f"{text}, but that is only {of}: too little to look for a cause"
+        return f"{still} {of} {when}, {noise}: too little to look for a cause"
+    text = f"{still} {noise} {when}"
     small = f"too little compared with how far {name} moves"
     return f"{text}; no cause is looked for, as that is {small}, or differs too much by trial"
 

@@ -189,7 +189,7 @@ drift_body = RateFamily(
 side_slip = RateFamily(
     name="side_slip",
     equation="velocity to the left = -k v^2 psi'",
-    sentence="it slides outwards in turns, by {k} of speed times lateral acceleration",
+    sentence="it slides {k>outwards|inwards} in turns, by {k} of speed times lateral acceleration",
     targets=lambda model: places.plane(model) if _moving(model) else [],
     quantities=lambda site: (Quantity("k", "s^2/m"),),
     lookalikes=("drift_body", "understeer", "sensor_delay"),
