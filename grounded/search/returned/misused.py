@@ -199,14 +199,14 @@ def ways(model: Model, own: Candidate, *, unsent: bool, over: bool = False) -> I
         if (names := tuple(group), factor) in tried or not {*names} <= {*model.state_names}:
             continue
         tried.add((names, factor))
-        right = " and ".join(dict.fromkeys(model.states[one] for one in names))
+        units = " and ".join(dict.fromkeys(model.states[one] for one in names))
         if factor == -1.0:
-            right = f"{'it' if len(names) == 1 else 'them'} with the sign that the log has"
+            units = f"{'it' if len(names) == 1 else 'them'} with the sign that the log has"
         yield Way(
             policy,
             f"they are what {name} sends if {listed(list(names))} "
             f"{'is' if len(names) == 1 else 'are'} passed to `runner.action` "
-            f"{_unit(model, names, factor)}: pass {right}",
+            f"{_unit(model, names, factor)}: pass {units}",
             names,
             factor,
         )

@@ -390,7 +390,7 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
         f"{listed([name for others, _ in groups[1:] for name in others])} as well: with "
         f"{CLOSER:g} times the weight on it ({weights}) a plan is off by {now}"
         + "; its feedback is stronger then, and carries more sensor noise"
-        * bool(first.policy.gain.any())
+        * bool(np.any(first.policy.gain))
     ]
 
 
