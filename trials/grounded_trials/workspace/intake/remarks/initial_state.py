@@ -57,32 +57,91 @@ class Begun:
 def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     """Return in which states a run did not start at s_0, beyond sensor noise; None if in none.
 
-    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
-    mean step of the run (of one much worse than promised, WORSE times a promised step), the most
-    costly first; another state relative to its range in the run.
     It spoils the utility if by the model it changes much of it, or by more than the run lost to the
-    best candidate. A change below the scatter of single runs spoils nothing. Offsets as
-    other starts have them (`placing`) are unavoidable: a repeat would begin no nearer, and the
-    search allows for what they cost. Before other runs tell, a start spoils a run if it explains
-    most of what it cost: a boat that was always placed to 5 cm had its first three runs discarded.
-    Of a run that left [safety], only the part before counts: a robot on the floor makes every start
-    seem near.
+    best candidate, unless the search repeats it for that. A change below the scatter of single runs
+    spoils nothing. Offsets as other starts have them (`placing`) are unavoidable: a repeat would
+    begin no nearer, and the search allows for what they cost. Before enough runs tell, a start
+    spoils a run if it explains most of what it cost: a boat that was always placed to 5 cm had its
+    first three runs discarded.
 
     Args:
         workspace: the workspace with the task, the model and the earlier runs.
         trial: the trial as stored.
     """
     task = workspace.task
-    placed = placing(workspace, but=trial.id)
     trial = interpolate_gaps(trial).trial.until(task.horizon)
     if not trial.candidate or trial.finite_steps < 0:
         return None
     off = task.model.difference(trial.began, task.start)
     if always := _always_there(workspace, trial, off):
         return Begun(always, again=False)
+    if (far := _far_off(workspace, trial, off)) is None:
+        return None
+    cost = abs(task.utility(trial))
+    if not np.isfinite(cost) or far.failed:
+        cost = -_promised(workspace, trial)
+    lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
+    placed, repeats = placing(workspace, but=trial.id), _to_repeat(workspace, trial)
+    unknown, perhaps = max(placed.runs) < FEWEST, _perhaps(off, placed)
+    within = np.abs(off) <= SURE * np.nan_to_num(placed.rms)
+    spoils, tolerated, usual = list[int](), list[int](), list[int]()
+    for i in far.states:
+        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
+        explains = 0 < lost < -changes and not repeats
+        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
+            open_ = (unknown or perhaps[i]) and abs(changes) < UNKNOWN * cost
+            as_others = within[i] or (open_ and not unknown)
+            (usual if as_others else tolerated if open_ else spoils).append(i)
+        elif not within[i] or far.share[i] > MUCH:
+            tolerated.append(i)
+    if not (spoils or tolerated or usual):
+        return None
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usual, *tolerated))
+    whole = _changes(workspace, trial, off)
+    by_model = f"By the model its whole start changes its utility by {whole:+.3g}"
+    does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
+    if spoils:
+        of = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
+        does = _to_discard(trial, listed(task.model.state_names[i] for i in spoils), of, whole)
+    elif repeats:
+        why = "that explains" if lost > 0 else "where its runs began explains"
+        does = (
+            f"The run counts; by the model {why} much of what {trial.candidate} lost, so it is to "
+            "be run once more. Place the robot nearer to the start"
+        )
+    elif usual:
+        does = _as_others_began(task, placed, usual, sure=bool(within[usual].all()))
+        does = f"{does}. {by_model}: place the robot more exactly, or average runs ([search] "
+        does += "repeats), to see smaller gains"
+    else:
+        if unknown:
+            does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
+        if abs(whole) > max(scatter, TOLD * cost):
+            does = f"{by_model}. {does}"
+    return Begun(
+        f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
+    )
+
+
+@dataclass(frozen=True)
+class _Far:
+    """The states in which a run began off s_0 by more than noise, the most costly first."""
+
+    states: list[int]
+    share: Array  # (n,) of the cost of a mean step; without weight, of the range in the run
+    failed: bool  # the run left [safety]
+
+
+def _far_off(workspace: Folder, trial: Trial, off: Array) -> _Far | None:
+    """Return in which states a start is far off, by `off` (n,); None if in none.
+
+    A state that [reward] weighs along the way is judged by the cost of its offset relative to a
+    mean step of the run (of one much worse than promised, WORSE times a promised step), another one
+    relative to its range in the run. Of a run that left [safety], only the part before counts: a
+    robot on the floor makes every start seem near.
+    """
+    task = workspace.task
     states = _inside(task, trial.states[: trial.finite_steps + 1])
-    failed = len(states) <= trial.finite_steps
-    usual = np.ptp(states, axis=0)
     predicted = workspace.candidate(trial.candidate)[0].predicted_states
     noise = sample_noise(trial.until(len(states) - 1), predicted)
     known = -task.rewards(trial)[: len(states)]
@@ -92,73 +151,36 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     usually = min(usually, WORSE * promised) if promised > 0 else usually
     weight = task.reward.state
     with np.errstate(all="ignore"):
-        share = np.where(weight > 0, weight * off**2 / usually, np.abs(off) / usual)
+        share = np.where(
+            weight > 0, weight * off**2 / usually, np.abs(off) / np.ptp(states, axis=0)
+        )
     told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
-    usual_off, perhaps = np.abs(off) <= SURE * np.nan_to_num(placed.rms), _perhaps(off, placed)
-    if not told.any():
-        return None
-    real = abs(task.utility(trial))
-    cost = real if np.isfinite(real) and not failed else -_promised(workspace, trial)
-    lost, scatter = _lost_by(workspace, trial), _scatter(workspace, trial, cost)
-    spoils, tolerated, usually_so = list[int](), list[int](), list[int]()
-    unknown = max(placed.runs) < FEWEST
-    repeats = _to_repeat(workspace, trial)
-    for i in sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i])):
-        changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
-        explains = 0 < lost < -changes and not repeats
-        if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
-            open_ = (unknown or perhaps[i]) and abs(changes) < UNKNOWN * cost
-            usual = usual_off[i] or (open_ and not unknown)
-            (usually_so if usual else tolerated if open_ else spoils).append(i)
-        elif not usual_off[i] or share[i] > MUCH:
-            tolerated.append(i)
-    if not (spoils or tolerated or usually_so):
-        return None
-    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usually_so, *tolerated))
-    whole = _changes(workspace, trial, off)
-    does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
-    if repeats:
-        why = "where its runs began explains"
-        if lost > 0:
-            why = "that explains"
-        does = (
-            f"The run counts; by the model {why} much of what {trial.candidate} lost, so it is to "
-            "be run once more. Place the robot nearer to the start"
-        )
-    elif usually_so:
-        usually = listed(
-            f"{with_unit(f'{placed.rms[i]:.2g}', list(task.model.states.values())[i])} in "
-            f"{task.model.state_names[i]}"
-            for i in usually_so
-        )
-        usual = usual_off[usually_so].all()
-        why = "this is no unusual one" if usual else "they are too few to call this one unusual"
-        does = (
-            f"The starts of {min(placed.runs[usually_so])} other runs are off by {usually} (rms): "
-            f"{why}, and the run counts; by the model its start changes its utility by "
-            f"{whole:+.3g}. Place the robot more exactly, or average runs ([search] repeats), "
-            "to see smaller gains"
-        )
-    else:
-        if unknown:
-            does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
-        if abs(whole) > max(scatter, TOLD * cost):
-            does = f"By the model its whole start changes its utility by {whole:+.3g}. {does}"
-    if spoils:
-        changes = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
-        names = listed(task.model.state_names[i] for i in spoils)
-        change = f"{names} change{'s' * (len(spoils) == 1)} its utility by {changes:+.3g}"
-        if not math.isclose(changes, whole, rel_tol=ALIKE):
-            change += f", its whole start by {whole:+.3g}"
-        does = (
-            f"By the model {change}: "
-            f"`discard {trial.id}`, place the robot nearer to the start and run "
-            f"{trial.candidate} again; if it can't be placed nearer, `propose` goes on with this "
-            "run. If it always starts there, set it in [task] start"
-        )
-    return Begun(
-        f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
+    order = sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i]))
+    return _Far(order, share, len(states) <= trial.finite_steps) if order else None
+
+
+def _to_discard(trial: Trial, names: str, changes: float, whole: float) -> str:
+    """Return why a run is to be discarded: what those states, and all, change its utility by."""
+    change = f"{names} change{'s' * (' and ' not in names)} its utility by {changes:+.3g}"
+    if not math.isclose(changes, whole, rel_tol=ALIKE):
+        change += f", its whole start by {whole:+.3g}"
+    return (
+        f"By the model {change}: `discard {trial.id}`, place the robot nearer to the start and run "
+        f"{trial.candidate} again; if it can't be placed nearer, `propose` goes on with this run. "
+        "If it always starts there, set it in [task] start"
     )
+
+
+def _as_others_began(task: Task, placed: Placing, which: list[int], *, sure: bool) -> str:
+    """Return how far other runs began off in these states, and that this one counts."""
+    units = list(task.model.states.values())
+    off = listed(
+        f"{with_unit(f'{placed.rms[i]:.2g}', units[i])} in {task.model.state_names[i]}"
+        for i in which
+    )
+    why = "this is no unusual one" if sure else "they are too few to call this one unusual"
+    count = min(placed.runs[which])
+    return f"The starts of {count} other runs are off by {off} (rms): {why}, and the run counts"
 
 
 def _perhaps(off: Array, placed: Placing) -> Array:
