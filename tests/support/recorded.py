@@ -27,6 +27,7 @@ def record(
     differs=0,
     turned=False,
     stale=0,
+    old=0,
     ahead=0,
     most=np.inf,
 ):
@@ -35,8 +36,8 @@ def record(
     `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
     `differs`: rows over which the program differentiates x, in place of the speed. `turned`: the
     motor is wired the wrong way round. `stale`: steps by which the program passes an older sample,
-    with its time. `ahead`: steps by which the program's clock ran before the run. `most`: where
-    the program cuts its commands.
+    with its time, `old`: the same at the present time. `ahead`: steps by which the program's clock
+    ran before the run. `most`: where the program cuts its commands.
     """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
@@ -55,7 +56,8 @@ def record(
             acted.append(felt)
             then = max(0, step - stale)
             if then + ahead < policy.horizon:
-                force = float(follow(policy, then + ahead, acted[then], sent)[0])
+                seen = acted[max(0, then - old)]
+                force = float(follow(policy, then + ahead, seen, sent)[0])
         force = float(np.clip(force, -most, most))
         if step + ahead >= policy.horizon:
             force = 0.0

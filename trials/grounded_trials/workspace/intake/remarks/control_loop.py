@@ -39,6 +39,7 @@ LACKING, SENT = 0.05, 0.25  # difference of commands in these, and share of it i
 MOST = 0.3  # share of the steps that tell which may be lost in a run
 RATHER = 0.7  # of the commands' squared errors: velocities alone are late if they leave less
 NEARLY = 0.4  # largest part of an adopted delay by which states that were predicted ahead miss it
+OLDEST, SURELY = 5, 0.5  # steps; share of other ages' errors of commands that tells an age
 NAMED = 2  # largest number of states that are named
 LARGE, MUCH_MORE = 0.2, 4.0  # swings, of an input's limits; of the cost that was predicted
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
@@ -63,7 +64,50 @@ def ran_otherwise(workspace: Folder, trial: Trial, lag: Lagging | None) -> str:
         return f"its commands are {found.told(own)}, and run {own.id} again"
     if lag and lag.again:
         return lag.told()
+    if told := _older_than_before(workspace, own, whole):
+        return told
     return _predicted_ahead(workspace, own, whole)
+
+
+def _older_than_before(workspace: Folder, own: Candidate, trial: Trial) -> str:
+    """Return the warning for a run that acted on older samples than the earlier ones; or "".
+
+    Samples that are as old in every run are the robot's, and later candidates allow for them. Of a
+    single one, the next step took its loss for its candidate's: an aircraft's model was given up.
+    """
+    if own.sample_age or not (old := _steps_old(own, trial)):
+        return ""
+    before = [one for one in workspace.task_trials() if one.candidate and one.id != trial.id]
+    ages = [
+        _steps_old(workspace.candidate(t.candidate)[0], interpolate_gaps(t).trial) for t in before
+    ]
+    known = [age for age in ages if age is not None]
+    if not known or any(known):
+        return ""
+    return (
+        f"its commands are what {own.id} sends on states that are {1e3 * old * trial.dt:.3g} ms "
+        "old, at the present time; earlier runs acted on the newest: pass `runner.action` the "
+        f"newest sample, and run {own.id} again"
+    )
+
+
+def _steps_old(own: Candidate, trial: Trial) -> int | None:
+    """Return how many steps old the states are by which a run's commands are its policy's.
+
+    None if no age leaves clearly less of its commands than the others do.
+    """
+    T = min(trial.finite_steps, own.policy.horizon)
+    if own.policy.gain is None or T < LEAST:
+        return None
+    run, off = commanded(own.policy, trial), []
+    for old in range(OLDEST + 1):
+        states = trial.states[None, np.maximum(np.arange(T) - old, 0)]
+        asked = own.policy.commands(states, run.past, run.sent[None])[0]
+        error = (asked - run.sent)[OLDEST:] / run.size
+        off.append(float(np.median(np.abs(error).max(axis=1))))
+    best = int(np.argmin(off))
+    rest = min(one for age, one in enumerate(off) if age != best)
+    return best if off[best] < SURELY * rest else None
 
 
 def _predicted_ahead(workspace: Folder, own: Candidate, trial: Trial) -> str:
