@@ -52,13 +52,20 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
         if not any(getattr(row, key) for row in ahead) or (few and key == "calibrated"):
             del columns[key]
     told_rows = (*ahead, *(whole if whole_trials or not ahead else ()))
-    pairs = [
-        [_cell(row, key, name) for key in ("crude", "with_effects")]
-        for row in told_rows
-        for name in row.unit_by_channel
-    ]
-    same = not diagnosis.verdict.causes and all(now == then for now, then in pairs)
-    if few or same:  # nothing is claimed: the same figures once more
+
+    def repeats_crude(key: str) -> bool:
+        pairs = (
+            (_cell(row, "crude", name), _cell(row, key, name))
+            for row in told_rows
+            for name in row.unit_by_channel
+        )
+        return all(now == then for now, then in pairs)
+
+    if "calibrated" in columns and repeats_crude("calibrated"):  # no other parameters were likelier
+        del columns["calibrated"]
+    if few or (
+        not diagnosis.verdict.causes and repeats_crude("with_effects")
+    ):  # nothing is claimed
         del columns["with_effects"]
     rows: list[Cells] = []
     for row in told_rows:
