@@ -210,6 +210,7 @@ def command(
     suggested = {name: float(f"{w:.6g}") for name, w in each.items() if name not in at_end}
     shared = len({*position_names(model)} & {*columns}) > 1
     alike = ", coordinates of a position alike by the smaller of their ranges" * shared
+    alike += ", at least a fifth of the larger" * shared
     slower = ", a tenth of that for velocities of positions" * bool(rates_beside(model, columns))
     for kind, by in (
         ("state", f"1 / (range in the target)^2{alike}{slower}"),
