@@ -85,8 +85,8 @@ def command(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
-    if done.rows_s:
-        show("\n".join(lines(_rows(done.rows_s), "  ", "  ")))
+    if told := _unknown_times(done.rows_s, done.mean_s):
+        show("\n".join(lines(told, "  ", "  ")))
     if found.at_bounds:
         show("\n".join(lines(_stopped(found.at_bounds), "  ", "  ")))
     if done.not_fitted:
@@ -115,12 +115,21 @@ def _not_fitted(delays: Sequence[str]) -> str:
     )
 
 
-def _rows(row: float) -> str:
-    """Say why the interval of a delay is as wide as it is."""
-    return (
-        f"interval of a delay: the {row:.3g} s between rows of the log to each side, which do not "
-        "say when in between a command was sent"
-    )
+def _unknown_times(row: float, mean: float) -> str:
+    """Say why the interval of a delay is as wide as it is; "" if it is by the data alone."""
+    why = list[str]()
+    if row:
+        rows = f"the {row:.3g} s between rows of the log"
+        why.append(f"{rows}, which do not say when in between a command was sent")
+    if mean > SLIGHT:
+        why.append(
+            f"{mean:.2g} s since a fit takes the mean of two commands where an input arrives "
+            "within a step; `diagnose` makes such steps in parts, so its value is the better one"
+        )
+    return f"interval of a delay, to each side: {'; '.join(why)}" if why else ""
+
+
+SLIGHT = 1e-5  # [s] of a delay that is not told
 
 
 def _stopped(names: Sequence[str]) -> str:

@@ -21,7 +21,7 @@ from grounded.search.returned.clipped import Clipped, clipped
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
 from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.who_drove import commanded, follows, latest
+from grounded.search.returned.who_drove import Commanded, commanded, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
@@ -105,12 +105,16 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> str:
     policy, n = own.policy, model.n
     if policy.gain is None or (policy.state_names, policy.input_names) != log.names:
         return ""
-    starts = [log.first, *log.openings[:TRIED]]
+    starts, runs = [log.first, *log.openings[:TRIED]], list[Commanded]()
     for begins in dict.fromkeys(log.on_step(policy, one) for one in starts):
         trial = log.trial_from(begins)
-        if trial is None or min(trial.finite_steps, policy.horizon) < least_of(policy.horizon):
-            continue
-        run = commanded(policy, trial)
+        if trial is not None and min(trial.finite_steps, policy.horizon) >= least_of(
+            policy.horizon
+        ):
+            runs.append(commanded(policy, trial))
+    # from the right start, its own commands may be nearer than any offset makes those of another
+    nearest = min((float(np.median(np.abs(r.sent - r.asked) / r.size)) for r in runs), default=0.0)
+    for run in runs:
         free = (run.sent > policy.low) & (run.sent < policy.high)
         free &= (run.asked > policy.low) & (run.asked < policy.high)
         off = ((run.sent - run.asked) / run.size)[free]
@@ -118,7 +122,8 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> str:
         if free.any(axis=1).sum() < FEW * n or float(np.median(np.abs(off))) < APART:
             continue
         by = np.linalg.lstsq(gains, off, rcond=1e-6)[0]
-        if float(np.median(np.abs(off - gains @ by))) > ORIGIN * float(np.median(np.abs(off))):
+        left = float(np.median(np.abs(off - gains @ by)))
+        if left > min(ORIGIN * float(np.median(np.abs(off))), nearest):
             continue
         does = np.abs(gains * by).max(axis=0) > ORIGIN * np.abs(off).max()
         if does.sum() < 2:  # of one state, its sensor's zero may differ as well
