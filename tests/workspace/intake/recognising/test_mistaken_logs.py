@@ -1,6 +1,7 @@
 """Logs with two commands exchanged, or in percent: told at ingest, and before a diagnosis."""
 
 from dataclasses import replace
+from types import SimpleNamespace as NS
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +12,12 @@ from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.onboard import Runner
 from grounded.plant import Plant
+from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.recognising import recognise
+from grounded_trials.workspace.intake.recognising.misused_run import other_origin
 from grounded_trials.workspace.intake.recognising.read_otherwise import misled
 from workspaces import make
 
@@ -494,6 +497,30 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
         return
     found = w.ingest(path, candidate=plan.id)
     assert holds(found.warnings[0], *told) and found.then.verb == "discard"
+
+
+def test_other_noise_than_the_log_s_is_no_other_origin(w):
+    """A rover's filtered state: "v 0.10 m/s and psi 0.25 rad", by a start before its own.
+
+    There its log is at rest, and offsets leave a little of the commands that it did not send.
+    """
+    plan, model, rng = w.propose().candidate, w.base_model, np.random.default_rng(2)
+    x, T = plan.predicted_states[:, : model.n], w.task.horizon
+    noise = 1e-5 * rng.standard_normal((2, T + 1, model.n))
+    passed = (x + noise[0])[None, :T]
+    sent = plan.policy.commands(passed, plan.policy.past, plan.predicted_inputs[None, :T])[0]
+    ran = Trial(x + noise[1], sent, w.task.dt, model.state_names, model.input_names)
+    moved, by = [], np.array([0.06, 0.0, -0.1])
+    runner = Runner(plan.policy)
+    for k in range(T):
+        moved.append(runner.action(k * w.task.dt, ran.states[k] + by))
+    before = replace(ran, inputs=np.array(moved) + 1e-3 * rng.standard_normal(sent.shape))
+    each = {0.0: before, 1.0: ran}
+    names = (plan.policy.state_names, plan.policy.input_names)
+    log = NS(first=0.0, openings=[1.0], names=names)
+    log.on_step, log.trial_from = (lambda policy, at: at), each.get
+    assert other_origin(NS(**{**vars(log), "openings": []}), model, plan)  # of that start alone
+    assert not other_origin(log, model, plan)
 
 
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
