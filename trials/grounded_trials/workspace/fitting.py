@@ -80,7 +80,7 @@ def fit_in(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
     row = row_interval(workspace.whole_trials(), ids_of(used))
-    found, row, mean = _as_known(workspace, found, row)
+    found, row, mean = _as_times_tell(workspace, found, row)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
         write_fit(workspace, used, found)
@@ -102,7 +102,7 @@ def fit_in(
     return fitted(applied=True, then=to_plan(workspace))
 
 
-def _as_known(workspace: Folder, found: Fit, row: float) -> tuple[Fit, float, float]:
+def _as_times_tell(workspace: Folder, found: Fit, row: float) -> tuple[Fit, float, float]:
     """Return a fit with delays' intervals widened by what it does not know of when commands act.
 
     A row of a table that repeats a command does not say if that was sent just then or up to a row

@@ -31,7 +31,7 @@ from grounded_trials.workspace.user_files.config import FILE
 # without weight along the way, share of its range in the run
 FAR = 0.1
 SURE = 3.0  # the start must also be off by this many times sensor noise, and earlier starts' rms
-UNLIKE = 0.99865  # the same for the rms of few starts, as a probability by Student's t
+CHANCE = 0.99865  # the same for the rms of few starts, as a probability by Student's t
 MUCH = 1.0  # share of a mean step's cost from which earlier starts that scatter are no excuse
 WORSE = 10.0  # times the promised cost: beside a worse run every offset would seem small
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much,
@@ -190,7 +190,7 @@ def _perhaps(off: Array, placed: Placing) -> Array:
     and 77 mm were "unusual".
     """
     pairs = zip(np.abs(off), placed.rms, placed.runs, strict=True)
-    return np.array([r > 0 and student(x / r, float(n)) <= UNLIKE for x, r, n in pairs], bool)
+    return np.array([r > 0 and student(x / r, float(n)) <= CHANCE for x, r, n in pairs], bool)
 
 
 def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
