@@ -164,10 +164,11 @@ def of_rivals(diagnosis: Diagnosis) -> str:
     beside = weighed_beside(diagnosis)
     if all(row.effect in beside for row in diagnosis.ranking):
         return ""
-    text = "alone: log-likelihood gained by it alone"
+    text = "log-likelihood less that of the likeliest model without effects; negative where "
+    text += "parameters alone explain more"
     if not any(row.claimed for row in diagnosis.ranking):
-        return text
-    return f"{text}, in place of what is claimed; beside that, it gains too little to be claimed"
+        return f"alone: its {text}"
+    return f"alone: in place of what is claimed, its {text}; beside that, it gains too little"
 
 
 def of_delays(diagnosis: Diagnosis) -> str:
