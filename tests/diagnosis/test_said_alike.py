@@ -95,7 +95,8 @@ def test_evidence_that_a_rival_gains_alone_has_its_own_column():
     ]
     rows, header = effect_table(found, rivals=False)
     assert len(rows) == 2 and "alone [nats]" not in header
-    assert holds(of_rivals(found), "in place of what is claimed", "beside that, it gains too little")
+    told = of_rivals(found)
+    assert holds(told, "in place of what is claimed", "beside that, it gains too little")
     assert of_rivals(Diagnosis(Verdict("effect"), ranking=ranking[:1])) == ""
     assert all(len(row) == len(header) for row in rows)
 
