@@ -61,7 +61,15 @@ from grounded_trials.logs.inspection.joint_names import (
     joint_units,
     of_joint,
 )
-from grounded_trials.logs.stated_units import Stated, factor_between, may_be, unit_of, without_role
+from grounded_trials.logs.stated_units import (
+    Stated,
+    bare_command,
+    factor_between,
+    may_be,
+    unit_of,
+    without_role,
+    without_unit,
+)
 
 LATEST = 0.5  # s: a command is sought up to this long before the angle that follows it
 JOINT = re.compile(r"\.(position|velocity)\[\d+\]$")  # numbers of a JointState
@@ -139,11 +147,19 @@ def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:
 
 
 def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
-    """Remove rivals of states that are assigned to inputs: a command is not a measurement."""
+    """Remove what is assigned to inputs from states: a command is not a measurement.
+
+    A heading follows its turn rate's command so closely that this seemed to be the turn rate.
+    """
     commands = {guesses[name].path: name for name in model.input_names if guesses[name].path}
     found = {}
     for name in model.state_names:
         guess = guesses[name]
+        if guess.path in commands and bare_command(guess.path) != without_unit(guess.path):
+            why = f"{guess.path} is the command '{commands[guess.path]}'"
+            others = tuple(path for path in guess.others if path not in commands)
+            found[name] = Guess(name, "", "", False, others, None, (why,))
+            continue
         rest = tuple(path for path in guess.others if path not in commands)
         if rest != guess.others and guess.path not in commands:
             said = [f"{p} is the command '{commands[p]}'" for p in guess.others if p in commands]
