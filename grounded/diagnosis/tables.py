@@ -63,9 +63,8 @@ def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[lis
 
     if "calibrated" in columns and repeats_crude("calibrated"):  # no other parameters were likelier
         del columns["calibrated"]
-    if few or (
-        not diagnosis.verdict.causes and repeats_crude("with_effects")
-    ):  # nothing is claimed
+    nothing_claimed = not diagnosis.verdict.causes and repeats_crude("with_effects")
+    if few or nothing_claimed:
         del columns["with_effects"]
     rows: list[Cells] = []
     for row in told_rows:

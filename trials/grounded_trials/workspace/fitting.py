@@ -113,7 +113,8 @@ def _as_times_tell(workspace: Folder, found: Fit, row: float) -> tuple[Fit, floa
     Returns:
         The fit, and what was added to each side of some delay [s] for either reason, at most.
     """
-    late = [n for n in found.params if n in _adopted_delays(workspace) or n.startswith("latency")]
+    adopted = _adopted_delays(workspace)
+    late = [n for n in found.params if n in adopted or n.startswith("latency")]
     dt, params, means = workspace.config.task.dt, dict(found.params), [0.0]
     for name in late:
         e = params[name]

@@ -77,7 +77,8 @@ def _older_than_before(workspace: Folder, own: Candidate, trial: Trial) -> str:
     """
     if own.sample_age or not (old := _steps_old(own, trial)):
         return ""
-    before = [one for one in workspace.task_trials() if one.candidate and one.id != trial.id]
+    ids = workspace.candidate_ids()  # not of another policy of its name, nor of one that is gone
+    before = [t for t in workspace.task_trials() if t.candidate in ids and t.id != trial.id]
     ages = [
         _steps_old(workspace.candidate(t.candidate)[0], interpolate_gaps(t).trial) for t in before
     ]
