@@ -242,8 +242,9 @@ class Predictor(SentOnce):
         soft, dry = ([r for r in rates if r[0].family.dry == one] for one in (False, True))
         if soft:
             there = after + 0.5 * dt * last
-            last = self.added_rate(dry, after, u, t + dt, own) if dry else 0.0
-            last = last + self.added_rate(soft, there, u, t + dt, own)
+            last = self.added_rate(soft, there, u, t + dt, own)
+            if dry:
+                last += self.added_rate(dry, after, u, t + dt, own)
         result = after + 0.5 * dt * last
         for i, j in self.tied():  # a carried heading rate is the heading's rate, effects included
             found = []
