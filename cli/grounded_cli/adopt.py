@@ -46,6 +46,14 @@ OLD = (
     "the target and the reported distance of {states} from it are in readings that are {by:.3g} s "
     "old: when they are on the target, the robot itself is ahead of it by that time"
 )
+ALONG = (
+    "came along: the sensors show it, and the plan allows for it then, as the robot's program gets "
+    "{it} that late"
+)
+BUT_LOGGED = (
+    ". If only the log is late, run `grounded adopt --undo`, set the delay_s that the diagnosis "
+    "gave in [log], and adopt again"
+)
 DRAW = "draw the manoeuvre first (`grounded target --help`), or propose anyway to repeat that drive"
 REMEASURE = (
     "the changed model was not compared with the trials yet: `grounded diagnose` does that; "
@@ -98,6 +106,9 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
             remark("note", SCALED.format(state=state, by=by, more=more))
         if family == "sensor_delay" and effect["name"] in effects:
             late.setdefault(effect["d"], []).extend(state.split("+"))
+    for name in done.along:  # not named by the user
+        only = BUT_LOGGED * name.startswith("sensor_delay:")
+        remark("note", f"{name} {ALONG.format(it=name.partition(':')[2])}{only}")
     for age, states in late.items():
         remark("note", OLD.format(states=listed(states), by=age))
     if not done.claimed:

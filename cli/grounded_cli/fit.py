@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from grounded.fit import Fit
     from grounded.fit.result import FittedValue
     from grounded.model import Model
+    from grounded_trials.workspace.fitting import Fitted
 
 STANDS_IN = (
     "fitted parameters can also compensate for effects that the equations lack (a mass for a "
@@ -85,7 +86,7 @@ def command(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
-    if told := _unknown_times(done.rows_s, done.mean_s):
+    if told := _unknown_times(done):
         show("\n".join(lines(told, "  ", "  ")))
     if found.at_bounds:
         show("\n".join(lines(_stopped(found.at_bounds), "  ", "  ")))
@@ -115,18 +116,25 @@ def _not_fitted(delays: Sequence[str]) -> str:
     )
 
 
-def _unknown_times(row: float, mean: float) -> str:
-    """Say why the interval of a delay is as wide as it is; "" if it is by the data alone."""
+def _unknown_times(done: Fitted) -> str:
+    """Say why intervals of times are as wide as they are; "" if it is by the data alone."""
     why = list[str]()
-    if row:
-        rows = f"the {row:.3g} s between rows of the log"
+    if done.rows_s:
+        rows = f"the {done.rows_s:.3g} s between rows of the log"
         why.append(f"{rows}, which do not say when in between a command was sent")
-    if mean > SLIGHT:
+    if done.mean_s > SLIGHT:
         why.append(
-            f"{mean:.2g} s since a fit takes the mean of two commands where an input arrives "
-            "within a step; `diagnose` makes such steps in parts, so its value is the better one"
+            f"{done.mean_s:.2g} s since a fit takes the mean of two commands where an input "
+            "arrives within a step; `diagnose` makes such steps in parts, so its value is the "
+            "better one"
         )
-    return f"interval of a delay, to each side: {'; '.join(why)}" if why else ""
+    from grounded.diagnosis.tables import in_between
+
+    text = f"interval of a delay, to each side: {'; '.join(why)}" if why else ""
+    if done.interpolated_s:
+        text += "; " * bool(text)
+        text += f"std of delays and time constants: {in_between(done.interpolated_s)}"
+    return text
 
 
 SLIGHT = 1e-5  # [s] of a delay that is not told

@@ -78,6 +78,8 @@ class DiagnosisOptions:
         one_message: states that are logged in one message, so that all or none of them are late.
         delays: adopted delays [s], {effect: delay}. They are part of the task's latency, and may
             turn out longer or shorter.
+        interpolated_s: standard deviation of times [s] because the states were interpolated
+            between the samples of a log.
         origin: the task before anything was adopted. Improvements are measured relative to the
             errors of its model, so that later diagnoses use the same scale as the first.
 
@@ -92,6 +94,7 @@ class DiagnosisOptions:
     but: Collection[str] = ()
     one_message: tuple[str, ...] = ()
     delays: Mapping[str, float] = field(default_factory=dict)
+    interpolated_s: float = 0.0
     origin: Task | None = None
 
     def __post_init__(self) -> None:
@@ -168,6 +171,7 @@ def diagnose(
     moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
     between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
     data = replace(data, filters=filters, between=frozenset(between))
+    data = replace(data, interpolated_s=options.interpolated_s)
     known = limits(data, looked.left_out)
     known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")

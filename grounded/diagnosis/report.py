@@ -209,6 +209,7 @@ class Made(Document):
     compared: tuple[str, ...] = ()  # the second group
     without: tuple[str, ...] = ()  # families that were excluded
     rows_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.row_s`; 0: of no such table
+    interpolated_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.interpolated_s`
 
     def __post_init__(self) -> None:
         if not all("name" in effect for effect in self.adopted):

@@ -21,6 +21,7 @@ WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED,
 UNBOUNDED = 1e6
 INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
 WITHOUT = "without: how much larger errors are without it, in the mean over states and horizons"
+TIMES = {"delay", "first_order_lag", "sensor_delay", "sensor_lag"}  # families of what arrives late
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -171,16 +172,30 @@ def of_rivals(diagnosis: Diagnosis) -> str:
 
 
 def of_delays(diagnosis: Diagnosis) -> str:
-    """Say where the +- of delays comes from if the log's rows don't tell when a command was sent.
+    """Say where the +- of times comes from, if it is not from the noise.
 
-    "" if they do, or if no delay is claimed.
+    The rows of a log may not tell when a command was sent, and states may be interpolated. "" if
+    neither is so, or if no such time is claimed.
     """
-    row = diagnosis.made.rows_s if diagnosis.made is not None else 0.0
-    if not row or not any(r.claimed and r.effect.startswith("delay:") for r in diagnosis.ranking):
+    made, why = diagnosis.made, list[str]()
+    claimed = [row.effect.partition(":")[0] for row in diagnosis.ranking if row.claimed]
+    if made is None:
         return ""
+    if made.rows_s and "delay" in claimed:
+        why.append(
+            f"+- of a delay: mostly half of the {made.rows_s:.3g} s between rows of the log, which "
+            "do not say when in between a command was sent"
+        )
+    if made.interpolated_s and (TIMES.intersection(claimed) or credit_of(diagnosis, CALIBRATION)):
+        why.append(f"+- of times: {in_between(made.interpolated_s)}")
+    return "; ".join(why)
+
+
+def in_between(seconds: float) -> str:
+    """Say by how much times are uncertain since states were interpolated."""
     return (
-        f"+- of a delay: mostly half of the {row:.3g} s between rows of the log, which do not say "
-        "when in between a command was sent"
+        f"at least {1e3 * seconds:.2g} ms, since states were interpolated between the samples of "
+        "the log, where a response may begin early"
     )
 
 

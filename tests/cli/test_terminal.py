@@ -98,6 +98,8 @@ def test_a_delay_of_a_log_with_rows_is_told_where_its_spread_comes_from(capsys):
     assert "half of the 0.02 s between rows" in " ".join(capsys.readouterr().out.split())
     _effects(replace(said, made=Made()), details=False)
     assert "between rows" not in " ".join(capsys.readouterr().out.split())
+    _effects(replace(said, made=Made(interpolated_s=0.0025)), details=False)
+    assert "+- of times: at least 2.5 ms" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_diagnosis_lists_rivals_and_whole_trials_only_in_its_details(capsys):

@@ -836,3 +836,30 @@ def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limi
 def test_a_relation_of_sensors_outlasts_effects_on_the_inputs():
     arm_late = adopted(ARM, ("dead_zone:u", {"c": 0.1}), ("first_order_lag:u", {"tau": 0.1}))
     assert integrals(arm_late) == integrals(ARM) != []
+
+
+ROVER = Model(
+    states={"omega": "rad/s", "psi": "rad"},
+    inputs={"turn": "rad/s"},
+    derivative=lambda s, a, p: {"omega": (a.turn - s.omega) / 0.12, "psi": s.omega},
+)
+
+
+def test_a_delay_that_is_part_of_the_model_is_not_corrected_again():
+    """It was: then the adopted delay "should be 0", and `diagnose` advised to adopt that."""
+    late = adopted(ROVER, ("sensor_delay:omega", {"d": 0.14 * DT}))
+    rng, t = np.random.default_rng(0), np.arange(1500) * DT
+    inputs = np.sin(1.3 * t)[:, None] + np.sign(np.sin(0.7 * t))[:, None]
+    states = [np.zeros((1, late.n))[0]]
+    for u in inputs:
+        states.append(late.system.step(states[-1][None], u[None], late.values, DT)[0])
+    x = np.array(states) + 1e-4 * rng.standard_normal((1501, late.n))
+    x[:, ROVER.n :] = np.nan
+    trial = Trial(x, inputs, DT, late.state_names, late.input_names)
+    found = preflight(late, [trial], hidden=late.state_names[ROVER.n :])
+    assert not found.findings
+    np.testing.assert_array_equal(found.trials[0].states, x)
+
+    own = Trial(x[:, : ROVER.n], inputs, DT, ROVER.state_names, ROVER.input_names)
+    (one,) = preflight(ROVER, [own]).findings
+    assert one.signal == "omega" and one.delay_s == pytest.approx(0.14 * DT, abs=0.02 * DT)

@@ -107,20 +107,30 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
     return bag(folder, topics, messages, storage)
 
 
-def rover_bag(folder):
-    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry."""
-    topics = {
-        "/cmd_vel": "geometry_msgs/msg/Twist",
-        "/odom": "nav_msgs/msg/Odometry",
-        "/joint_states": "sensor_msgs/msg/JointState",
-    }
+def rover_bag(folder, *, seen=""):
+    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry.
+
+    With `seen`, the topic of a camera's poses, nothing else is logged beside the commands.
+    """
+    topics = {"/cmd_vel": "geometry_msgs/msg/Twist"}
+    if seen:
+        topics |= {seen: "geometry_msgs/msg/PoseStamped"}
+    else:
+        topics |= {
+            "/odom": "nav_msgs/msg/Odometry",
+            "/joint_states": "sensor_msgs/msg/JointState",
+        }
     messages, v, w, x, y, psi = [], 0.0, 0.0, 0.0, 0.0, 0.0
     names = ["wheel_left_joint", "wheel_right_joint"]
     for k in range(1000):
         t, ahead, turn = START + k * 10**7, 0.6 * np.sin(0.01 * k) ** 2, 0.8 * np.sin(0.013 * k)
         if k % 5 == 0:
             messages.append(("/cmd_vel", t, twist(float(ahead), float(turn))))
-        if k > 0:
+        if seen:
+            pose = odometry(t, x, y, psi, v, w).pose.pose
+            stamped = T["geometry_msgs/msg/PoseStamped"](header=header(t), pose=pose)
+            messages.append((seen, t, stamped))
+        elif k > 0:
             messages.append(("/odom", t, odometry(t, x, y, psi, v, w)))
             sides = np.array([v - 0.26 * w, v + 0.26 * w]) / 0.1
             turned = np.array([x, x]) / 0.1

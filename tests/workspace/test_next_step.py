@@ -260,6 +260,23 @@ def test_a_filter_of_a_sensor_comes_along_where_only_the_physics_is_named(cart, 
     diagnosed(folder, preflight=[LAGGING])
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
     assert done["effects"][-1] == {"name": "sensor_lag:v", "tau": 0.03}
+    assert done["along"] == ["sensor_lag:v"]
+
+
+@pytest.mark.parametrize("finding", ["LAGGING", "DELAYED"])
+def test_what_comes_along_without_being_named_is_told(cart, tmp_path, finding):
+    """A delay of a sensor was written silently; its diagnosis had offered `delay_s` as well."""
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, preflight=[globals()[finding]])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    told = " ".join(done.err.split())
+    assert "sensor_" in told and "v came along: the sensors show it" in told
+    assert ("adopt --undo" in told) == ("set the delay_s" in told) == (finding == "DELAYED")
+    folder = copied(cart, tmp_path / "named")
+    diagnosed(folder, preflight=[globals()[finding]])
+    late = "sensor_lag:v" if finding == "LAGGING" else "sensor_delay:v"
+    named = grounded("-C", folder, "adopt", "viscous_friction:v", late)
+    assert "came along" not in named.err and late in named.out
 
 
 def test_a_filter_is_adopted_alone_where_nothing_else_was_found(cart, tmp_path):
@@ -1136,10 +1153,17 @@ def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_ex
     assert effect["d"] == pytest.approx(found["value"], rel=1e-6)
     # "0.0584 .. 0.0592" of rows 0.05 s apart, beside +- 0.025 in the diagnosis
     exact = grounded("-C", folder, "fit", "--json").json["params"]["delay_force_d"]
-    monkeypatch.setattr(fitting, "row_interval", lambda *_: 0.05)
+    monkeypatch.setattr(fitting, "unsure_times", lambda *_: (0.05, 0.0))
     wide = grounded("-C", folder, "fit", "--json").json
     assert wide["rows_s"] == 0.05 and fitted["rows_s"] == 0.0
     known = wide["params"]["delay_force_d"]
     assert known["low"] == pytest.approx(exact["low"] - 0.05)
     assert known["high"] == pytest.approx(exact["high"] + 0.05)
     assert "the 0.05 s between rows" in " ".join(grounded("-C", folder, "fit").out.split())
+    monkeypatch.setattr(fitting, "unsure_times", lambda *_: (0.0, 0.002))
+    wide = grounded("-C", folder, "fit", "--json").json
+    known = wide["params"]["delay_force_d"]
+    assert wide["interpolated_s"] == 0.002
+    assert known["high"] == pytest.approx(exact["high"] + 1.96 * 0.002)
+    assert wide["params"]["mass"]["std"] == pytest.approx(0.0022, abs=1e-4)
+    assert "2 ms, since states were inter" in " ".join(grounded("-C", folder, "fit").out.split())

@@ -14,6 +14,7 @@ from grounded.diagnosis.tables import instrument_lines
 from grounded.errors import GroundedError
 from grounded.instruments.finding import Finding
 from grounded.trial import Trial
+from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.diagnosing import instruments_in
 from grounded_trials.workspace.folder import Folder
@@ -96,6 +97,9 @@ def test_a_delay_is_not_removed_from_logs_that_the_model_has(tmp_path):
     np.savetxt(tmp_path / "b.csv", rows[:-5], "%.6f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         ingest_log(Folder(w.folder), tmp_path / "b.csv", data=True)
+    assert holds(str(refused.value), "[log.state.v] delay_s", "sensor_delay:v", "adopt --undo")
+    with pytest.raises(GroundedError) as refused:  # before a run, not only after it
+        Workspace(w.folder).propose()
     assert holds(str(refused.value), "[log.state.v] delay_s", "sensor_delay:v", "adopt --undo")
 
 

@@ -57,6 +57,7 @@ class Data:
     hidden: tuple[int, ...] = ()  # states without a sensor: only their start is known
     filters: Mapping[int, float] = field(default_factory=dict)  # sensor time constants [s] by state
     between: frozenset[str] = frozenset()  # sensors shifted in time by a fraction of a sample
+    interpolated_s: float = 0.0  # as std of times: states were interpolated
 
     @property
     def count(self) -> int:

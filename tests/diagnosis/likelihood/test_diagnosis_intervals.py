@@ -1,15 +1,22 @@
 """Standard deviations from the information: right where it is regular, honest where it is not."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.intervals import between_steps, fisher, standard_deviations
+from grounded.diagnosis.likelihood.intervals import (
+    between_samples,
+    between_steps,
+    fisher,
+    standard_deviations,
+)
 from grounded.diagnosis.validation.blame import moved_parameters
 from grounded.diagnosis.validation.limits import counted_once
 from grounded.diagnosis.validation.ruler import folds
@@ -120,6 +127,61 @@ def test_a_delay_between_two_steps_makes_a_lag_beside_it_uncertain():
     assert not between_steps(one, 0.07, 2).any()  # two whole steps
     assert not between_steps(one.minus("first_order_lag:throttle"), 0.1, 1).any()
     assert not between_steps(one.minus("sensor_delay:v"), 0.1, 1).any()
+
+
+def lagging(samples, late=0.05, grid=0.05, tau=0.1):
+    """A motor's speed logged every `samples` [s], its commands sent every `grid` [s]."""
+    rng, h = np.random.default_rng(0), 1e-3
+    t = h * np.arange(30_000)
+    sent = np.repeat(rng.uniform(-1, 1, 40), 750)
+    acts = np.concatenate([np.zeros(round(late / h)), sent])[: len(t)]
+    w = np.zeros(len(t) + 1)
+    for k, u in enumerate(acts):
+        w[k + 1] = u + (w[k] - u) * np.exp(-h / tau)
+    at, when = np.arange(0, len(t), round(samples / h)), np.arange(0, len(t), round(grid / h))
+    log = w[at] + 1e-3 * rng.standard_normal(len(at))
+    return {"w": (t[at], log), "u": (t[when], sent[when])}
+
+
+@pytest.mark.parametrize("samples", [0.02, 0.01])
+def test_a_delay_is_no_surer_than_states_between_two_samples(samples):
+    """Of a rover's log at 50 Hz on a grid of 20 Hz: 0.0461 +- 0.0001 s, of 0.050 s."""
+    from grounded_trials.logs.resample import to_grid
+    from grounded_trials.logs.signals import Series, SignalSpec
+
+    series = {}
+    for name, (t, y) in lagging(samples).items():
+        stamps = np.round(1e9 * t).astype(np.int64)
+        spec = SignalSpec(f"/{name}.data")
+        series[name] = Series(spec, stamps, y, stamps, len(t), "a/B", stamped=True)
+    log = to_grid(series, 0.05, ["w"], ["u"])
+    assert log.interpolated_s == pytest.approx(0.0025 if samples == 0.02 else 0.0, abs=1e-4)
+    motor = Model(
+        states={"w": "rad/s"},
+        inputs={"u": "rad/s"},
+        derivative=lambda s, a, p: {"w": (a.u - s.w) / 0.1},
+    )
+    trial = Trial(log.states, log.inputs, 0.05, ("w",), ("u",))
+    found = diagnose(motor, [trial], DiagnosisOptions(interpolated_s=log.interpolated_s))
+    (row,) = (one for one in found.ranking if one.claimed)
+    d, least = row.params["d"], max(log.interpolated_s, 1e-5)
+    assert row.effect == "sensor_delay:w" and abs(d.value - 0.05) < 2 * d.std
+    assert least <= d.std < least + 1e-3
+
+
+def test_states_between_two_samples_make_times_alone_uncertain():
+    one = Hypothesis()
+    for name, values in (("first_order_lag:throttle", 0.28), ("input_gain:steering", 0.1)):
+        effect = Library().effect(name, car)
+        one = one.plus(effect, {effect.free[0].name: values})
+    x = np.random.default_rng(0).standard_normal((40, car.n))
+    trial = Trial(x, x[1:, : car.m], 0.05, car.state_names, car.input_names)
+    data = replace(prepare(car, [trial]), interpolated_s=0.003)
+    assert between_samples(one, data, 2).tolist() == [0.003, 0.0]
+    assert not between_samples(one, prepare(car, [trial]), 2).any()
+    units = [p.unit for p in car.params.values() if p.spread]
+    whole = between_samples(one, data, 2 + len(units))
+    assert [bool(v) for v in whole[2:]] == [unit in ("s", "1/s") for unit in units]
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
 from grounded_trials.workspace.diagnosing import unwritten_in
 from grounded_trials.workspace.folder import Folder
+from ros_bags import rover_bag
 
 
 def table(path, names):
@@ -57,6 +58,16 @@ def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_p
     found = {g.name: g.path for g in (*done.states, *done.inputs)}
     assert found["turn"] == "/csv.cmd_omega" and found["speed"] == "/csv.cmd_v"
     assert not found["omega"] and not found["v"] and done.then.verb == "ingest"
+
+
+def test_commands_beside_a_camera_s_poses_are_no_measured_speeds(tmp_path):
+    """/cmd_vel became the states v and omega, and "nothing in the log fits" speed and turn."""
+    done = begin(tmp_path / "w", rover_bag(tmp_path / "bag", seen="/mocap"))
+    found = {g.name: g.path for g in (*done.states, *done.inputs)}
+    assert found["speed"] == "/cmd_vel.linear.x" and found["turn"] == "/cmd_vel.angular.z"
+    assert not found["v"] and not found["omega"] and found["x"] == "/mocap.pose.position.x"
+    config = Folder(tmp_path / "w").config
+    assert config.file.read_text().count("the smoother estimates v, omega") == 1
 
 
 def test_a_target_beside_unmapped_inputs_leads_to_the_log(tmp_path):

@@ -70,6 +70,7 @@ class Adopted(Result):
     jointly: tuple[str, ...] = ()  # parameters and effects determined only with the others
     rewritten: tuple[Rewritten, ...] = ()  # of effects that were adopted before
     stopped: str = ""  # what to do about parameters that reached their bounds
+    along: tuple[str, ...] = ()  # late and filtering sensors that were adopted without being named
 
     def summary(self) -> str:
         """Return the effects that the model has now."""
@@ -84,6 +85,7 @@ class Adopted(Result):
             "claimed": self.claimed,
             "beside": list(self.beside),
             "jointly": list(self.jointly),
+            "along": list(self.along),
             "left": {name: one.value for name, one in self.left.items()},
         }
 
@@ -120,13 +122,13 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     found = read_diagnosis(workspace.reports)
     if found is None:
         raise GroundedError("nothing was diagnosed yet: run a diagnosis first", then=AGAIN)
-    names = with_curves(found, list(dict.fromkeys(names)))
+    asked = names = with_curves(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
     check_adoptable(names, found, workspace, before)
     physics = [name for name in names if name not in found.late_sensors]
     claimed = not physics or claims_all(found, physics)
     if physics and {*found.effects} <= {*physics}:
-        names += [name for name in late_open(workspace, found) if name not in names]
+        names = list(dict.fromkeys([*names, *late_open(workspace, found)]))
     calibrated = found.known_parameters if parameters and physics and claimed else {}
     nominal = nominal_values(found, workspace, names)
     old = workspace.config.model.effects
@@ -167,6 +169,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         ),
         rewritten=_rewritten(workspace, old, adopted),
         stopped=wider(found.parameters) if parameters and physics and claimed else "",
+        along=tuple(name for name in names if name not in asked),
     )
 
 

@@ -19,7 +19,7 @@ from grounded.progress import duration
 from grounded.result import begun
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
-from grounded_trials.workspace.identity import row_interval
+from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
 from grounded_trials.workspace.unknown_id import named_trials
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
@@ -85,6 +85,7 @@ def diagnose_in(
     planner, used = workspace.planner, _chosen(workspace, trials)
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
+    rows, early = unsure_times(workspace.whole_trials(), {one.id for one in (*used, *others)})
     options = DiagnosisOptions(
         library=library,
         max_effects=max_effects,
@@ -92,6 +93,7 @@ def diagnose_in(
         but={*names} - {*delays},  # the d of a delay is not a model parameter
         one_message=one_message(workspace),
         delays=delays,
+        interpolated_s=early,
         origin=workspace.origin if effects or workspace.config.model.params else None,
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
@@ -103,7 +105,8 @@ def diagnose_in(
         named=tuple(trial.id for trial in used) if trials or compare else (),
         compared=tuple(compare),
         without=tuple(without),
-        rows_s=row_interval(workspace.whole_trials(), {trial.id for trial in used + others}),
+        rows_s=rows,
+        interpolated_s=early,
     )
     began = time.monotonic()
     found = diagnose(

@@ -19,10 +19,12 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import estimated_in, row_interval
+from grounded_trials.workspace.identity import estimated_in, unsure_times
 from grounded_trials.workspace.last_diagnosis import fittable, ids_of, write_fit
 from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
+
+NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
 
 if TYPE_CHECKING:
     from grounded.engine import Engine
@@ -42,6 +44,7 @@ class Fitted(Result):
     trials: tuple[str, ...] = ()  # the trials that were fitted
     rows_s: float = 0.0  # rows of a table, between which a command was sent; in delays' intervals
     mean_s: float = 0.0  # the most that the mean of two commands may move a delay; in them, too
+    interpolated_s: float = 0.0  # standard deviation of times by interpolated states; in them, too
 
     def summary(self) -> str:
         """Return the fitted values."""
@@ -55,6 +58,7 @@ class Fitted(Result):
             "not_fitted": list(self.not_fitted),
             "rows_s": self.rows_s,
             "mean_s": self.mean_s,
+            "interpolated_s": self.interpolated_s,
             "preflight": [one.to_json() for one in self.preflight],
         }
 
@@ -79,8 +83,8 @@ def fit_in(
     found, seen = fit_trials(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
-    row = row_interval(workspace.whole_trials(), ids_of(used))
-    found, row, mean = _as_times_tell(workspace, found, row)
+    rows, early = unsure_times(workspace.whole_trials(), ids_of(used))
+    found, row, mean = _as_times_tell(workspace, found, rows, early)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
         write_fit(workspace, used, found)
@@ -88,7 +92,7 @@ def fit_in(
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
-    fitted = partial(fitted, rows_s=row, mean_s=mean)
+    fitted = partial(fitted, rows_s=row, mean_s=mean, interpolated_s=early)
     if apply and not np.isfinite(found.loglik):
         raise GroundedError(f"nothing was written: {found.sentence}", then=after_fit(workspace))
     if apply and found.worse:
@@ -102,13 +106,16 @@ def fit_in(
     return fitted(applied=True, then=to_plan(workspace))
 
 
-def _as_times_tell(workspace: Folder, found: Fit, row: float) -> tuple[Fit, float, float]:
-    """Return a fit with delays' intervals widened by what it does not know of when commands act.
+def _as_times_tell(
+    workspace: Folder, found: Fit, row: float, early: float
+) -> tuple[Fit, float, float]:
+    """Return a fit with intervals of times widened by what it does not know of when things happen.
 
     A row of a table that repeats a command does not say if that was sent just then or up to a row
     [s] before. And where an input arrives a part f of a step late, the fit takes the mean of two
     commands, which moves the delay by less than f (1 - f) dt: 2.5 ms of 80 ms for a robot with a
-    lag of 0.1 s, at 50 ms. (`diagnose` makes such steps in parts.)
+    lag of 0.1 s, at 50 ms. (`diagnose` makes such steps in parts.) Delays and time constants take
+    responses as they were interpolated, which may begin early [s].
 
     Returns:
         The fit, and what was added to each side of some delay [s] for either reason, at most.
@@ -123,6 +130,10 @@ def _as_times_tell(workspace: Folder, found: Fit, row: float) -> tuple[Fit, floa
         more = row + means[-1]
         std = math.hypot(e.std, row / 2, means[-1] / 2)
         params[name] = replace(e, std=std, low=e.low - more, high=e.high + more)
+    for name, e in params.items() if early else ():
+        off = early * {"s": 1.0, "1/s": e.value**2}.get(e.unit, 0.0)
+        low, high = e.low - NORMAL * off, e.high + NORMAL * off
+        params[name] = replace(e, std=math.hypot(e.std, off), low=low, high=high)
     return replace(found, params=params), row * bool(late), max(means)
 
 

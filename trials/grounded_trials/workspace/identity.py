@@ -29,6 +29,7 @@ from grounded_trials.store.store import Damaged, Store, Stored
 
 # keys of a log's metadata
 ROWS = "rows_s"  # time between rows of a table that repeats commands
+INTERPOLATED = "interpolated_s"  # by which responses may begin early between samples
 ESTIMATED_WITH = "estimated_with"  # adopted effects of the model that estimated its speeds
 LASTED = "source_seconds"  # duration of the log
 READ_BY = "read_by"  # how [log] read its signals
@@ -345,7 +346,8 @@ def other_task(task: Task, made: Candidate) -> str:
     return "; ".join(told) or "another target, reward or feedback"
 
 
-def row_interval(stored: Iterable[StoredTrial], trials: Collection[str]) -> float:
-    """Return the largest interval of rows in the tables of some trials, see `Gridded` [s]."""
-    logs = [one for one in stored if one.stored.id in trials]
-    return max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
+def unsure_times(stored: Iterable[StoredTrial], trials: Collection[str]) -> tuple[float, float]:
+    """Return the largest `row_s` and `interpolated_s` of the logs of some trials, see `Gridded`."""
+    logs = [one.meta for one in stored if one.stored.id in trials]
+    rows, early = ([float(meta.get(key, 0.0)) for meta in logs] for key in (ROWS, INTERPOLATED))
+    return max(rows, default=0.0), max(early, default=0.0)

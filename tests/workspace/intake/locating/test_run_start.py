@@ -623,13 +623,13 @@ def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
     from grounded.diagnosis.report import Estimate, Ranked
     from grounded_trials.workspace.diagnosing import _as_known
     from grounded_trials.workspace.folder import Folder
-    from grounded_trials.workspace.identity import row_interval
+    from grounded_trials.workspace.identity import unsure_times
 
     recorded_in_motion(tmp_path / "a.csv")
     trial = w.ingest(tmp_path / "a.csv", data=True).trial
     d = {"d": Estimate(0.07, 0.0002, (0.0696, 0.0704), "s")}
     rows = (Ranked("delay:force", d), Ranked("first_order_lag:force", d))
-    late, lag = _as_known(rows, row_interval(Folder(w.folder).whole_trials(), {trial}))
+    late, lag = _as_known(rows, unsure_times(Folder(w.folder).whole_trials(), {trial})[0])
     assert late.params["d"].interval == pytest.approx((0.0596, 0.0804))
     assert late.params["d"].std == pytest.approx(0.005, rel=0.01)
     assert lag.params["d"] is d["d"]

@@ -9,7 +9,7 @@ lower. If the best is not clearly better than the rest, the table says so and li
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -142,14 +142,15 @@ def guess_mapping(
     for name, some in scored.items():
         if not any(c.score >= LEAST for c in some):
             scored[name] = _of_stem(log, name, units.get(name, "")) or some
+    named = {name: _by_name(log, name, units) for name in inputs}
+    sent = {path for name in inputs for path in _sent(named[name])}
+    scored = {name: [c for c in some if c.field.path not in sent] for name, some in scored.items()}
     homes = _homes(scored)
     found = tuple(_choose(log, name, scored[name], homes) for name in states)
     taken = {guess.path for guess in found}
     rest = []
     for name in inputs:
-        meanings = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(units.get(name, ""), ()))
-        found_for = _candidates(log, name, meanings, is_input=True) or _commanded(log, name)
-        candidates = [c for c in found_for if c.field.path not in taken]
+        candidates = [c for c in named[name] if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})
         rest.append(guess if guess.path or guess.others else commands_of(log, guess, taken))
     if len(rest) == 1:
@@ -194,6 +195,22 @@ def _has_words(path: str, name: str) -> bool:
     words = {*_WORD.findall(name.lower())}
     long = bool(words) and all(len(word) > 1 for word in words)
     return long and words <= said and not (said - words) & _RATES
+
+
+def _by_name(log: LogReport, name: str, units: Mapping[str, str]) -> list[_Candidate]:
+    """Return the candidates for an input, best first, by its names and those of its unit."""
+    meanings = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(units.get(name, ""), ()))
+    return _candidates(log, name, meanings, is_input=True) or _commanded(log, name)
+
+
+def _sent(candidates: Sequence[_Candidate]) -> Iterator[str]:
+    """Yield the best number for an input if its name says that it is a command: no measurement.
+
+    In a log of poses and /cmd_vel the commands were taken for the measured speed and turn rate.
+    """
+    best = next(iter(candidates), None)
+    if best and best.score >= LEAST and {*_COMMANDED}.intersection(_WORD.findall(best.field.path)):
+        yield best.field.path
 
 
 def _commanded(log: LogReport, name: str) -> list[_Candidate]:

@@ -5,7 +5,8 @@ changed since a candidate was proposed, so everything is checked again:
 
     the file      holds the candidate it is named after, as it was proposed (never overridden)
     the robot     state and input names (never overridden), units, dt
-    [log]         maps every input, if it maps anything: else no one knows what an input is there
+    [log]         maps every input, if it maps anything: else no one knows what an input is there;
+                  removes no delay that an adopted effect has in the model as well
     the task      the task hash; another task's candidate is only exported, if a trial ran it
     [limits]      the policy's own limits, and what it sends and holds, are inside the current ones
     the model     a candidate that no trial ran is void once the model was changed
@@ -38,6 +39,7 @@ from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import ranges, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
+from grounded_trials.workspace.where_to_mend import twice_in_time
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
@@ -97,14 +99,14 @@ def checked_candidate(
     Raises:
         Void: if it must not be handed over, unless `anyway`.
         GroundedError: if its file is damaged, rewritten, renamed, or for another robot; also if
-            [log] lacks an input, unless `anyway`.
+            [log] lacks an input or counts a delay twice, unless `anyway`.
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = intact(data, identity)
     check = Check(workspace, candidate, meta, other_task, now)
     check.refuse_foreign(sha256(data))
     if not anyway:
-        refuse_unmapped(workspace)
+        check_log(workspace)
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
@@ -128,12 +130,15 @@ def unmapped(workspace: Folder) -> str:
     return f"[log] maps no {listed([repr(name) for name in lost])}" if lost else ""
 
 
-def refuse_unmapped(workspace: Folder) -> None:
-    """Refuse to plan for inputs that [log] lacks, see `unmapped`.
+def check_log(workspace: Folder) -> None:
+    """Refuse to plan for inputs that [log] lacks (see `unmapped`), or for delays that count twice.
 
     Raises:
-        GroundedError: if there is such an input.
+        GroundedError: if there is such an input, or if [log] removes a delay that an adopted effect
+            has in the model as well.
     """
+    if twice := twice_in_time(workspace):
+        raise GroundedError(twice)
     if not (lost := unmapped(workspace)):
         return
     file = workspace.config.model.file or workspace.config.model.module

@@ -15,9 +15,9 @@ from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
+    check_log,
     checked_candidate,
     outside_limits,
-    refuse_unmapped,
     unmapped,
 )
 from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
@@ -130,7 +130,8 @@ def propose_in(workspace: Folder) -> Proposed:
 
     Raises:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
-            damaged, the task can't be planned, or [log] lacks an input (see `unmapped`).
+            damaged, the task can't be planned, or [log] lacks an input or counts a delay twice (see
+            `check_log`).
     """
     if not workspace.config.task.target:
         raise GroundedError(
@@ -138,7 +139,7 @@ def propose_in(workspace: Folder) -> Proposed:
             "target`; `fit` and `diagnose` need none",
             NextCommand("target", ("SHAPE",)),
         )
-    refuse_unmapped(workspace)
+    check_log(workspace)
     before, told = workspace.candidate_ids(), bool(workspace.noted.since)
     proposal, void = _handed_over(workspace)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))

@@ -29,6 +29,7 @@ from grounded_trials.workspace.candidates.standing_without import asked_again
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
+    INTERPOLATED,
     LASTED,
     READ_BY,
     ROWS,
@@ -48,6 +49,7 @@ from grounded_trials.workspace.where_to_mend import twice_in_time
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
+SLIGHT = 0.002  # of a control step, by which interpolated states may be early
 HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
 
 
@@ -222,6 +224,8 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
     about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
+    early = found.interpolated_s / trial.dt > SLIGHT
+    about |= {INTERPOLATED: f"{found.interpolated_s:.3g}"} if early else {}
     encoded = _encode(log.workspace, trial, about, found.start_ns)
     return Read(
         trial,
