@@ -15,6 +15,7 @@ from grounded.search.standing import standing
 from grounded.search.starts import Starts, worth_of_start
 from grounded.search.step.step_size import SearchOptions, losers_of
 from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.candidates.proposing import _lost_by_starts
 from small_tasks import cart_task, drive, other
 
 TASK = cart_task()
@@ -68,6 +69,10 @@ def test_a_better_candidate_that_began_off_is_run_again_and_becomes_the_best(sto
     assert holds(now.sentence, "c0002 lost to c0001", "by the model", "itself", "better")
     assert "from [task] start" in now.sentence
     assert losers_of(now.history, "c0001", PLANNER.fingerprint) == []
+    assert not _lost_by_starts(now)
+    lost = replace(now, history=(best, replace(doubt, accepted=False)))
+    (said,) = _lost_by_starts(lost)  # else its utility in the table looks like the step's own
+    assert said.startswith("c0002 lost to c0001 by") and "due to where their runs began" in said
     now = story.run(0, OFF)  # what the best one measures then is no better
     now = story.run(1)
     assert now.incumbent.candidate.id == "c0002" and now.phase == "propose"

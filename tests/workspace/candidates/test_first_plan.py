@@ -574,9 +574,12 @@ model = Model(states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"}, angles=("ps
 """
 
 
-@pytest.mark.parametrize("heading", [1.0, 0.0])
+@pytest.mark.parametrize("heading", [1.0, 0.3, 0.0])
 def test_a_plan_off_its_path_says_which_weights_would_bring_it_closer(tmp_path, heading):
-    """A current of 5 cm/s: along the path the boat has to point beside it."""
+    """A current of 5 cm/s: along the path the boat has to point beside it.
+
+    Of a lane change by 0.8 m along 5 m, 51 mm were 1 % of its extent, and not told.
+    """
     (tmp_path / "driven.py").write_text(DRIVEN)
     w = Workspace.create(tmp_path / "w", model=tmp_path / "driven.py")
     t = 0.1 * np.arange(101)
@@ -597,7 +600,7 @@ def test_a_plan_off_its_path_says_which_weights_would_bring_it_closer(tmp_path, 
     assert len(found) == (heading > 0)
     if heading:
         assert (
-            off > 0.05
+            off > (0.05 if heading == 1 else 0.02)
             and f"{1e3 * off:.0f} mm" in found[0]
             and f"{1e3 * closer:.0f} mm" in found[0]
         )

@@ -55,6 +55,7 @@ SHORT = 0.25  # share of the target's extent by which a plan may end away from t
 MISSED = 0.1  # share of the target's extent above which an error is reported
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
 ASIDE = 0.01  # share of the target's extent by which a plan may be off, as an rms
+NARROW, LEAST = 0.02, 0.2  # or of its smallest range, counted as at least this of the largest
 CLOSER, ENOUGH = 10.0, 0.6  # factor tried on the position's weights; share of the error then left
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
@@ -76,8 +77,8 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
         held: the result of `at_rest.held_before`.
     """
     task, first, found = workspace.task, proposal.candidate, list[str]()
-    off, extent = (0.0, 0.0) if first is None else _off_path(task, first.predicted_states)
-    astray = off > ASIDE * extent
+    off, extent, near = (0.0, 0.0, 0.0) if first is None else _off_path(task, first)
+    astray = off > near
     free = [
         name
         for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
@@ -374,7 +375,7 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
     state[states], terminal[states] = CLOSER * state[states], CLOSER * terminal[states]
     reward = replace(aim.reward, state=state, terminal=terminal)
     closer = finished(replace(aim, reward=reward).problem(), first.predicted_inputs)
-    left, _ = _off_path(task, closer.z[:, : task.model.n])
+    left, *_ = _off_path(task, replace(first, predicted_states=closer.z[:, : task.model.n]))
     was, now = measured_alike([off, left], unit)
     how = "at its end" if ends else "rms"
     if not left < ENOUGH * off:
@@ -394,24 +395,32 @@ def _outweighed(workspace: Folder, first: Candidate, off: float) -> list[str]:
     ]
 
 
-def _off_path(task: Task, run: Array) -> tuple[float, float]:
-    """Return the error of a run (H + 1, n) in the first weighed group, and the group's extent.
+def _off_path(task: Task, plan: Candidate) -> tuple[float, float, float]:
+    """Return the error of a plan in the first weighed group, the group's extent, and what is near.
 
-    It is the error at the end if the task is to reach a point, else the rms error.
+    It is the error at the end if the task is to reach a point, else the rms error. What is near is
+    a share of the extent or, of a path that is long and narrow, of its width: a boat that was to
+    change its lane by 0.8 m along 5 m was planned 51 mm off it, as its heading weighed as much.
     """
     groups = weighed_groups(task)
     if not groups:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     states = [task.model.state_names.index(name) for name in groups[0][0]]
-    error = task.model.difference(run, task.target)[:, states]
+    error = task.model.difference(plan.predicted_states, task.target)[:, states]
     off = np.linalg.norm(error[-1:] if reaches(task) else error, axis=1)
-    return float(np.sqrt(np.mean(off**2))), _extent(task, states)
+    extent, ranges = _extent(task, states), _ranges(task, states)
+    near = min(ASIDE * extent, NARROW * max(ranges.min(), LEAST * ranges.max()))
+    return float(np.sqrt(np.mean(off**2))), extent, float(near)
 
 
 def _extent(task: Task, states: Sequence[int]) -> float:
     """Return the diagonal of the box that the start and the target of some states span."""
-    way = np.vstack([task.start, task.target])[:, states]
-    return float(np.linalg.norm(np.ptp(way, axis=0)))
+    return float(np.linalg.norm(_ranges(task, states)))
+
+
+def _ranges(task: Task, states: Sequence[int]) -> Array:
+    """Return the ranges of some states in the start and the target."""
+    return np.asarray(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
 
 
 def _thrown(task: Task, first: Candidate) -> list[str]:

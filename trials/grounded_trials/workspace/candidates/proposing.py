@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.result import Result, figure
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded_trials.wording import ranges, rendered
 from grounded_trials.workspace.candidates.exported_files import to_run
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.identity import StoredTrial
 
 PROPOSE = NextCommand("propose")
+MOSTLY = 0.5  # share of a loss that is told if it is due to where runs began
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,6 +277,24 @@ def _disowned(now: Standing) -> list[str]:
     return found
 
 
+def _lost_by_starts(now: Standing) -> list[str]:
+    """Name the steps from the best candidate whose losses are mostly due to where runs began.
+
+    Their utilities in the table include that: one of -0.96 beside -0.51 was itself 0.04 worse.
+    """
+    if (best := now.incumbent) is None:
+        return []
+    own = best.candidate.id
+    steps = [t for t in now.history if t.accepted is False and t.candidate.base == own]
+    lost = {t.candidate.id: (best.utility - t.utility, t.excused(best)) for t in steps}
+    return [
+        f"{name} lost to {own} by {figure(loss)}; by the model {figure(due)} of that "
+        "is due to where their runs began"
+        for name, (loss, due) in lost.items()
+        if math.isfinite(loss) and due > MOSTLY * loss
+    ]
+
+
 def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
     """Return whether the search's last candidate was planned with another model, and never run."""
     last = _not_run(workspace, before)
@@ -325,6 +345,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
             *_nothing_stored(workspace),
             *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
             *(_disowned(standing) if standing.phase != "propose" else ()),
+            *_lost_by_starts(standing),
             *_namesakes(workspace),
             *not_counted(uncounted(workspace, workspace.trials(), standing)),
             *left_out(workspace),
