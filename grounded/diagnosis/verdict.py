@@ -505,10 +505,12 @@ def told_apart(
     Args:
         group: effects that tie.
         same: the groups that are equivalent in this model.
-        claimed: the claimed effects. Of one in the group the clause says that adopting writes it.
+        claimed: the claimed effects. Of one in the group the clause says that adopting writes it,
+            or which it is if it is a parameter, which mostly a fit writes.
     """
     own = next((name for name in group if name in claimed), "")
     writes = f"; adopting writes {own}, the claimed one" * bool(own)
+    writes = f"; {own} is claimed" if own.startswith("parameter:") else writes
     if group in same:
         return f"{listed(group)} are equivalent in this model{writes}"
     either = "either" if len(group) == 2 else "each"

@@ -12,10 +12,10 @@ function of time in both, and so is at least one state that the rates may depend
 Compared are means over tenths of the trial, so that noise or a chattering feedback does not make
 motions different.
 
-An effect that is a function of time alone (a wave, a trend) adds the same to all trials, whatever
-they do. Candidates for one target move alike except for a few per cent, and so does any function of
-a state that they share. So for these effects, a trial's nats are weighted by the fraction of its
-motion that differs from the motion with the largest share.
+Candidates for one target move alike except for a few per cent, and so does any function of a state
+that they share: a wave, but also a patch of ground or a coupling. So a trial's nats are weighted by
+the fraction of its motion that differs from the motion with the largest share. A constant is told:
+what else repeats with a motion changes along it.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ REPEATS = 0.03  # fraction of a signal's power below which trials make the same 
 TENTHS = 10  # stretches whose means are compared
 LENGTH = 0.2  # relative difference of the lengths of trials of one motion, at most
 KNOWN = 2.0  # standard deviations from zero from which a size is known
+STEADY = 0.05  # relative change up to which what an effect adds is constant
 HALF = 0.5  # weight below which a trial counts as the same motion
 
 
@@ -66,10 +67,9 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
     lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
     nats = search.tempering.factor * np.bincount(data.trial_of, lost, data.count)
     most = int(np.bincount(motion, nats).argmax())
-    say = (motion != most).astype(float)
-    if getattr(h.effects[h.names.index(name)].family, "timed", False):
-        first = int(np.flatnonzero(motion == most)[0])
-        say *= [paths.apart(first, trial) for trial in range(data.count)]
+    say, own = (motion != most).astype(float), np.flatnonzero(motion == most)
+    if not paths.constant:
+        say *= [min(paths.apart(int(i), k) for i in own) for k in range(data.count)]
     alike = int((say < HALF).sum())
     return alike if alike > 1 and say @ nats < CLAIM else 0
 
@@ -167,14 +167,20 @@ class _Paths:
         self.moves = np.zeros(len(seen), bool)
         self.moves[seen] = self.spread[seen] > 1e-9 * np.nanmean(means[:, seen] ** 2, axis=0)
 
+    @property
+    def constant(self) -> bool:
+        """Whether what is added is the same at every step."""
+        change = [np.nan_to_num(_power(one - np.nanmean(one, axis=0))) for one in self.signal]
+        return bool(sum(change) <= STEADY**2 * sum(self.power))
+
     def motions(self) -> Any:
         """Return the motion of each trial, (S,) of int."""
-        led, found = list[int](), np.zeros(len(self.signal), int)
+        found = np.arange(len(self.signal))
         for i in range(len(found)):
-            leader = next((k for k, j in enumerate(led) if self.same(i, j)), len(led))
-            led += [i] * (leader == len(led))
-            found[i] = leader
-        return found
+            for j in range(i):
+                if found[i] != found[j] and self.same(i, j):  # also by way of others
+                    found[found == max(found[i], found[j])] = min(found[i], found[j])
+        return np.unique(found, return_inverse=True)[1]
 
     def same(self, i: int, j: int) -> bool:
         """Check whether two trials make the same motion."""

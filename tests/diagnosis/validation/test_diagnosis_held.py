@@ -174,3 +174,30 @@ def test_a_sum_in_a_sentence_has_its_largest_terms_and_on_the_page_all():
     assert all(term in whole for term in terms) and "smaller" not in whole
     known.identifiable = [Identifiable("k", "weak", 1.0, 0.01, dict([*given.items()][:3]))]
     assert "smaller" not in held_sentence(known)
+
+
+@pytest.mark.parametrize(
+    ("off", "named"),
+    [
+        ({"m": 4.0, "k": 0.5, "b": 1.5}, {"m", "b"}),  # b by evidence, k by no more than trials do
+        ({"m": 1.9, "k": 0.5, "b": 1.5}, {"m", "k", "b"}),  # together, if none is alone
+    ],
+)
+def test_what_trials_disagree_about_by_as_much_is_not_off(off, named):
+    """Twelve of an aircraft's 32 parameters "off" were so by less than their +-."""
+    model, _ = motor(1)
+    sizes = [off[name] for name in model.param_names]
+    estimates = {
+        name: Estimate(param.value + 0.1 * size, 0.1, None, param.unit)
+        for (name, param), size in zip(model.params.items(), sizes, strict=True)
+    }
+    claims = SimpleNamespace(data=SimpleNamespace(model=model), parameters=lambda: estimates)
+    blamed = [Blame(i, 9.0) for i in range(3)]
+    kept = claims_of.Claims._known(claims, blamed)
+    assert {model.param_names[one.index] for one in kept} == named
+    slight = [Blame(i, 9.0 if size > 2 else 2.0) for i, size in enumerate(sizes)]
+    kept = claims_of.Claims._known(claims, slight)  # too few nats: 2 standard deviations then
+    assert {model.param_names[one.index] for one in kept} == (
+        named - {"b"} if 4 in sizes else named
+    )
+    assert claims_of.Claims._known(claims, []) == ()
