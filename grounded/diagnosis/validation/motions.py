@@ -14,8 +14,8 @@ motions different.
 
 Candidates for one target move alike except for a few per cent, and so does any function of a state
 that they share: a wave, but also a patch of ground or a coupling. So a trial's nats are weighted by
-the fraction of its motion that differs from the motion with the largest share. A constant is told:
-what else repeats with a motion changes along it.
+the fraction of its motion, or of what the effect adds to it, that differs from the motion with the
+largest share. A constant is told: what else repeats with a motion changes along it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def repeats(search: FittedHypotheses, fit: Fitted, less: Fitted, name: str) -> i
     most = int(np.bincount(motion, nats).argmax())
     say, own = (motion != most).astype(float), np.flatnonzero(motion == most)
     if not paths.constant:
-        say *= [min(paths.apart(int(i), k) for i in own) for k in range(data.count)]
+        say *= [min(paths.unlike(int(i), k) for i in own) for k in range(data.count)]
     alike = int((say < HALF).sum())
     return alike if alike > 1 and say @ nats < CLAIM else 0
 
@@ -184,9 +184,12 @@ class _Paths:
 
     def same(self, i: int, j: int) -> bool:
         """Check whether two trials make the same motion."""
-        acts = _power(self._between(self.signal, i, j))
-        alike = acts <= REPEATS * (self.power[i] + self.power[j])
-        return bool(alike and self.apart(i, j) <= REPEATS)
+        return self.unlike(i, j) <= REPEATS
+
+    def unlike(self, i: int, j: int) -> float:
+        """Return by which fraction what is added to two trials, or else their motion, differs."""
+        acts, both = _power(self._between(self.signal, i, j)), self.power[i] + self.power[j]
+        return max(self.apart(i, j), min(float(acts) / both, 1.0) if both > 0 else 0.0)
 
     def apart(self, i: int, j: int) -> float:
         """Return by which fraction of its power the most similar state of two trials differs."""
