@@ -365,7 +365,8 @@ def _trust(
         return f"{since}: {measured}; no run has tested its plans yet"
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
     if measured:
-        return f"{measured}, by its diagnosis; no run of this task has tested it yet"
+        alone = ", whose trials all made one motion" * _of_one_motion(workspace)
+        return f"{measured}, by its diagnosis{alone}; no run of this task has tested it yet"
     if not logs:
         return "unknown: the crude model was never compared with the real system"
     config = workspace.config.model
@@ -444,6 +445,15 @@ def _came_true(
     if blind or candidate.doubtful or not little:  # a note may say it
         return doubt
     return f"{doubt}. {run_or_stop(gain, best)}"
+
+
+def _of_one_motion(workspace: Workspace) -> bool:
+    """Return whether the last diagnosis had trials of one motion alone, so not of a new task's."""
+    from grounded_trials.workspace.last_diagnosis import readable_diagnosis
+
+    found = readable_diagnosis(workspace.reports)
+    several = found is not None and found.made is not None and len(found.made.trials) > 1
+    return several and found is not None and found.motions == 1
 
 
 def _measured(workspace: Workspace) -> str:

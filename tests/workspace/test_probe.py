@@ -7,16 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cli import grounded
 from grounded.diagnosis import excitation
 from grounded.diagnosis.patterns import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
+from grounded_cli import propose
 from grounded_trials import Workspace
 from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.diagnosing import _near, _probe
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
+from grounded_trials.workspace.last_diagnosis import read_diagnosis, write_diagnosis
+from reported import copied
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.02\nv = 0.05\n"
@@ -167,6 +170,24 @@ def test_numbers_that_one_motion_told_get_no_promise_in_another(diagnosed):
         sentences.append(_probe(w, known, trials, Library(), write=False)[1])
     assert "+-" not in sentences[0] and "holds in another" in sentences[0]
     assert "+-" in sentences[1]
+
+
+def test_a_plan_for_another_task_says_what_its_model_was_told_by(diagnosed, tmp_path, monkeypatch):
+    """A car's patch of ground, of one turn alone: a circle's first run cost 65, and 0.83 was said.
+
+    "No run of this task has tested it yet" stood there, which would be as true of any model.
+    """
+    w, found = diagnosed
+    folder = copied(w.folder, tmp_path / "w")
+    (folder / "grounded.toml").write_text(NOISY)
+    grounded("-C", folder, "target", "line", "--to", "x=0.7")
+    monkeypatch.setattr(propose, "_measured", lambda workspace: "the model misses x by 1 mm")
+    said = {}
+    for motions in (1, 2):
+        write_diagnosis(folder / "reports", replace(found, motions=motions))
+        said[motions] = " ".join(grounded("-C", folder, "propose").out.split())
+    assert "by its diagnosis, whose trials all made one motion; no run" in said[1]
+    assert "by its diagnosis; no run" in said[2]
 
 
 def test_people_export_a_probe(diagnosed, tmp_path):
