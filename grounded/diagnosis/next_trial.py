@@ -66,7 +66,10 @@ def next_trial(
     from grounded.effects import like_a_load
 
     if claims.known.no_cause:
-        return "Run two or more trials in which every input changes: runs of candidates count."
+        return (
+            "Run another trial, or record a longer log, in which every input changes: runs of "
+            "candidates count."
+        )
     separable = [group for group in groups if group not in same]
     if groups and not separable and not (worse or ended or flip):
         own = next((name for name in groups[0] if name in claims.names), groups[0][0])

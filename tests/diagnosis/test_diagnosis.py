@@ -276,6 +276,7 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
         known=known, blamed=(), best=best, parameters=lambda: {"m": Estimate(1.2, 0.01, None, "kg")}
     )
     claims.data, claims.one_clock = SimpleNamespace(model=pendulum), ()
+    claims.with_rivals = dict
     claims.moved = (Blame(pendulum.param_names.index("m"), 9.0),)
     credit = [Credit(effect.name, 0.9), Credit("calibration", 0.004)]
     credit = credit if effect_first else [Credit("calibration", 0.9), Credit(effect.name, 0.1)]
@@ -294,6 +295,7 @@ def test_values_of_adopted_effects_that_are_off_are_told_in_their_own_words():
     off = ["viscous_friction_omega_k", "m"]
     known = {off[0]: Estimate(0.3, 0.01, None, "1/s"), "m": Estimate(1.2, 0.01, None, "kg")}
     claims = SimpleNamespace(data=SimpleNamespace(model=model), parameters=lambda: known)
+    claims.with_rivals = dict
     claims.moved = tuple(Blame(model.param_names.index(name), 9.0) for name in off)
     told = _moved(claims, ["viscous_friction:omega"])
     assert "omega is damped by 0.3 1/s (viscous_friction:omega: k = 0.300 +- 0.010 1/s" in told
@@ -350,6 +352,7 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
         moved=(),
         names=claimed,
         data=SimpleNamespace(model=pendulum),
+        with_rivals=dict,
         one_clock=(),
         best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
         parameters=dict,

@@ -48,6 +48,7 @@ def _claims(*effects, moved=(), parameters=None):
         data=SimpleNamespace(model=MODEL),
         one_clock=(),
         off_with_rivals=dict,
+        with_rivals=dict,
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.error_report import Identifiable
-from grounded.diagnosis.likelihood.data import PIECES, Data
+from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -64,7 +64,10 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     """
     found, no_cause = [], False
     if data.count < 2 and len(data.valid) < PIECES:
-        found.append("one trial alone confirms nothing; run a second one, or a longer one")
+        found.append(
+            "one trial alone confirms nothing; run a second one, or one of "
+            f"{PIECES * SHORTEST_PIECE} steps or more"
+        )
         no_cause = True
     if data.steps < FEW_STEPS:
         found.append(

@@ -9,6 +9,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Identifiable
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.validation import claims as claims_of
 from grounded.diagnosis.validation.blame import Blame
@@ -97,6 +98,7 @@ def test_a_value_that_adopt_leaves_alone_is_told_as_not_determined():
         data=SimpleNamespace(model=model),
         moved=(Blame(model.param_names.index("k"), 9.0),),
         parameters=lambda: {"k": Estimate(1.3, 0.4, None, "N/V")},
+        with_rivals=dict,
     )
     parts = [Identifiable("k", verdict, 1.0, 1.0, {}) for verdict in ("weak", "not identifiable")]
     told = [_causes(claims, (), [Credit("calibration")], [part], {})[0] for part in parts]
@@ -115,6 +117,7 @@ def test_of_many_adjusted_parameters_those_that_move_most_are_named():
         moved=(Blame(5, 9.0),),
         parameters=lambda: known,
         off_with_rivals=dict,
+        with_rivals=dict,
     )
     (told,) = _causes(claims, (), [Credit("calibration")], (), {})
     most = "5 others are adjusted with it, most of all p4 (+8.0 %), p3 (-7.5 %) and p2 (+6.7 %)"
@@ -152,6 +155,30 @@ def test_a_parameter_that_is_off_only_with_an_effect_that_ties_is_found(monkeypa
     assert claims_of.Claims.off_with_rivals(claims) == {"m": "joint_friction:u<-v"}
     claims.best.hypothesis.spread = 0.0  # no parameter is calibrated
     assert claims_of.Claims.off_with_rivals(claims) == {}
+
+
+def test_a_value_that_goes_with_a_tied_effect_says_what_it_is_with_the_other():
+    """A rover's lag of 0.18 s "should be 0.21048 +- 0.00025 s", beside a damping that tied."""
+    model, _ = motor(1)
+
+    def rival(*shift):
+        return SimpleNamespace(hypothesis=SimpleNamespace(shift=np.array(shift)))
+
+    claims = SimpleNamespace(
+        names=("viscous_friction:v",),
+        moved=(Blame(1, 9.0), Blame(2, 9.0)),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(spread=0.1)),
+        rivals=lambda name: [("input_gain:u", rival(0.0, 0.3, 0.2))],
+        data=SimpleNamespace(model=model),
+        parameters=lambda: {n: Estimate(v, 0.01, None, "") for n, v in (("k", 1.5), ("b", 0.7))},
+    )
+    both = "viscous_friction:v", "input_gain:u"
+    found = claims_of.Claims.with_rivals(claims)
+    assert found == {"k": (*both, pytest.approx(1.3))}  # b is 0.7 with either
+    claims.rivals = lambda name: [("input_gain:u", SimpleNamespace(hypothesis=Hypothesis()))]
+    assert claims_of.Claims.with_rivals(claims)["b"] == (*both, 0.5)  # held, as the model has it
+    claims.best.hypothesis.spread = 0.0
+    assert claims_of.Claims.with_rivals(claims) == {}
 
 
 def test_a_line_names_no_twenty_parameters():

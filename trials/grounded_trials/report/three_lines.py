@@ -17,7 +17,7 @@ from grounded.diagnosis.ruler_words import (
     telling,
     worsened,
 )
-from grounded.diagnosis.verdict import OPEN, also_off, told_apart, told_of
+from grounded.diagnosis.verdict import ONE_MOTION, OPEN, also_off, told_apart, told_of
 from grounded.result import begun, listed, measured_alike
 from grounded.task import Task
 from grounded_trials.wording import shown
@@ -163,4 +163,5 @@ def still_open(diagnosis: Diagnosis, *, ties: bool = True, repeated: bool = Fals
     if not diagnosis.leftover and (small := rest(rows)):
         found.append(small)
     text = "; ".join(found) or nothing
-    return f"{begun(text)}."
+    one = f" {ONE_MOTION}" * (ONE_MOTION in diagnosis.verdict.lines)
+    return f"{begun(text)}.{one}"
