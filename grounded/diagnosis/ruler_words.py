@@ -317,7 +317,7 @@ def rest(rows: Sequence[RulerRow]) -> str:
     still, noise = f"the state {name} is still off by", f"{float(f'{times:.2g}'):,g} times {noise}"
     if share < MATTERS:
         of = f"{100 * share:.1g} % of the crude model's error"
-        return f"{still} {of} {when}, {noise}: too little to look for a cause"
+        return f"{still} {of} {when}: too little to look for a cause, though {noise}"
     text = f"{still} {noise} {when}"
     small = f"too little compared with how far {name} moves"
     return f"{text}; no cause is looked for, as that is {small}, or differs too much by trial"
