@@ -311,7 +311,9 @@ def test_what_a_cause_is_worth_is_the_same_in_the_sentence_and_in_the_table():
     effect = Library().effect("viscous_friction:v", cart_task().model)
     k = {"k": Estimate(0.3, unit="1/s")}
     best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
-    claims = _claims(best=best, moved=(), parameters=dict, data=SimpleNamespace(model=None))
+    claims = _claims(
+        best=best, moved=(), parameters=dict, with_rivals=dict, data=SimpleNamespace(model=None)
+    )
     claims.data.model = SimpleNamespace(params={}, param_names=[])
     credit = (Credit(effect.name, 0.926, times=12.3), Credit("calibration", 0.074, times=1.222))
     ranked = (Ranked(effect.name, k, claimed=True),)
