@@ -114,6 +114,7 @@ def test_a_value_is_no_fact_while_a_gap_remains(error):
         data=data,
         moved=[Blame(model.param_names.index("k"), 90.0)],
         parameters=lambda: known,
+        with_rivals=dict,
         one_clock=(),
         names=(),
     )
