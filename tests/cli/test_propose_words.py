@@ -1,12 +1,15 @@
 """What `propose` says of earlier predictions is the number of the column `predicted`."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
 
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.standing import Standing
-from grounded_cli.propose import _came_true, _predicted, _samples, _so_far, _what
+from grounded_cli.propose import _by_itself, _came_true, _predicted, _samples, _so_far, _what
+from grounded_trials import Workspace
+from workspaces import make
 
 
 def test_a_prediction_has_one_value_and_the_noise_of_its_log_is_named():
@@ -66,6 +69,37 @@ def test_a_gain_below_the_noise_that_a_plan_replays_is_told_as_that(replayed, ru
     now = SimpleNamespace(incumbent=best, history=(best,))
     said = _came_true(step, [best], now, 0.002, replayed)
     assert ("less than the sensor noise that it replays costs, 0.007000" in said) == told
+
+
+@pytest.mark.parametrize(
+    ("alone", "real", "told"),
+    [(-0.0055, -0.1364, True), (0.001, -0.1364, False), (-1, -0.2, False)],
+)
+def test_a_gain_that_a_right_model_does_not_confirm_may_be_the_noise_of_one_run(alone, real, told):
+    """A boat's model was right to 1 % of its first run; four runs were spent on a promise."""
+    made = SimpleNamespace(id="c0001", base="", predicted_utility=-0.1352, doubtful=False)
+    best = Tried(made, (SimpleNamespace(id="t0001"),), (real,), True)
+    step = SimpleNamespace(id="c0002", way="", predicted_utility=-0.1171, likely_off=0.0)
+    step.promised_over, step.doubtful = lambda other: 0.0149, False
+    now = SimpleNamespace(incumbent=best, history=(best,))
+    said = _came_true(step, [best], now, 0.0018, 0.0131, alone)
+    words = "the model foretold that run, and by itself puts c0002 0.005500 behind c0001"
+    assert (words in said) == told
+    assert "stop with c0001" in said or not told
+    less = _came_true(step, [best], now, 0.0018, 0.002, alone)  # noise is not what it gains
+    assert words not in less and "a gain of 0.01490" in less
+
+
+def test_what_a_step_gains_by_itself_is_asked_of_the_model_without_a_bias(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    w.learn(1)
+    made = w.propose().proposal
+    best = made.standing.incumbent
+    alone = _by_itself(made.candidate, best, w)
+    assert alone < 0 < made.candidate.predicted_gain  # c0001 is the model's own optimum
+    assert math.isnan(_by_itself(best.candidate, best, w)) and math.isnan(
+        _by_itself(made.candidate, None, w)
+    )
 
 
 def test_how_old_samples_are_is_one_short_sentence(monkeypatch):

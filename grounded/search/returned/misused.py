@@ -38,7 +38,7 @@ NEARER, NEARLY_ALL = 0.5, 0.95  # a misuse must be so much nearer in that share 
 WITHOUT = (
     "without its feedback: send what `runner.action(t, state)` returns, not "
     "`runner.policy.feedforward`, for a state that holds numbers only (`runner.blind` counts the "
-    "calls without)"
+    "calls without), and for the states that the log has"
 )
 BESIDE = 0.95  # share of a run's commands that are the feed-forward's of that step or a neighbour
 ELSEWHERE = (

@@ -94,7 +94,7 @@ def write_first(
         "[limits]" + "                      # enter the limits of your robot" * (not limits),
         *limits,
         *[
-            "# SEEN in the log: enter the limits of your robot, then delete these two lines",
+            "# SEEN in the log, 0 included: enter those of your robot, then delete these two lines",
             f"seen_in = {json.dumps(log, ensure_ascii=False)}",
         ]
         * bool(limits),

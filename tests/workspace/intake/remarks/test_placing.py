@@ -89,6 +89,21 @@ def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_pa
     assert any("`discard t0005`" in one for one in far.warnings)
 
 
+def test_states_that_began_off_and_cost_less_are_named_too(w, tmp_path, monkeypatch):
+    """Of a boat y = 34 mm was told, and x = 52 mm was not."""
+    ran, *_ = read_trial(run(w))
+    off = np.array([0.15, -0.02])
+    assert initial_state._less_far(w.task, off, []) == ""
+    two = "; x by +0.15 m and v by -0.02 m/s, which matter less"
+    assert initial_state._less_far(w.task, off, [0, 1]) == two
+    far = initial_state._far_off
+    monkeypatch.setattr(
+        initial_state, "_far_off", lambda *given: replace(far(*given), beyond_noise=[0, 1])
+    )
+    (told,) = [one for one in placed(w, tmp_path, ran, 0.15).warnings if "started with" in one]
+    assert holds(told, "x = 0.150 m", "; v by +0 m/s, which matters less, more than")
+
+
 def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
     """`this changes its utility by -0.0202` told one of two offsets; both changed it by -0.041."""
     ran, *_ = read_trial(run(w))

@@ -96,9 +96,10 @@ def left_open(workspace: Folder, proposal: Proposal, held: Sequence[str]) -> lis
             f"equations and values in {workspace.config.model.file or 'the model'}"
         )
     if log := seen_in(workspace.config):
+        seen = f"[limits] are only the range used in {log} (0 included)"
         found.append(
-            f"{_never_sent(workspace) or f'[limits] are only the range used in {log}'}: enter the "
-            "robot's real limits, then delete seen_in there"
+            f"{_never_sent(workspace) or seen}: enter the robot's real limits, then delete seen_in "
+            "there"
             + _at_limits(task, first)
             + "; and draw the manoeuvre (`target`): target.csv is the run in that log"
             * still_logged(workspace)

@@ -7,6 +7,7 @@ s_0. A run whose utility it changes much says nothing about its candidate, and m
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +97,9 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
             tolerated.append(i)
     if not (spoils or tolerated or usual):
         return None
-    where = "; ".join(_placed(task, trial, i, off[i]) for i in (*spoils, *usual, *tolerated))
+    named = (*spoils, *usual, *tolerated)
+    where = "; ".join(_placed(task, trial, i, off[i]) for i in named)
+    where += _less_far(task, off, [i for i in far.beyond_noise if i not in named])
     whole = _changes(workspace, trial, off)
     by_model = f"By the model its whole start changes its utility by {whole:+.3g}"
     does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
@@ -129,6 +132,7 @@ class _Far:
 
     states: list[int]
     share: Array  # (n,) of the cost of a mean step; without weight, of the range in the run
+    beyond_noise: list[int]  # states that cost at each step, and are off by more than noise
     failed: bool  # the run left [safety]
 
 
@@ -154,9 +158,11 @@ def _far_off(workspace: Folder, trial: Trial, off: Array) -> _Far | None:
         share = np.where(
             weight > 0, weight * off**2 / usually, np.abs(off) / np.ptp(states, axis=0)
         )
-    told = (share > FAR) & (np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    clear = np.abs(off) > np.maximum(SURE * noise, 1e-9)
+    told = (share > FAR) & clear
     order = sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i]))
-    return _Far(order, share, len(states) <= trial.finite_steps) if order else None
+    beyond = np.flatnonzero(clear & (weight > 0)).tolist()
+    return _Far(order, share, beyond, len(states) <= trial.finite_steps) if order else None
 
 
 def _to_discard(trial: Trial, names: str, changes: float, whole: float) -> str:
@@ -191,6 +197,13 @@ def _perhaps(off: Array, placed: Placing) -> Array:
     """
     pairs = zip(np.abs(off), placed.rms, placed.runs, strict=True)
     return np.array([r > 0 and student(x / r, float(n)) <= CHANCE for x, r, n in pairs], bool)
+
+
+def _less_far(task: Task, off: Array, states: Sequence[int]) -> str:
+    """Return by how much other states are off, of which a step costs less; or ""."""
+    both = list(task.model.states.items())
+    each = [f"{both[i][0]} by {with_unit(f'{off[i]:+.2g}', both[i][1])}" for i in states]
+    return f"; {listed(each)}, which matter{'s' * (len(each) == 1)} less" if each else ""
 
 
 def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
