@@ -367,8 +367,8 @@ def _trust(
         return f"{since}: {measured}; no run has tested its plans yet"
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
     if measured:
-        alone = ", whose trials all made one motion" * _of_one_motion(workspace)
-        return f"{measured}, by its diagnosis{alone}; no run of this task has tested it yet"
+        of_one = ", whose trials all made one motion" * _of_one_motion(workspace)
+        return f"{measured}, by its diagnosis{of_one}; no run of this task has tested it yet"
     if not logs:
         return "unknown: the crude model was never compared with the real system"
     config = workspace.config.model
