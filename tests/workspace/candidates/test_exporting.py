@@ -217,3 +217,17 @@ def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tm
     assert plain_name.code == 0 and json.loads((tmp_path / "plain").read_text())["dt"] == 0.05
     folder = grounded("-C", w.folder, "export", "c0001", "-o", ".")
     assert folder.code == 1 and "is a folder" in folder.err
+
+
+@pytest.mark.parametrize("feedback", [True, False])
+def test_the_law_that_an_export_states_is_of_what_it_holds(tmp_path, feedback):
+    """A quarter turn's JSON, open loop, had `gain_t (z - reference_t)` in its law, and neither."""
+    w = make(
+        tmp_path / "w", config=CONFIG.replace("[task]", f"[task]\nfeedback = {feedback}".lower())
+    )
+    document = json.loads(exported(w, tmp_path, "json").read_text())
+    assert ("gain_t" in document["law"]) == ("gain" in document) == feedback
+    arrays = np.load(exported(w, tmp_path, "npz"))
+    assert ("gain_t" in str(arrays["law"])) == ("gain" in arrays.files) == feedback
+    head, _, rest = exported(w, tmp_path, "csv").read_text().partition("\nt,")
+    assert ("gain_t" in head) == ("gain." in rest.splitlines()[0]) == feedback

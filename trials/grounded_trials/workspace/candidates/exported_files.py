@@ -23,6 +23,7 @@ from grounded.policy import Policy, to_arrays
 from grounded_trials.workspace.folder import Folder
 
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
+OPEN_LOOP = "u_t = clip(feedforward_t, low, high)"  # no gain and no reference
 
 
 def is_export(workspace: Folder, identity: str, path: Path) -> bool:
@@ -58,9 +59,13 @@ def units_of(workspace: Folder) -> dict[str, str]:
     return {**model.states, **model.inputs}
 
 
+def _law(policy: Policy) -> str:
+    return OPEN_LOOP if policy.gain is None else LAW
+
+
 def _npz(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     stream = io.BytesIO()
-    texts = {"law": LAW, "units": json.dumps(units), "time_unit": "s", **about}
+    texts = {"law": _law(policy), "units": json.dumps(units), "time_unit": "s", **about}
     np.savez(stream, **to_arrays(policy, **texts))
     return stream.getvalue()
 
@@ -69,7 +74,7 @@ def _json(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes
     document: dict[str, Any] = {
         "format": "grounded-policy-1",
         **about,
-        "law": LAW,
+        "law": _law(policy),
         "dt": policy.dt,
         "time_unit": "s",
         "units": units,
@@ -95,7 +100,7 @@ def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     """Format one row per control step; lines that start with # have the law, units and limits."""
     stream = io.StringIO()
     stream.write("# format: grounded-policy-1\n")
-    for key, value in {**about, "law": LAW, "dt [s]": repr(policy.dt)}.items():
+    for key, value in {**about, "law": _law(policy), "dt [s]": repr(policy.dt)}.items():
         stream.write(f"# {key}: {value}\n")
     stream.write(f"# units: {json.dumps(units)}\n")
     stream.write(f"# z: {', '.join(policy.z_names)}\n")
