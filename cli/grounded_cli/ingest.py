@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.ingest import Ingested
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
+TABLE = "/csv."  # before the columns of a table, in the path of a signal
 AGAIN, ASIDE = "run again", "set aside"  # verdicts
 BEGUN = "in doubt for its start"  # a verdict "in doubt" that another run of the same one settles
 BEST = ("better", "maybe better")  # verdicts on what was the best when its run arrived
@@ -185,7 +186,10 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
             clock: f" ({', '.join(s.name for s in one.signals if s.clock == clock)})"
             for clock in dict.fromkeys(s.clock for s in one.signals)
         }
-        clocks = listed(CLOCKS[clock] + names * (len(own) > 1) for clock, names in own.items())
+        called = CLOCKS
+        if all(s.path.startswith(TABLE) for s in one.signals):
+            called = CLOCKS | {"header": "the column of times"}
+        clocks = listed(called[clock] + names * (len(own) > 1) for clock, names in own.items())
         skewed = "; skew: stamp minus log time, negative if recorded after its stamp"
         sentence(f"  Hz, jitter, gap: by {clocks}{skewed * any(s.skew_s for s in one.signals)}")
 

@@ -46,6 +46,8 @@ def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent)
     word = [name.partition(" ")[0].replace(".", "_") for name in sent]
     assert [found["speed"], found["turn"]] == [f"/csv.{name}" for name in word]
     assert all(found[name] for name in ("v", "omega", "x", "y", "psi"))
+    taken = " ".join(grounded("-C", tmp_path / "w", "ingest", "--data", log).out.split())
+    assert "Hz, jitter, gap: by the column of times" in taken  # a table has no headers
 
 
 def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_path):
