@@ -91,7 +91,10 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         return
     say("")
     show(summary(status))
-    _tell(document, three_lines(diagnosed, workspace.task))
+    once = bool(status.standing.lead_doubt) and not any(
+        len(tried.trials) > 1 for tried in status.standing.history
+    )
+    _tell(document, three_lines(diagnosed, workspace.task), once=once)
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
@@ -108,11 +111,13 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
     return chosen[:most] if standing.trials > MANY * most else []
 
 
-def _tell(document: dict[str, Any], verdict: list[str]) -> None:
+def _tell(document: dict[str, Any], verdict: list[str], *, once: bool) -> None:
+    """Print what was learned and diagnosed; `once`: no run was repeated, so scatter is unknown."""
     from grounded.result import percent
 
     first, last = document["utilities"][0], document["utilities"][-1]
     gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
+    gain += ", none of them repeated" * once
     show(
         "\n"
         + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")
