@@ -357,7 +357,8 @@ def _trust(
     ran = [tried for tried in standing.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
     if same:
-        alone = _by_itself(candidate, standing.incumbent, workspace)
+        once = len(same) == 1
+        alone = _by_itself(candidate, standing.incumbent, workspace) if once else math.nan
         return _came_true(candidate, same, standing, missed, replayed, alone)
     measured = _measured(workspace)
     if ran:
@@ -396,8 +397,7 @@ def _came_true(
     model without a gap, a rover's first step lost in five of five searches. A prediction begins at
     [task] start; what it cost that runs began elsewhere is no error of it.
 
-    Where the model foretold the one run of the best so far, and by itself (`alone`) finds nothing
-    to gain, the promise may be no more than the noise of that run: a boat's model was right to 1 %
+    Where the model foretold its one run so far, and by itself (`alone`) finds nothing to gain, the promise may be no more than the noise of that run: a boat's model was right to 1 %
     of its first run, promised 11 %, and four runs were spent on that.
     """
     from grounded.search.certainty import missed_by_start
@@ -442,7 +442,7 @@ def _came_true(
     if len(best.trials) == 1 and gain < replayed:
         then = ", and"
         promise += f", less than the sensor noise that it replays costs, {number(replayed)}"
-    elif len(same) == 1 and alone <= 0 and missed[-1] < RIGHT * gain < lacks + replayed:
+    elif -math.inf < alone <= 0 and missed[-1] < RIGHT * gain < lacks + replayed:
         own = best.candidate.id
         return (
             f"{promise}, but may only replay the noise of one run: the model foretold that run, "
@@ -462,10 +462,7 @@ def _came_true(
 
 
 def _by_itself(candidate: Candidate, best: Tried | None, workspace: Workspace) -> float:
-    """Return a step's gain in the model without the bias of the best one's run; else NaN.
-
-    Asked for the first step alone, as where the model is right to a few runs.
-    """
+    """Return a step's gain in the model without the bias of the best one's only run; else NaN."""
     if best is None or len(best.trials) != 1 or candidate.base != best.candidate.id:
         return math.nan
     from grounded.rollout import simulate

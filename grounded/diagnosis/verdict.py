@@ -398,14 +398,14 @@ def _moved(claims: Claims, adopted: Collection[str]) -> str:
 
     params, known = claims.data.model.params, claims.parameters()
     named, texts, again = parameters_off(claims), list[str](), dict[str, dict[str, str]]()
-    else_ = claims.with_rivals()
+    beside_rivals = claims.with_rivals()
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value / old - 1) if old else 0.0
         beside = [f"{change:+.{0 if abs(change) >= 1 else 1}f} %"] * bool(old)
         beside += ended(known[name], old)
-        if name in else_:
-            claimed, rival, value = else_[name]
+        if name in beside_rivals:
+            claimed, rival, value = beside_rivals[name]
             then = with_unit(number(value), params[name].unit)
             beside.append(f"or {then} if {rival} is the cause instead of {claimed}")
         part = f" ({', '.join(beside)})" * bool(beside)

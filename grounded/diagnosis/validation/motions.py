@@ -170,8 +170,12 @@ class _Paths:
     @property
     def constant(self) -> bool:
         """Whether what is added is the same at every step."""
-        change = [np.nan_to_num(_power(one - np.nanmean(one, axis=0))) for one in self.signal]
-        return bool(sum(change) <= STEADY**2 * sum(self.power))
+        change = 0.0
+        for one in self.signal:  # NaN in runs left out, which may be all of a trial
+            known = np.isfinite(one)
+            mean = np.where(known, one, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            change += float(_power(one - mean, none=0.0))
+        return change <= STEADY**2 * sum(self.power)
 
     def motions(self) -> Any:
         """Return the motion of each trial, (S,) of int."""

@@ -11,7 +11,13 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import PIECES, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.motions import motions, of_no_size, repeats, without_others
+from grounded.diagnosis.validation.motions import (
+    _Paths,
+    motions,
+    of_no_size,
+    repeats,
+    without_others,
+)
 from grounded.effects import Library, wrap
 
 DT, STEPS = 0.05, 120
@@ -89,6 +95,15 @@ def test_a_log_of_many_motions_needs_no_other_one():
     runs = SimpleNamespace(count=2, trial_of=np.repeat([0, 1], PIECES))
     found = repeats(SimpleNamespace(data=runs), SimpleNamespace(hypothesis=h), None, "periodic:v")
     assert found == 0
+
+
+def test_a_trial_of_which_no_run_is_used_leaves_a_constant_constant():
+    paths = _Paths.__new__(_Paths)
+    shaped = np.arange(10.0).reshape(5, 2)
+    for last, constant in ((np.full((5, 2), 3.0), True), (shaped, False)):
+        paths.signal = [np.full((5, 2), np.nan), np.full((5, 2), 3.0), last]
+        paths.power = [0.0, 9.0, float((last**2).mean())]
+        assert paths.constant is constant
 
 
 def test_what_acts_differently_is_another_motion():
