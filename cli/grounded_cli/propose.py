@@ -397,8 +397,9 @@ def _came_true(
     model without a gap, a rover's first step lost in five of five searches. A prediction begins at
     [task] start; what it cost that runs began elsewhere is no error of it.
 
-    Where the model foretold its one run so far, and by itself (`alone`) finds nothing to gain, the promise may be no more than the noise of that run: a boat's model was right to 1 %
-    of its first run, promised 11 %, and four runs were spent on that.
+    Where the model foretold its one run so far, and by itself (`alone`) finds nothing to gain, the
+    promise may be no more than the noise of that run: a boat's model was right to 1 % of its first
+    run, promised 11 %, and four runs were spent on that.
     """
     from grounded.search.certainty import missed_by_start
 
