@@ -480,8 +480,9 @@ def _of_one_motion(workspace: Workspace) -> bool:
     from grounded_trials.workspace.last_diagnosis import readable_diagnosis
 
     found = readable_diagnosis(workspace.reports)
-    several = found is not None and found.made is not None and len(found.made.trials) > 1
-    return several and found is not None and found.motions == 1
+    if found is None or found.made is None:
+        return False
+    return found.motions == 1 < len(found.made.trials)
 
 
 def _measured(workspace: Workspace) -> str:

@@ -170,8 +170,8 @@ def diagnose(
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
     between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
-    data = replace(data, filters=filters, between=frozenset(between))
-    data = replace(data, interpolated_s=options.interpolated_s)
+    early = options.interpolated_s
+    data = replace(data, filters=filters, between=frozenset(between), interpolated_s=early)
     known = limits(data, looked.left_out)
     known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")

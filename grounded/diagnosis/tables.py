@@ -21,7 +21,6 @@ WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED,
 UNBOUNDED = 1e6
 INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
 WITHOUT = "without: how much larger errors are without it, in the mean over states and horizons"
-TIMES = {"delay", "first_order_lag", "sensor_delay", "sensor_lag"}  # families of what arrives late
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
@@ -177,6 +176,8 @@ def of_delays(diagnosis: Diagnosis) -> str:
     The rows of a log may not tell when a command was sent, and states may be interpolated. "" if
     neither is so, or if no such time is claimed.
     """
+    from grounded.diagnosis.likelihood.hypothesis import TIMES
+
     made, why = diagnosis.made, list[str]()
     claimed = [row.effect.partition(":")[0] for row in diagnosis.ranking if row.claimed]
     if made is None:
@@ -186,7 +187,7 @@ def of_delays(diagnosis: Diagnosis) -> str:
             f"+- of a delay: mostly half of the {made.rows_s:.3g} s between rows of the log, which "
             "do not say when in between a command was sent"
         )
-    if made.interpolated_s and (TIMES.intersection(claimed) or credit_of(diagnosis, CALIBRATION)):
+    if made.interpolated_s and (TIMES.keys() & claimed or credit_of(diagnosis, CALIBRATION)):
         why.append(f"+- of times: {in_between(made.interpolated_s)}")
     return "; ".join(why)
 

@@ -54,6 +54,7 @@ from grounded.instruments.kinematics.relations import (
     differenced,
     judge_speed,
     lag_of,
+    late_by_the_model,
     logged_behind,
     own_lag,
     travelled,
@@ -84,7 +85,7 @@ from grounded.instruments.units.odd_trial import (
 )
 from grounded.instruments.units.other_units import judge_stamps, judge_units
 from grounded.model import Model
-from grounded.places import Integral, integrals, partner, speed, true_values
+from grounded.places import Integral, integrals, partner, speed
 from grounded.result import SMALL, with_error
 from grounded.task import Task
 from grounded.trial import Trial
@@ -265,10 +266,7 @@ class _Bench:
 
     def pairs(self) -> Iterator[Finding]:
         """Check each position against its velocity."""
-        memory = set(self.model.state_names).difference(
-            self.model.state_names[i] for i in self.shown
-        )
-        modelled = {*true_values(self.model.state_names, memory).values()}  # late by the model
+        modelled = {*late_by_the_model(self.model, self.shown).values()}
         for relation in integrals(self.model):
             if relation.i not in self.shown or relation.j not in self.shown:
                 continue

@@ -794,6 +794,16 @@ def adopted(model, *effects):
     return model
 
 
+def run_of(model, shown, inputs, noise):
+    """A run of a model from 0, with noise on its first `shown` states; the others are memory."""
+    rng, states = np.random.default_rng(0), [np.zeros(model.n)]
+    for u in inputs:
+        states.append(model.system.step(states[-1][None], u[None], model.values, DT)[0])
+    x = np.array(states) + noise * rng.standard_normal((len(states), model.n))
+    x[:, shown:] = np.nan
+    return Trial(x, inputs, DT, model.state_names, model.input_names)
+
+
 @pytest.mark.parametrize("hides", [(LATE, PLAY), (PLAY, LATE), (SHORT_OF,), (SHORT_OF, LATE)])
 def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hides):
     truck = adopted(TRUCK, CROOKED, *hides)
@@ -801,15 +811,9 @@ def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hide
     rows = kinematic_rows(truck, range(TRUCK.n))
     assert [truck.state_names[row.i] for row in rows] == ["x", "y"]
 
-    rng, start = np.random.default_rng(0), np.zeros((1, truck.n))
     t = np.arange(400) * DT
     inputs = np.stack([0.3 * np.sin(1.3 * t), 1.5 + 0.5 * np.sin(0.7 * t)], axis=1)
-    states = [start[0]]
-    for u in inputs:
-        states.append(truck.system.step(states[-1][None], u[None], truck.values, DT)[0])
-    x = np.array(states) + 1e-3 * rng.standard_normal((401, truck.n))
-    x[:, TRUCK.n :] = np.nan
-    trial = Trial(x, inputs, DT, truck.state_names, truck.input_names)
+    trial = run_of(truck, TRUCK.n, inputs, 1e-3)
     found = preflight(truck, [trial], hidden=truck.state_names[TRUCK.n :])
     assert [one.finding for one in found.findings] == []
 
@@ -848,18 +852,13 @@ ROVER = Model(
 def test_a_delay_that_is_part_of_the_model_is_not_corrected_again():
     """It was: then the adopted delay "should be 0", and `diagnose` advised to adopt that."""
     late = adopted(ROVER, ("sensor_delay:omega", {"d": 0.14 * DT}))
-    rng, t = np.random.default_rng(0), np.arange(1500) * DT
+    t = np.arange(1500) * DT
     inputs = np.sin(1.3 * t)[:, None] + np.sign(np.sin(0.7 * t))[:, None]
-    states = [np.zeros((1, late.n))[0]]
-    for u in inputs:
-        states.append(late.system.step(states[-1][None], u[None], late.values, DT)[0])
-    x = np.array(states) + 1e-4 * rng.standard_normal((1501, late.n))
-    x[:, ROVER.n :] = np.nan
-    trial = Trial(x, inputs, DT, late.state_names, late.input_names)
+    trial = run_of(late, ROVER.n, inputs, 1e-4)
     found = preflight(late, [trial], hidden=late.state_names[ROVER.n :])
     assert not found.findings
-    np.testing.assert_array_equal(found.trials[0].states, x)
+    np.testing.assert_array_equal(found.trials[0].states, trial.states)
 
-    own = Trial(x[:, : ROVER.n], inputs, DT, ROVER.state_names, ROVER.input_names)
+    own = Trial(trial.states[:, : ROVER.n], inputs, DT, ROVER.state_names, ROVER.input_names)
     (one,) = preflight(ROVER, [own]).findings
     assert one.signal == "omega" and one.delay_s == pytest.approx(0.14 * DT, abs=0.02 * DT)

@@ -27,7 +27,7 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
+from grounded.diagnosis.likelihood.hypothesis import TIMES, Hypothesis, rates_of
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -159,7 +159,6 @@ def parametric(fit: Fitted) -> bool:
 
 PARAM_PRIOR = 0.2  # prior standard deviation of a blamed parameter, relative to its size
 BRIEF = 0.1  # of a control step: shorter delays and lags may be errors of the time stamps
-TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
 LEFT = 0.25  # effects cancel if together they do less than this fraction of what each does alone
 WINDOW, OFTEN, TOO_SLOW = 0.25, 0.9, 0.5  # [s], quantile of changes, share of it: see _seen_rate
 NOISE_CHANGES = 1.645  # the same quantile of |x| of a standard normal x

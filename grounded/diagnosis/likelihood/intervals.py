@@ -21,7 +21,7 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import TIMES, Hypothesis, param_scale
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.filter import kalman
@@ -29,7 +29,6 @@ from grounded.frozen import Array
 
 NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
 DELAY, LAGS = "sensor_delay", ("first_order_lag", "sensor_lag")
-DELAYS = ("delay", DELAY)
 STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
 LONG = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
@@ -97,13 +96,18 @@ def between_samples(h: Hypothesis, data: Data, count: int) -> Array:
     found, free = np.zeros(count), [e.family.name for e in h.effects for _ in e.free]
     if not data.interpolated_s:
         return found
-    found[[k for k, name in enumerate(free) if name in (*LAGS, *DELAYS)]] = data.interpolated_s
+    found[[k for k, name in enumerate(free) if name in TIMES]] = data.interpolated_s
     which, scale = calibrated(data), param_scale(data.model)
     for k, i in enumerate(which if count > len(free) else ()):
         param = list(data.model.params.values())[i]
-        by = {"s": 1.0, "1/s": param.value**2}.get(param.unit, 0.0)
-        found[len(free) + k] = by * data.interpolated_s / scale[i]
+        off = moved_by(data.interpolated_s, param.value, param.unit)
+        found[len(free) + k] = off / scale[i]
     return found
+
+
+def moved_by(seconds: float, value: float, unit: str) -> float:
+    """Return by how much a value of a model changes if a time does; 0 if it is no time or rate."""
+    return seconds * {"s": 1.0, "1/s": value**2}.get(unit, 0.0)
 
 
 def _student(freedom: int) -> float:

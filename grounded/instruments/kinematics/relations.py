@@ -33,15 +33,19 @@ OFF = 0.03  # scale error that is reported, beyond both of its bounds
 SAME_WAY = 0.95  # coherence of speed and distance: below it something drifts or slips
 
 
+def late_by_the_model(model: Model, shown: Sequence[int]) -> dict[int, int]:
+    """Return the memory states with true values, {its index: that of the state that logs it}."""
+    names = model.state_names
+    return true_values(names, [name for i, name in enumerate(names) if i not in shown])
+
+
 def logged_behind(model: Model, shown: Sequence[int]) -> list[tuple[Integral, bool]]:
     """Return the relations between logged states whose true values are in memory states.
 
     Adopted sensor effects (delays, filters) keep the true value of a state as memory. Each relation
     comes with whether both of its states are delayed.
     """
-    names = model.state_names
-    memory = [name for i, name in enumerate(names) if i not in shown]
-    log = true_values(names, memory)
+    log = late_by_the_model(model, shown)
     return [
         (replace(one, i=log.get(one.i, one.i), j=log.get(one.j, one.j)), {one.i, one.j} <= {*log})
         for one in integrals(model)

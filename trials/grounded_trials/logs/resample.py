@@ -106,9 +106,9 @@ class Gridded:
         """What is odd about the samples."""
         return self._told[1]
 
-    @property
+    @cached_property
     def interpolated_s(self) -> float:
-        """By how much a response may begin early between two samples [s], see `early`."""
+        """By how much a response may begin early between two samples [s], see `begins_early`."""
         return self.early()
 
     @cached_property
@@ -210,13 +210,13 @@ def to_grid(
         late_s=late,
         moved_s=moved * 1e-9,
         row_s=rows_apart(sent, [samples[name] for name in states]),
-        early=lambda: max((early(one, grid) for one in tracked), default=0.0),
+        early=lambda: max((begins_early(one, grid) for one in tracked), default=0.0),
         last_ns=min(int(samples[name].t[-1]) for name in states),
         told=told,
     )
 
 
-def early(samples: Samples, grid: Ints) -> float:
+def begins_early(samples: Samples, grid: Ints) -> float:
     """Return by how much a response may begin early by linear interpolation at the grid [s].
 
     Where the course bends at a part c between two samples h apart, a straight line is off at a part

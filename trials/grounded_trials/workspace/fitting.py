@@ -24,8 +24,6 @@ from grounded_trials.workspace.last_diagnosis import fittable, ids_of, write_fit
 from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
-NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
-
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
@@ -120,6 +118,8 @@ def _as_times_tell(
     Returns:
         The fit, and what was added to each side of some delay [s] for either reason, at most.
     """
+    from grounded.diagnosis.likelihood.intervals import NORMAL, moved_by
+
     adopted = _adopted_delays(workspace)
     late = [n for n in found.params if n in adopted or n.startswith("latency")]
     dt, params, means = workspace.config.task.dt, dict(found.params), [0.0]
@@ -131,7 +131,7 @@ def _as_times_tell(
         std = math.hypot(e.std, row / 2, means[-1] / 2)
         params[name] = replace(e, std=std, low=e.low - more, high=e.high + more)
     for name, e in params.items() if early else ():
-        off = early * {"s": 1.0, "1/s": e.value**2}.get(e.unit, 0.0)
+        off = moved_by(early, e.value, e.unit)
         low, high = e.low - NORMAL * off, e.high + NORMAL * off
         params[name] = replace(e, std=math.hypot(e.std, off), low=low, high=high)
     return replace(found, params=params), row * bool(late), max(means)

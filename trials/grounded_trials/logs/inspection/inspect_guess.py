@@ -9,7 +9,7 @@ lower. If the best is not clearly better than the rest, the table says so and li
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -143,7 +143,7 @@ def guess_mapping(
         if not any(c.score >= LEAST for c in some):
             scored[name] = _of_stem(log, name, units.get(name, "")) or some
     named = {name: _by_name(log, name, units) for name in inputs}
-    sent = {path for name in inputs for path in _sent(named[name])}
+    sent = {_sent(named[name]) for name in inputs}
     scored = {name: [c for c in some if c.field.path not in sent] for name, some in scored.items()}
     homes = _homes(scored)
     found = tuple(_choose(log, name, scored[name], homes) for name in states)
@@ -203,14 +203,17 @@ def _by_name(log: LogReport, name: str, units: Mapping[str, str]) -> list[_Candi
     return _candidates(log, name, meanings, is_input=True) or _commanded(log, name)
 
 
-def _sent(candidates: Sequence[_Candidate]) -> Iterator[str]:
-    """Yield the best number for an input if its name says that it is a command: no measurement.
+def _sent(candidates: Sequence[_Candidate]) -> str:
+    """Return the best number for an input if its name says that it is a command; else "".
 
-    In a log of poses and /cmd_vel the commands were taken for the measured speed and turn rate.
+    That is no measurement: in a log of poses and /cmd_vel the commands were taken for the measured
+    speed and turn rate.
     """
     best = next(iter(candidates), None)
-    if best and best.score >= LEAST and {*_COMMANDED}.intersection(_WORD.findall(best.field.path)):
-        yield best.field.path
+    if best is None or best.score < LEAST:
+        return ""
+    commanded = {*_COMMANDED}.intersection(_WORD.findall(best.field.path))
+    return best.field.path if commanded else ""
 
 
 def _commanded(log: LogReport, name: str) -> list[_Candidate]:
