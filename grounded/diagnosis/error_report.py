@@ -15,6 +15,8 @@ SURE = 3.0  # the same in standard deviations of the floor, since many channels 
 AT_MOST = "repeats, at most"  # source of a noise floor that holds errors of the model as well
 BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
+# families of what arrives late, and the quantity that is a time [s]
+TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
 BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
 

@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.cause_words import OWN, give_or_take, times_of
-from grounded.diagnosis.error_report import CALIBRATION, RulerRow, furthest
+from grounded.diagnosis.error_report import CALIBRATION, TIMES, RulerRow, furthest
 from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
 
@@ -176,8 +176,6 @@ def of_delays(diagnosis: Diagnosis) -> str:
     The rows of a log may not tell when a command was sent, and states may be interpolated. "" if
     neither is so, or if no such time is claimed.
     """
-    from grounded.diagnosis.likelihood.hypothesis import TIMES
-
     made, why = diagnosis.made, list[str]()
     claimed = [row.effect.partition(":")[0] for row in diagnosis.ranking if row.claimed]
     if made is None:

@@ -13,9 +13,6 @@ from grounded.effects import Effect, LossFamily, MediumFamily, RateFamily
 from grounded.frozen import Array
 from grounded.model import Model
 
-# families of what arrives late, and the quantity that is a time [s]
-TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
-
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:

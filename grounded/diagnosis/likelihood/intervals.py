@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out
-from grounded.diagnosis.likelihood.hypothesis import TIMES, Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.filter import kalman
