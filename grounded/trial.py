@@ -42,6 +42,8 @@ class Trial:
             or zero without a task.
         start_states: states at t = 0 as the samples before it show them, by name, where they show
             them better than the first row alone does: of a robot that stood still before its run.
+        group: the condition that the trial was run in, if the user names it ("wet"): a diagnosis
+            fits values without a group and predicts it.
 
     Raises:
         GroundedError: if the shapes do not match.
@@ -56,6 +58,7 @@ class Trial:
     candidate: str = ""
     start_inputs: Array | None = None
     start_states: Mapping[str, float] = field(default_factory=dict)
+    group: str = ""
 
     def __post_init__(self) -> None:
         states = numbers(self.states, "trial: states")

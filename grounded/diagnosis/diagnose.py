@@ -27,17 +27,21 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.attribution import USUAL_EFFECTS, attribute, grown, so_far
-from grounded.diagnosis.hypotheses.explored import no_limits
-from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.attribution import (
+    USUAL_EFFECTS,
+    attribute,
+    grown,
+    regrown,
+    so_far,
+)
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data, prepare
-from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.agreement import compared
-from grounded.diagnosis.validation.decide import decide
+from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import (
     counted_once,
     held,
@@ -181,7 +185,7 @@ def diagnose(
         null = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
         if null:
             data = replace(data, model=held(uncertain, null[0]))
-            model = without_others(Predictor(data), null[0].track, options.but, options.library)
+            model = without_others(data, options.but, options.library)
             data = replace(data, model=model)
     settled, late = {*options.but, *looked.settled}, options.delays
     settled |= {f"sensor_delay:{name}" for name in options.one_message}
@@ -213,61 +217,46 @@ def diagnose(
     most = min(limit, many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
     used = [trial for trial in trials if trial.known_steps >= 2]
     task = subject if isinstance(subject, Task) else None
-    written: Writer | None = None
-    before, once_more, cut_short = best, True, False
+    ruler = Ruler(search.predictor, options.origin)
+    decision: Decision | None = None
+    cut_short = False
 
     def found_so_far() -> str:
-        return so_far(search, most, written.claims.names if written else None)
+        return so_far(search, most, decision.fit.hypothesis.names if decision else None)
 
-    def writer_of(best: Fitted) -> Writer:
-        ruler = Ruler(search.predictor, options.origin)
-        decision = decide(search, best, ruler, most)
-        tick("leftover")
-        return Writer(
-            decision,
-            ruler,
-            known,
-            (*options.but, *options.delays),
-            options.horizon,
-            most,
-            tick,
-            task,
-            used,
-            first,
-            exact,
-            uncertain,
-        )
-
-    here = interruptible(found_so_far)
-    with np.errstate(all="ignore"), here, running(engine, copied=copied):
+    # While a gap remains, search again without the leader, then for one more effect; decide anew.
+    with np.errstate(all="ignore"), interruptible(found_so_far), running(engine, copied=copied):
         try:
-            while True:
-                tick("predict")
-                writer = writer_of(best)
-                if written and not writer.worth_more_than(written):
-                    written.most = most  # one more was sought
-                    # two effects may be needed for what neither predicts better alone
-                    likelier = search.score(best) > search.score(before) + LARGE_GAIN
-                    if not ((once_more or options.max_effects) and likelier and most < limit):
-                        break
-                    once_more = False
-                else:
-                    written, once_more = writer, True
-                    if not (most < limit and writer.unfinished):
-                        break
-                most += 1
+            tick("predict")
+            decision, left_out = decide(search, ruler), set[str]()
+            while decision.gap or options.max_effects:
+                leader, before = decision.leader, decision.causes
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
-                before, best = best, grown(search, best, most)
-            while beyond := no_limits(data, written.decision.fit.hypothesis):
-                search.refused.update(beyond)
-                written = writer_of(search.chosen(most))
+                if decision.gap and leader and not left_out:
+                    left_out.add(leader)
+                    regrown(search, leader, most)
+                elif most < limit:
+                    most += 1
+                    grown(search, search.chosen(most), most)
+                else:
+                    break
+                more = left_out and most == USUAL_EFFECTS
+                decision = decide(search, ruler)
+                if decision.causes == before and not more:
+                    break
         except KeyboardInterrupt:
-            if written is None:
+            if decision is None:
                 raise
             cut_short, tick.beside = True, ""
+        tick("leftover")
+        adopted = (*options.but, *options.delays)
+        written = Writer(
+            decision, ruler, known, adopted, options.horizon, most, tick, task, used, first, exact,
+            uncertain,
+        )  # fmt: skip
         groups = [k < first for k in range(data.count)]
-        apart = compared(search, written.decision.fit, groups) if compare else None
+        apart = compared(search, decision.fit, groups) if compare else None
         found = written.diagnosis(apart)
         said = with_faults(found.verdict, looked.findings)
         said = interrupted(said) if cut_short else said

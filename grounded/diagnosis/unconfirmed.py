@@ -82,13 +82,10 @@ def _trifling(claims: Claims, one: Doubtful, row: RulerRow) -> bool:
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
-    few = one.repeats or few_trials(data, acts)
-    if not few and one.alone is None:
+    few = one.one_group or few_trials(data, acts)
+    if not few:
         return None
     trial = int(np.bincount(data.trial_of, acts.sum(axis=0), data.count).argmax())
-    if not few and one.alone is not None:  # it acts in all, but predictions improve in one only
-        few, trial = 1, int(data.used[one.alone])
-        acts = acts * (data.trial_of == trial)
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
     start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
@@ -109,7 +106,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         float(begin + end),
         (few, data.count),
         regions[0] if regions else None,
-        one.repeats > 0,
+        one.one_group,
         tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few]),
     )
 

@@ -19,9 +19,7 @@ from grounded.diagnosis.error_report import (
     Where,
     furthest,
 )
-from grounded.diagnosis.hypotheses.attribution import promised
 from grounded.diagnosis.hypotheses.correction import correction
-from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -32,13 +30,10 @@ from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import SLIGHT, Decision, closes_the_gap
-from grounded.diagnosis.validation.gain import BETTER
+from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import Limits, identifiable, joints_without_input
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
-from grounded.diagnosis.validation.motions import how_many
-from grounded.diagnosis.validation.own_numbers import SURE
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import verdict
@@ -53,7 +48,6 @@ WRONG_TERM = (  # advice beside a gap without a cause
     'wrong by a parameter of its own (`Param(1.0, "1", 0.0, 2.0)`) and diagnose again; one that '
     "comes out far from 1 is why."
 )
-MUCH = 0.4  # gain of one state at one horizon, a third of its error, that is worth a name
 
 
 class Writer:
@@ -83,47 +77,6 @@ class Writer:
         self.measured = Measured(decision, ruler, trials, first, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler, uncertain)
         self.left, self.uncertain = self.measured.left, uncertain
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether as many effects as were looked for leave more than noise, or promise another one.
-
-        That is also so if one of them was dropped: beside a further one it may be needed. Nothing
-        need be above a floor that may hold the model's own error too, as any without repeats does,
-        nor where something small but lasting is left: there evidence is asked.
-        """
-        likely = len(self.search.chosen(self.most).hypothesis.names)
-        if self.known.no_cause or max(likely, len(self.claims.names)) < self.most:
-            return False
-        left = self.measured.remainders()
-        if any(one.above for one in left):
-            return bool(self.claims.names)
-        full = len(self.claims.names) >= self.most
-        full = full and (self.measured.source == "short horizon" or bool(left))
-        return full and promised(self.search, self.best) > SURE
-
-    def worth_more_than(self, other: Writer) -> bool:
-        """Whether predictions gain by one effect more what is worth a name (`SLIGHT`).
-
-        Or some state at some horizon gains much, and all do on average: a robot's side slip made
-        its position's error a second ahead a fifth, and doubled that at the end of 46 s.
-
-        Or nothing is left with it, where a gap is without it.
-
-        Or as many effects are likelier, and predict as well. What a longer search meets on its way
-        may be the cause that a shorter one missed: a camera's delay, 30 nats likelier than the
-        coupling that imitated it.
-        """
-        fit, less, ruler = self.decision.fit, other.decision.fit, self.ruler
-        more = ruler.gain(less, fit)
-        much = more.mean > 0 and more.largest > MUCH
-        if much or more.mean > SLIGHT * ruler.since_outset(fit):
-            return True
-        if closes_the_gap(self.search, ruler, less, fit):
-            return True
-        likelier = self.search.score(fit) > self.search.score(less) + CLAIM
-        as_many = len(fit.hypothesis.effects) <= len(less.hypothesis.effects)
-        return as_many and likelier and not ruler.gain(fit, less).beyond(*BETTER)
 
     def diagnosis(self, apart: Compared | None = None) -> Diagnosis:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
@@ -171,7 +124,7 @@ class Writer:
         ties = [group for group in groups if group not in same]
         worse = objection(rows, agreement, named, ties, remainder)
         lost, ended = self.unrepeatable(), at_bounds(self.claims)
-        moved, parameters = how_many(predictor), self.claims.parameters()
+        moved, parameters = len(data.groups), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
         combinations = self.claims.by_priors.combinations
         joint = {name for one in combinations for name in (*one.values, *one.rests_on)}

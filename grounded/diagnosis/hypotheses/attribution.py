@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
-from grounded.diagnosis.hypotheses.joint_model import joint_model
-from grounded.diagnosis.hypotheses.plainest import drier, plain_friction
+from grounded.diagnosis.hypotheses.joint_model import joint_model, split
+from grounded.diagnosis.hypotheses.plainest import plain_friction, plainer
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -25,22 +25,20 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
 )
-from grounded.diagnosis.hypotheses.swaps import HOPEFUL, TUNED, reordered, swapped
+from grounded.diagnosis.hypotheses.swaps import HOPEFUL, TUNED, parted, reordered, swapped
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.likelihood.refine import clean, refine
+from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
-FORETOLD = (2.0, 0.05)  # scatters and gain by which a rival must predict better to be extended too
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-RIVAL = 10.0  # nats behind the chosen set within which another one's dry frictions are tried, too
 NEAR = 3.0  # nats behind the likeliest of a size within which fits have to converge
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
@@ -209,7 +207,7 @@ def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
     ruler.beside(search.exact_null())
     found = best
     for fit in rivals:
-        if fit is not best and ruler.gain(found, fit).beyond(*FORETOLD):
+        if fit is not best and ruler.gain(found, fit).clear:
             found = fit
     return found
 
@@ -231,19 +229,6 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
     if null is None:
         return []
     return [f for f in likely if f not in starts and score(f) > score(null) + LARGE_GAIN]
-
-
-def promised(search: HypothesisSearch, fit: Fitted) -> float:
-    """Return the largest gain of one more effect beside a fit, from a short fit [nats].
-
-    A scan is not enough: coloured noise and parameters fitted without an effect hide it, and give
-    way only when they are fitted together. The fits are not kept.
-    """
-    starts = search.one_more(fit, search.most)
-    fits = refine(search.predictor, [fit, *starts], iterations=AT_FIRST, worth=search.score)
-    more = [search.score(f) for f in fits if len(f.hypothesis.names) > len(fit.hypothesis.names)]
-    as_many = [search.score(f) for f in (fit, *fits) if f.hypothesis.names == fit.hypothesis.names]
-    return max(more, default=-np.inf) - max(as_many)
 
 
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
@@ -285,9 +270,6 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if search.chosen(most) is chosen:
             break
     chosen = search.chosen(most)
-    for rival in search.of_size(len(chosen.hypothesis.effects))[:HOPEFUL]:
-        if rival is not chosen and search.score(rival) > search.score(chosen) - RIVAL:
-            drier(search, rival)
     plain_friction(search, chosen)
     if (plain := search.chosen(most)) is not chosen:
         _nested(search, plain)
@@ -300,7 +282,25 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if len(search.chosen(most).hypothesis.effects) > size:
             return grown(search, search.chosen(most), most)
     settle(search, most)
+    chosen = search.chosen(most)
+    for fit in [chosen, *search.of_size(len(chosen.hypothesis.effects))[:TUNED]]:
+        parted(search, fit)  # the rule may prefer what blames less
+        split(search, fit)
+        plainer(search, fit)
     return search.chosen(most)
+
+
+def regrown(search: HypothesisSearch, leader: str, most: int) -> None:
+    """Search again as if one effect did not exist; all fits are added to the search.
+
+    A set that grew one effect at a time never leaves the one that it began with, however much is
+    left: each further effect fits what that one leaves.
+    """
+    other = search.lacking(leader)
+    singles = other.of_size(1)
+    if singles:
+        grown(other, _explore(other, 1), most)
+        search.keep(list(other.fits.values()))
 
 
 def _nested(search: HypothesisSearch, larger: Fitted) -> None:

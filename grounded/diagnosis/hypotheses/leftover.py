@@ -24,7 +24,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.gain import Errors
-from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.result import per_second
@@ -32,7 +32,6 @@ from grounded.result import per_second
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
 PENALTIES = (3.0, 30.0)  # ridge: relative prior variances of the weights
 LAGS = (1, 2, 4, 7)  # steps
-COUNTS = (2.0, 0.03)  # scatters and log gain of predictions by a correction that is stated
 RHO_LAGS = 10  # autocorrelation lags of the test for white innovations
 
 
@@ -51,7 +50,7 @@ class Leftover:
 def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     """Return the channels in which the regression predicts held-out trials better, best first."""
     data = predictor.data
-    if len(np.unique(folds(data))) < 2:
+    if len(np.unique(data.folds)) < 2:
         return []
     features, gains = flexible(predictor, fit), filter_of(predictor, fit)
     found = []
@@ -75,7 +74,7 @@ def corrections(
         rate = np.zeros((*one.correction.shape, len(names)))
         rate[..., names.index(one.channel)] = one.correction
         gain, errors = ruler.corrected(fit, rate)
-        if gain.beyond(*COUNTS):
+        if gain.clear:
             found[one.channel] = one, errors
     return found
 
@@ -135,7 +134,7 @@ def _channel(
 ) -> tuple[float, Array, Array]:
     """Return the held-out gain in one channel (total, by step (L, B)) and its correction (L, B)."""
     gain, by_step, weights = held_out_columns(predictor, fit, gains, features, i)
-    left_out, rate = folds(predictor.data), np.zeros_like(by_step)
+    left_out, rate = predictor.data.folds, np.zeros_like(by_step)
     for k, trial in enumerate(np.unique(left_out)):
         own = left_out == trial
         rate[:, own] = features[:, own] @ weights[k]
@@ -164,7 +163,7 @@ def held_out_columns(
     d = np.zeros((L, B, n, K))
     d[:, :, i, :] = features * data.dt
     white, _ = kalman.innovations(gains, d, np.zeros((L + 1, 1, 1, 1)))
-    left_out = folds(data)
+    left_out = data.folds
     trials = np.unique(left_out)
     grams, scores = [], []
     for trial in trials:

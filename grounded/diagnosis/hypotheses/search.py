@@ -321,13 +321,14 @@ class HypothesisSearch(FittedHypotheses):
         alone = refine(self.predictor, [start], iterations=1, fixed_noise=True)
         return alone[0] if alone else self.best_null()
 
-    def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
-        """Return the fits under one noise structure and prior width; None without a null."""
-        other, exact = self._empty(), (structure, 0.0, ())
+    def lacking(self, name: str) -> HypothesisSearch:
+        """Return a search without one effect, with the fits that don't have it."""
+        rest = [effect for effect in self.candidates if effect.name != name]
+        joints = [effect for effect in self.joints.values() if effect.name != name]
+        other = HypothesisSearch(self.data, rest, self.tick, joints)
         other._prices, other.refused = self._prices, self.refused
-        kept = [f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact]
-        other.keep(kept)  # which also sets the tempering, by the likeliest of them
-        return other if exact in other.fits else None
+        other.keep([f for f in self.fits.values() if name not in f.hypothesis.names])
+        return other
 
 
 def undefined(predictor: Predictor) -> GroundedError:

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.likelihood.groups import Group, Signals, folds
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Scales, scales_of
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import true_values
+from grounded.places import dynamic, true_values
 from grounded.trial import Trial
 
 LONGEST_RUN, SHORTER_RUN = 200, 150  # most steps of a run; the second applies to a simulator
@@ -58,11 +59,26 @@ class Data:
     filters: Mapping[int, float] = field(default_factory=dict)  # sensor time constants [s] by state
     between: frozenset[str] = frozenset()  # sensors shifted in time by a fraction of a sample
     interpolated_s: float = 0.0  # as std of times: states were interpolated
+    groups: tuple[Group, ...] = ()  # trials that differ in motion or condition
 
     @property
     def count(self) -> int:
         """S, the number of trials."""
         return len(self.lengths)
+
+    @cached_property
+    def group_of(self) -> Any:
+        """The group of each trial, (S,) of int."""
+        found = np.zeros(self.count, int)
+        for k, group in enumerate(self.groups):
+            found[list(group.trials)] = k
+        return found
+
+    @cached_property
+    def folds(self) -> Any:
+        """The fold of each run that is held out together, (B,): its group, or part of it."""
+        steps = self.valid.sum(axis=1)
+        return folds(self.group_of[self.trial_of], self.trial_of, steps)
 
     @property
     def steps(self) -> int:
@@ -231,7 +247,22 @@ def prepare(
         skipped=len(step_at) - len(keep),
         ids=tuple(trial.id for trial, _ in used),
         hidden=tuple(model.state_names.index(name) for name in hidden),
+        groups=tuple(_signals(model, used, hidden).groups()),
     )
+
+
+def _signals(model: Model, used: Sequence[tuple[Trial, int]], hidden: Sequence[str]) -> Signals:
+    """Return the inputs and the measured states that rates may depend on, for grouping."""
+    names = [n for n in model.state_names if n in dynamic(model) and n not in hidden]
+    states = [_filled(trial.states[:T]) for trial, T in used]
+    known = np.any([np.isfinite(trial.states).any(axis=0) for trial, _ in used], axis=0)
+    which = [i for i in map(model.state_names.index, names) if known[i]]
+    each = [
+        np.concatenate([x[:, which], trial.inputs[:T]], axis=1)
+        for x, (trial, T) in zip(states, used, strict=True)
+    ]
+    shown = [model.state_names[i] for i in which]
+    return Signals([*shown, *model.input_names], each, [trial.group for trial, _ in used])
 
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:

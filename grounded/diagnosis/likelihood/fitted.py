@@ -83,22 +83,31 @@ def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
     return replace(other, shift=shift)
 
 
-def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
-    """Return the changes of all values without each trial (S, C), and its rss with them (S,).
+def leave_one_out(fit: Fitted, fold: Array) -> tuple[Array, Array]:
+    """Return the changes of all values without each fold (S, C), and its rss with them (S,).
 
-    One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i.
+    One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i. A coefficient that only the fold
+    itself shows returns to zero, so that it predicts nothing there: a weak prior does that, UNSEEN
+    of the information of all folds.
     """
-    trials = np.unique(trial_of)
-    C = fit.gram.shape[-1]
-    prior, total = np.diag(fit.prior), fit.gram.sum(axis=0)
-    shifts, rss = np.zeros((len(trials), C)), np.zeros(len(trials))
-    for i, trial in enumerate(trials):
-        own = trial_of == trial
+    names = np.unique(fold)
+    C, total = fit.gram.shape[-1], fit.gram.sum(axis=0)
+    theta, weak = np.zeros(C), np.zeros(C)
+    free = [(v[q.name], not q.grid) for e, v in fit.hypothesis.pairs for q in e.free]
+    for k, (value, coefficient) in enumerate(free):
+        theta[k], weak[k] = value, UNSEEN * total[k, k] * coefficient
+    shifts, rss = np.zeros((len(names), C)), np.zeros(len(names))
+    for i, name in enumerate(names):
+        own = fold == name
         G, s = fit.gram[own].sum(axis=0), fit.score[own].sum(axis=0)
-        if C and len(trials) > 1:
-            A = total - G + prior
+        if C and len(names) > 1:
+            A = total - G + np.diag(fit.prior + weak)
             scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
             scaled = A * np.outer(scale, scale)
-            shifts[i] = scale * np.linalg.lstsq(scaled, scale * s, rcond=1e-8)[0]
+            pull = scale * (s - weak * theta)
+            shifts[i] = scale * np.linalg.lstsq(scaled, pull, rcond=1e-8)[0]
         rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
     return shifts, rss
+
+
+UNSEEN = 1e-4  # share of a coefficient's information that must lie outside of what is held out

@@ -22,7 +22,6 @@ from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import NORMAL
-from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
@@ -65,7 +64,7 @@ def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[F
         nats = search.score(other) - search.score(fit)
         likely = other is not fit and list(some) == names and nats > math.log(SLIGHT)
         if likely and set(_values(other.hypothesis)) == set(own):
-            worse = ruler.held_out and ruler.gain(other, fit).beyond(*BETTER)
+            worse = ruler.held_out and ruler.gain(other, fit).clear
             found += [] if worse else [(other, math.exp(min(nats, MOST)))]
     return found
 

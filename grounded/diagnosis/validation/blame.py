@@ -23,7 +23,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.validation.decide import SLIGHT
+from grounded.diagnosis.validation.choose import SHARE
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
@@ -77,7 +77,7 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
         held = held[1:]
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
-        least = SLIGHT * ruler.since_outset(fit)
+        least = SHARE * ruler.since_outset(fit)
         rest = fit
         for i in held:
             rest = unmoved(data, rest, k + i)

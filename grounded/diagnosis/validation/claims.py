@@ -22,16 +22,13 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.blame import ENOUGH, MOVED, STILL, Blame, moved_parameters
-from grounded.diagnosis.validation.bounds import set_by_bound
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
-from grounded.diagnosis.validation.gain import BETTER
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
-from grounded.diagnosis.validation.own_numbers import with_mechanism
 from grounded.diagnosis.validation.prediction_error import normalised
-from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.frozen import Array
 
@@ -75,7 +72,6 @@ class Claims:
         """`uncertain`: evaluates hypotheses with those parameters free that the search held."""
         self.search, self.best, self.known = decision.search, decision.fit, known
         self.ruler = ruler
-        self.whole, self.held_up = decision.whole, decision.held_up
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
         self._uncertain = uncertain or search.predictor
@@ -128,19 +124,18 @@ class Claims:
                 gap = gaps_of(self.predictor, [fit], where)[0]
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
-        others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
+        others = (f for f in self.search.of_size(1) if f.hypothesis.names[0] not in listed)
         likely = (  # no absurd values
             f
             for f in others
-            if math.isfinite(self.whole.score(f)) and not no_limits(self.data, f.hypothesis)
+            if math.isfinite(self.search.score(f)) and not no_limits(self.data, f.hypothesis)
         )
         sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
         singles = list(islice(sized, max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
-        base = self.base if self.whole is self.search else self.whole.score(self.whole.best_null())
         for fit, gap in zip(singles, gaps, strict=True):
             name = fit.hypothesis.names[0]
-            evidence = self.whole.score(fit) - base
+            evidence = self.search.score(fit) - self.base
             rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
         return tuple(rows)
 
@@ -249,7 +244,7 @@ class Claims:
 
     def _alone(self, fit: Fitted) -> tuple[Array, Array]:
         b = self.search.tempering.factor
-        return standard_deviations(self.predictor, fit, folds(self.data), b)
+        return standard_deviations(self.predictor, fit, self.data.folds, b)
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return groups of indistinguishable explanations, the claimed one first in each.
@@ -316,7 +311,6 @@ class Claims:
             as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
             needed = (h.spread > 0) == free or as_likely
             beyond = other in no_limits(self.data, h) or _restated(name, other, rest)
-            beyond = beyond or set_by_bound(self.search, f, self.best, other)
             beyond = beyond or self._adds(other, score(f) - without)
             if other not in (name, *found) and needed and not beyond and self._ties(name, other, f):
                 found[other] = f
@@ -372,7 +366,7 @@ class Claims:
         (mainly those of the parameters) differ by less than TIE.
         """
         score, best = self.search.score, self.best
-        if fit is with_mechanism(self.search, best) or score(best) - score(fit) < TIE:
+        if score(best) - score(fit) < TIE:
             return self._not_refused(fit)
         if not self.ruler.held_out or not self._one_thing(name, other):
             return False
@@ -380,7 +374,7 @@ class Claims:
         known, other_known = (score(f) - b * f.loglik for f in (best, fit))
         unlike = abs(known - other_known) > TIE
         gains = (self.ruler.gain(fit, best), self.ruler.gain(best, fit))
-        return not unlike and not any(gain.beyond(*BETTER) for gain in gains)
+        return not unlike and not any(gain.clear for gain in gains)
 
     def _as_likely(self, fit: Fitted) -> bool:
         """Check whether a fit is as likely as the claim, or likelier and predicts as well."""
@@ -392,7 +386,7 @@ class Claims:
         """Check that a fit is no likelier than the claim, or that predictions don't refuse it."""
         likelier = self.search.score(fit) - self.search.score(self.best) > TIE
         refused = likelier and self.ruler.held_out
-        return not (refused and self.ruler.gain(fit, self.best).beyond(*BETTER))
+        return not (refused and self.ruler.gain(fit, self.best).clear)
 
     def _one_thing(self, name: str, other: str) -> bool:
         """Check whether two effects are equivalent with other values of the free parameters."""

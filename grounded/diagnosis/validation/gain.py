@@ -1,32 +1,25 @@
-"""Gain in prediction accuracy of one hypothesis over another, with tests of its significance.
+"""Gain in prediction accuracy of one hypothesis over another, with its standard error.
 
-The gain is the mean log ratio of rms errors over channels and horizons; its scatter is the
-jackknife standard error over runs. Two further tests correct weaknesses of this measure:
-
-- Runs differ in how much of an effect they contain. If two of eight trials show all of it, the gain
-  is 1.5 of its scatter even without noise. So the short horizons are also compared in pieces of a
-  second; pieces where the effect does not act add neither gain nor scatter (`again`).
-- The runs with the largest errors dominate the sums and their scatter, such as that of a pendulum
-  that once stopped near the top. So each trial's gain is also computed separately, and all trials
-  count equally (`chance`).
-
-In a single log, the runs that it is cut into take the place of trials in both.
+The gain is the mean log ratio of rms errors over channels and horizons; its standard error is the
+jackknife's over trials (in a single log, over the runs that it is cut into). Runs differ in how
+much of an effect they contain: if two of eight trials show all of it, the gain is 1.5 standard
+errors even without noise. So the short horizons are also compared in pieces of a second, where a
+piece in which the effect does not act adds neither gain nor scatter (`Gain.again`), and single
+channels are looked at, since an effect on one would be lost in the mean over a dozen.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from grounded.frozen import Array
 
-MOST, FEW = 0.8, 4  # one of FEW trials that holds MOST of what trials gain stands alone
-AGAIN = 2.0  # scatters that the gain of all pieces must have without the best trial
-CLEAR = 0.1  # log gain of a trial (10 % smaller errors) from which it shows an effect
-BETTER = (2.0, 0.05)  # scatters and log gain by which a less likely rival must predict better
-CHANCE = 0.01  # p-value of the gains of single trials below which they are significant
+LEAST = 0.01  # log gain in some channel at some horizon below which a difference does not matter
+CLEARLY = 2.0  # standard errors from which one hypothesis predicts clearly better than another
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,60 +38,89 @@ class Errors:
 
 @dataclass(frozen=True)
 class Gain:
-    """Improvement of one hypothesis over another: log ratio of errors, and its scatter."""
+    """Improvement of one hypothesis over another: mean log ratio of errors, and how sure it is."""
 
     mean: float
-    scatter: float
+    scatter: float  # its jackknife standard error
     largest: float  # of any channel and horizon
     channels: Array  # (n',) mean over horizons, by shown state
-    scatters: Array  # (n',) scatter of these
-    pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of each piece, up to 1 s
-    trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) trial of each piece
-    own: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of each trial separately
-    single: bool = False  # there is one trial only, whose runs count as the trials
+    scatters: Array  # (n',) standard errors of these
+    again: float  # gain of all pieces but those of the best trial, in scatters of their sum
 
     @property
-    def chance(self) -> float:
-        """One-sided p-value of the mean gain of single trials (Student's t)."""
-        from scipy.special import stdtr
+    def clear(self) -> bool:
+        """Whether predictions are clearly better."""
+        return self.mean > CLEARLY * self.scatter and self.largest > LEAST
 
-        count, spread = len(self.own), float(self.own.std(ddof=1)) if len(self.own) > 1 else 0.0
-        if not spread > 0:
-            return 1.0
-        return float(stdtr(count - 1, -float(self.own.mean()) * np.sqrt(count) / spread))
+    def pays(self, scatters: float) -> bool:
+        """Check whether the gain is significant: over all channels, again and again, or in one."""
+        one = (self.channels > CLEARLY * scatters * self.scatters) & (self.channels > LEAST)
+        several = self.mean > 0 and (self.again > CLEARLY or bool(one.any()))
+        return self.largest > LEAST and (self.mean > scatters * self.scatter or several)
 
-    @property
-    def again(self) -> float:
-        """Gain of all pieces without the best trial, in scatters of their sum."""
-        by = np.bincount(self.trial, self.pieces) if len(self.pieces) else np.zeros(1)
-        each = self.pieces[self.trial != int(by.argmax())]
-        scatter = np.sqrt(len(each) * each.var()) if len(each) > 1 else 0.0
-        return float(each.sum() / scatter) if scatter > 0 else 0.0
 
-    @property
-    def alone(self) -> int | None:
-        """The trial, by its place in `own`, that makes nearly all of the gain; None if none does.
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """How errors of two hypotheses on the same trials are compared.
 
-        Few trials need show an effect (a free swing among driven runs). Its gain there is as large
-        as its scatter, so it can't be told from chance, but it is not nothing either.
+    Args:
+        shown: (n',) states that are compared.
+        matters: (K, n') errors below which differences do not matter.
+        unit: (P,) jackknife unit of each piece: its trial, or in a single log its run.
+    """
+
+    shown: Any
+    matters: Array
+    unit: Any
+
+    def __call__(self, before: Errors, after: Errors) -> Gain:
+        """Return the gain of one set of errors over another."""
+        a, b = (self._by_unit(errors.total) for errors in (before, after))
+        count = self._by_unit(before.count).sum(axis=1, keepdims=True)
+        seen, least = count > 0, count * self.matters[:, None] ** 2 + 1e-300
+
+        def ratio(x: Array, y: Array) -> Array:
+            return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
+
+        def without(x: Array) -> Array:
+            return np.asarray(np.maximum(x.sum(axis=1, keepdims=True) - x, 0.0))
+
+        whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
+        counts = np.maximum(seen.sum(axis=(0, 1)), 1)
+        by, some = ratio(without(a), without(b)).sum(axis=0), max(int(seen.sum()), 1)
+        return Gain(
+            float(whole.sum() / some),
+            float(_jackknife(by.sum(axis=-1) / some)),
+            float(whole.max()),
+            whole.sum(axis=(0, 1)) / counts,
+            _jackknife(by / counts),
+            self._again(before, after),
+        )
+
+    def _by_unit(self, values: Array) -> Array:
+        """Return sums over pieces by unit, (K, U, n') of (K, P, n)."""
+        found = np.zeros((len(values), int(self.unit.max()) + 1, len(self.shown)))
+        np.add.at(found, (slice(None), self.unit), values[..., self.shown])
+        return found
+
+    def _again(self, before: Errors, after: Errors) -> float:
+        """Return the gain of the pieces without the best unit, in scatters of their sum.
+
+        Each is damped by the mean error, so that none dominates.
         """
-        gains = np.maximum(self.own, 0.0)
-        if self.single or len(gains) < FEW or not self.mean > 0:
-            return None
-        best = int(gains.argmax())
-        return best if gains[best] > max(MOST * gains.sum(), CLEAR) else None
+        a, b, n = (e[:-1][..., self.shown] for e in (before.total, after.total, before.count))
+        count = np.maximum(n.sum(axis=1, keepdims=True), 1)
+        usual = n * (b.sum(axis=1, keepdims=True) / count + self.matters[:-1, None] ** 2) + 1e-300
+        pieces = (n / count * np.log((a + usual) / (b + usual))).sum(axis=(0, 2))
+        by = np.bincount(self.unit, pieces)
+        rest = pieces[self.unit != int(by.argmax())]
+        scatter = np.sqrt(len(rest) * rest.var()) if len(rest) > 1 else 0.0
+        return float(rest.sum() / scatter) if scatter > 0 else 0.0
 
-    def beyond(self, scatters: float, least: float) -> bool:
-        """Check whether the gain exceeds `scatters` of its scatter, and `least` in some channel."""
-        return self.mean > scatters * self.scatter and self.largest > least
 
-    def pays(self, scatters: float, least: float) -> bool:
-        """Check whether the gain supports a claim.
-
-        It does if it is significant over all channels, in pieces without the best trial, by single
-        trials, or in one channel. The last needs one scatter more; without it, an effect on one
-        channel would be lost in the mean over a dozen channels and in their scatter.
-        """
-        one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
-        again = (self.again > AGAIN or self.chance < CHANCE) and self.largest > least
-        return self.beyond(scatters, least) or (self.mean > 0 and (again or bool(one.any())))
+def _jackknife(each: Array) -> Array:
+    """Return the jackknife standard error from the means without each unit, (U, ...) -> (...)."""
+    count = len(each)
+    if count < 2:
+        return np.full(each.shape[1:], np.inf)
+    return np.asarray(np.sqrt((count - 1) / count * ((each - each.mean(axis=0)) ** 2).sum(axis=0)))

@@ -19,7 +19,6 @@ from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.prediction_error import Horizon, errors, normalised
-from grounded.diagnosis.validation.ruler import folds
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
@@ -55,7 +54,7 @@ def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Hori
     data, h = predictor.data, fit.hypothesis
     if not h.effects and h.spread == 0:
         return errors(predictor, h, track, where)
-    left_out = folds(data)
+    left_out = data.folds
     shifts, _ = leave_one_out(fit, left_out)
     found = np.full((len(where.at), data.model.n), np.nan)
     of_start = left_out[where.run]

@@ -27,7 +27,7 @@ from grounded.diagnosis.error_report import (
     RunChange,
     Split,
 )
-from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers, whiteness
+from grounded.diagnosis.hypotheses.leftover import Leftover, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.ahead import unseen
@@ -65,8 +65,7 @@ class Measured:
         self.units = {n: self.data.model.states[n] for n in ruler.names}
         self.lost = losses(ruler, decision)
         self.credit = shares(ruler, decision, self.lost)
-        self.left = leftovers(self.predictor, self.best)
-        self.flexible = corrections(ruler, self.best, self.left)
+        self.left, self.flexible = decision.left, decision.flexible
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
         self.is_white = not self.left and min(told, default=0.0) * len(told) > WHITE
@@ -170,7 +169,9 @@ class Measured:
             "with_effects": self.rms(self.best),
             "noise_floor": self.floor,
         }
-        by = "pieces" if self.ruler.folds.max() >= self.data.count else "trials"
+        by = (
+            "groups" if len(self.data.groups) > 1 else "trials" if self.data.count > 1 else "pieces"
+        )
         rows = []
         for k, seconds in self.horizons():
             found = {

@@ -30,7 +30,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.validation.ahead import at_steps, missed, unseen
-from grounded.diagnosis.validation.gain import Errors, Gain
+from grounded.diagnosis.validation.gain import Comparison, Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
@@ -49,28 +49,13 @@ AS_LONG = 1.25  # whole trials up to this times as long as the repeats have thei
 ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
 
 
-MOST_LEFT_OUT = 1 / 3  # of all steps: leaving out more would make the rest extrapolate
-MOST_FOLDS = 20
-
-
-def folds(data: Data) -> Any:
-    """Return the fold of each run, (B,), which is held out together.
-
-    A fold is a trial. A trial with a large share of all steps is held out in pieces (its runs), and
-    several trials together form a fold if there are very many.
-    """
-    share = data.lengths[data.trial_of] / data.lengths.sum()
-    whole = data.trial_of * min(data.count, MOST_FOLDS) // data.count
-    return np.where(share > MOST_LEFT_OUT, data.count + np.arange(len(share)), whole)
-
-
 class Ruler:
     """Held-out errors of fitted hypotheses on one set of trials."""
 
     def __init__(self, predictor: Predictor, origin: Task | None = None) -> None:
         self.predictor, self.data, self.origin = predictor, predictor.data, origin
         data = self.data
-        self.folds = folds(data)
+        self.folds = data.folds
         self.held_out = len(np.unique(self.folds)) > 1
         longest = int(data.lengths.max())
         fast = data.dt < SLOW
@@ -83,11 +68,12 @@ class Ruler:
         count = -(-data.valid.sum(axis=1).astype(int) // self.steps[-1])
         self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # first piece of each run, and the end
         self.run_of: Any = np.repeat(np.arange(len(count)), np.diff(self.piece0))
-        self.single = len(data.used) == 1
-        # runs of one group count as one: those of a trial; in a single log, each for itself
-        self.group: Any = np.arange(len(count)) if self.single else data.trial_of
+        # the runs of a trial count as one; in a single log, each for itself
+        trial = np.unique(data.trial_of, return_inverse=True)[1]
+        self.unit: Any = (trial if trial.any() else np.arange(len(count)))[self.run_of]
         self.fine_whole = self.fine  # over whole trials
         self._measured: dict[int, tuple[Fitted, Errors]] = {}
+        self._compared: dict[tuple[int, int], Gain] = {}
 
     @cached_property
     def starts(self) -> tuple[Any, Any]:
@@ -125,6 +111,7 @@ class Ruler:
         missed, spread = np.nan_to_num(self.outset.rms), self.data.filled.std(axis=0)
         self.fine_whole = np.maximum(self.fine, SLIGHT * np.minimum(missed.max(axis=0), spread))
         self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
+        self._compared.clear()
 
     def negligible(self, fit: Fitted, channel: str) -> bool:
         """Check whether errors of a state at the furthest horizon are negligible."""
@@ -228,52 +215,16 @@ class Ruler:
 
     def compared(self, before: Errors, after: Errors) -> Gain:
         """Return the gain of one set of errors over another."""
-        a, b = (errors.total[..., self.shown] for errors in (before, after))
-        count = before.count[..., self.shown].sum(axis=1, keepdims=True)
-        seen, least = count > 0, count * self._matters()[:, None] ** 2 + 1e-300
-
-        def ratio(x: Array, y: Array) -> Array:
-            return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
-
-        def without(x: Array) -> Array:
-            return np.asarray(np.maximum(x.sum(axis=1, keepdims=True) - x, 0.0))
-
-        whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
-        counts = np.maximum(seen.sum(axis=(0, 1)), 1)
-        by = ratio(without(self.by_run(a)), without(self.by_run(b))).sum(axis=0)
-        each = by.sum(axis=-1) / max(int(seen.sum()), 1)
-        return Gain(
-            float(whole.sum() / max(int(seen.sum()), 1)),
-            float(_jackknife(each)),
-            float(whole.max()),
-            whole.sum(axis=(0, 1)) / counts,
-            _jackknife(by / counts),
-            self._pieces(before, after),
-            self.group[self.run_of],
-            self._by_group(before, after),
-            self.single,
-        )
+        known = self._compared.get((id(before), id(after)))
+        if known is None:
+            known = Comparison(self.shown, self._matters(), self.unit)(before, after)
+            self._compared[id(before), id(after)] = known
+        return known
 
     def _matters(self) -> Array:
         """Return the error below which differences are negligible, (K, n')."""
         short, whole = self.fine[self.shown], self.fine_whole[self.shown]
         return np.stack([*[short] * len(self.steps), whole])
-
-    def _pieces(self, before: Errors, after: Errors) -> Array:
-        """Return the gain of each piece (P,), damped by the mean error so that none dominates."""
-        a, b, n = (e[:-1][..., self.shown] for e in (before.total, after.total, before.count))
-        all_n = np.maximum(n.sum(axis=1, keepdims=True), 1)
-        usual = n * (b.sum(axis=1, keepdims=True) / all_n + self.fine[self.shown] ** 2) + 1e-300
-        return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
-
-    def _by_group(self, before: Errors, after: Errors) -> Array:
-        """Return the gain of each group separately, the mean over channels and horizons, (S,)."""
-        groups = [self.group == i for i in np.unique(self.group)]
-        runs = [self.by_run(e[..., self.shown]) for e in (before.total, after.total, before.count)]
-        a, b, n = (np.stack([e[:, own].sum(axis=1) for own in groups]) for e in runs)
-        least, seen = n * self._matters() ** 2 + 1e-300, n > 0
-        each = np.where(seen, 0.5 * np.log((a + least) / (b + least)), 0.0)
-        return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
 
     def by_run(self, pieces: Array) -> Array:
         """Return the sums of pieces (K, P, n) by run (K, B, n)."""
@@ -380,14 +331,6 @@ def _uneven(cells: Sequence[tuple[float, Array, Array]]) -> Array:
     spread = (weight * (each - mean) ** 2).sum(axis=0) / np.maximum(often - 1, 1)
     few = np.sqrt(spread / np.maximum(often, 1)) / np.maximum(2 * mean, 1e-300)
     return np.where((often > 1) & (mean > 0), few, 0.0)
-
-
-def _jackknife(each: Array) -> Array:
-    """Return the jackknife standard error from the means without each run, (B, ...) -> (...)."""
-    B = len(each)
-    if B < 2:
-        return np.full(each.shape[1:], np.inf)
-    return np.asarray(np.sqrt((B - 1) / B * ((each - each.mean(axis=0)) ** 2).sum(axis=0)))
 
 
 def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]:
