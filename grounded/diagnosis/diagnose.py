@@ -233,7 +233,8 @@ def diagnose(
                 leader, before = decision.leader, decision.causes
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
-                if decision.gap and leader and not left_out:
+                again = decision.gap and leader and leader not in left_out and not left_out
+                if again:
                     left_out.add(leader)
                     regrown(search, leader, most)
                 elif most < limit:
@@ -241,9 +242,8 @@ def diagnose(
                     grown(search, search.chosen(most), most)
                 else:
                     break
-                more = left_out and most == USUAL_EFFECTS
                 decision = decide(search, ruler)
-                if decision.causes == before and not more:
+                if decision.causes == before and not again:
                     break
         except KeyboardInterrupt:
             if decision is None:

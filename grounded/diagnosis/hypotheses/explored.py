@@ -51,15 +51,12 @@ class FittedHypotheses:
         self._cancelling: dict[object, bool] = {}
         self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
-        self.refused: set[str] = set()  # effects that are no cause, whatever their evidence
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
         families = [e.family.name for e in candidates]
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
     def price(self, effect: Effect, values: Mapping[str, float]) -> float:
         """Return the price of an effect at given values [nats]."""
-        if effect.name in self.refused:
-            return math.inf
         key = (effect.name, len(effect.free), *sorted(values.items()))
         if key not in self._prices:
             targets = self.crowd.get(effect.name, 1)

@@ -46,13 +46,6 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
     return found
 
 
-def drier(search: HypothesisSearch, fit: Fitted) -> None:
-    """Fit a rival without the viscous parts of its joints' frictions, and with no other effects."""
-    for h in plain_forms(search, fit.hypothesis):
-        if {*h.names} == {*fit.hypothesis.names}:
-            tune(search, search.refined([(h, fit.noise, fit.track)], TO_THE_TOP))
-
-
 def plain_friction(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Return a fit with the plain friction of its joints in place of other laws, where likelier.
 

@@ -326,7 +326,7 @@ class HypothesisSearch(FittedHypotheses):
         rest = [effect for effect in self.candidates if effect.name != name]
         joints = [effect for effect in self.joints.values() if effect.name != name]
         other = HypothesisSearch(self.data, rest, self.tick, joints)
-        other._prices, other.refused = self._prices, self.refused
+        other._prices = self._prices
         other.keep([f for f in self.fits.values() if name not in f.hypothesis.names])
         return other
 

@@ -6,7 +6,7 @@ steps:
 
     1. A set is *supported* if each of its causes is: with it the set is likelier (CLAIM nats), and
        predictions are better by more than their standard error, as much as matters (LEAST, and
-       SHARE of what the best set gains). A cause that a guard refuses is not supported.
+       SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets within WITHIN standard errors of the reference, the smallest is chosen
        (the one-standard-error rule of Breiman et al. 1984, and of projection predictive selection,
@@ -20,14 +20,14 @@ each number's curve.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.validation.gain import LEAST, Errors, Gain
 
 CLAIM = 3.0  # nats by which a cause must make a set likelier; within which two sets tie
 SCATTERS = 1.0  # standard errors by which predictions must gain by each cause
-SHARE = 0.01  # of what the best set gains, below which a cause does not matter
+SHARE = 0.01  # of what a set gains, below which a cause of it does not matter
 WITHIN = 1.0  # standard errors of the reference within which a smaller set predicts as well
 
 
@@ -52,68 +52,79 @@ class Option:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What the rule chose, the reference that it was measured by, and which sets are supported."""
+    """What the rule chose, and the reference that it was measured by."""
 
     chosen: Option
     reference: Option
-    supported: tuple[Option, ...]
     lost: float  # log gain of the reference over the chosen set
     standard_error: float
 
 
-def choose(options: Sequence[Option], gain: Callable[[Errors, Errors], Gain]) -> Choice:
-    """Choose among sets of causes.
+class Rule:
+    """The rule, applied to one set of options.
 
     Args:
         options: the fitted sets, of each at most one, with the set without any cause.
-        gain: compares the errors of two of them.
-    """
-    by_causes = {option.causes: option for option in options}
-    crude = by_causes[frozenset()]
-
-    def gained(option: Option) -> float:
-        return gain(crude.errors, option.errors).mean
-
-    most = max(map(gained, options))
-    supported = [o for o in options if not unsupported(o, by_causes, gain, SHARE * most)]
-    reference = max(supported, key=gained)
-    near = [o for o in supported if _as_good(o, reference, gain)]
-    smallest = min(len(option.causes) for option in near)
-    small = [option for option in near if len(option.causes) == smallest]
-    likeliest = max(option.evidence for option in small)
-    tied = [option for option in small if option.evidence > likeliest - CLAIM]
-    chosen = min(tied, key=lambda option: (option.order, -option.evidence))
-    apart = gain(chosen.errors, reference.errors)
-    return Choice(chosen, reference, tuple(supported), apart.mean, apart.scatter)
-
-
-def unsupported(
-    option: Option,
-    known: Mapping[frozenset[str], Option],
-    gain: Callable[[Errors, Errors], Gain],
-    least: float,
-) -> list[str]:
-    """Return the causes of a set that it does not need, or that a guard refuses.
-
-    Args:
-        option: the set.
-        known: all options by their causes.
         gain: compares the errors of two options.
-        least: mean log gain below which a cause does not matter.
+        less: returns a set without one cause, fitted if it was not; None if it can't be.
+        held_out: False if nothing could be held out; then evidence alone decides.
     """
-    found = list(option.refused)
-    for cause in sorted(option.causes - option.refused):
-        less = known.get(option.causes - {cause})
+
+    def __init__(
+        self,
+        options: Sequence[Option],
+        gain: Callable[[Errors, Errors], Gain],
+        less: Callable[[Option, str], Option | None],
+        *,
+        held_out: bool = True,
+    ) -> None:
+        self.options, self.gain, self.less, self.held_out = list(options), gain, less, held_out
+        self.crude = next(option for option in options if not option.causes)
+        self._unsupported: dict[frozenset[str], list[str]] = {}
+
+    def choose(self) -> Choice:
+        """Return the smallest supported set that predicts as well as the best one."""
+        if not self.held_out:
+            by = sorted(self.options, key=lambda option: -option.evidence)
+            likeliest = next(option for option in by if not self.unsupported(option))
+            return Choice(likeliest, likeliest, 0.0, 0.0)
+        by = sorted(self.options, key=self.gained, reverse=True)
+        reference = next(option for option in by if not self.unsupported(option))
+        near = [option for option in by if self._as_good(option, reference)]
+        for size in sorted({len(option.causes) for option in near}):
+            small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
+            if small:
+                break
+        most = max(option.evidence for option in small)
+        tied = [option for option in small if option.evidence > most - CLAIM]
+        chosen = min(tied, key=lambda option: (option.order, -option.evidence))
+        apart = self.gain(chosen.errors, reference.errors)
+        return Choice(chosen, reference, apart.mean, apart.scatter)
+
+    def gained(self, option: Option) -> float:
+        """Return the mean log gain over the set without causes."""
+        return self.gain(self.crude.errors, option.errors).mean
+
+    def unsupported(self, option: Option) -> list[str]:
+        """Return the causes of a set that it does not need, or that a guard refuses."""
+        known = self._unsupported.get(option.causes)
+        if known is None:
+            known = [c for c in sorted(option.causes) if not self._needed(option, c)]
+            self._unsupported[option.causes] = known
+        return known
+
+    def _needed(self, option: Option, cause: str) -> bool:
+        """Check whether a set is likelier and predicts better with one of its causes."""
+        if cause in option.refused:
+            return False
+        less = self.less(option, cause)
         if less is None or option.evidence - less.evidence < CLAIM:
-            found.append(cause)
-            continue
-        more = gain(less.errors, option.errors)
-        if more.mean < least or not more.pays(SCATTERS):
-            found.append(cause)
-    return found
+            return False
+        more = self.gain(less.errors, option.errors)
+        matters = more.mean >= SHARE * max(self.gained(option), 0.0)
+        return not self.held_out or (matters and more.pays(SCATTERS))
 
-
-def _as_good(option: Option, best: Option, gain: Callable[[Errors, Errors], Gain]) -> bool:
-    """Check whether a set predicts as well as the best: within standard errors, or what matters."""
-    more = gain(option.errors, best.errors)
-    return more.mean <= max(WITHIN * more.scatter, LEAST)
+    def _as_good(self, option: Option, best: Option) -> bool:
+        """Check whether a set predicts as well as the best, within its error or what matters."""
+        more = self.gain(option.errors, best.errors)
+        return more.mean <= max(WITHIN * more.scatter, LEAST)

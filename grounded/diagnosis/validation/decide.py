@@ -12,28 +12,29 @@ A guard refuses a cause whatever it gains:
                the bound decides how large the cause is
     no size    none of its values differs from zero by NO_SIZE standard deviations
     one group  it names no mechanism (`Family.loose`) and only one group of trials shows it
+    refuted    it limits a rate that the log exceeds, or that no command reaches (`no_limits`)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from grounded.diagnosis.error_report import CALIBRATION
+from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.validation.choose import CLAIM, SHARE, Choice, Option, choose, unsupported
+from grounded.diagnosis.validation.choose import CLAIM, Choice, Option, Rule
 from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
 from grounded.frozen import Array
 
-MEASURED = 8  # likeliest sets of each size, with and without free parameters, that are measured
+MEASURED = 6  # likeliest sets of each size, with and without free parameters, that are measured
 REFIT = 12  # iterations after a cause was removed
 NO_SIZE = 2.0  # standard deviations from zero below which a value is none
 LIKELY = 10.0  # nats from which an effect that is not claimed is told
@@ -59,14 +60,19 @@ class Decision:
     without: dict[str, Fitted]  # by effect, or "calibration"
     choice: Choice
     doubtful: tuple[Doubtful, ...]  # likeliest first
-    left: tuple[Leftover, ...]  # structure that the claim leaves, by channel
-    flexible: dict[str, tuple[Leftover, Errors]]  # of these, what improves predictions if corrected
-    leader: str  # the effect that predictions need most; "" without one
+    left: tuple[Leftover, ...]  # structure that the claim leaves
+    flexible: dict[str, tuple[Leftover, Errors]]  # of it, what predictions gain by, by channel
 
     @property
     def gap(self) -> bool:
-        """Whether a flexible correction predicts what the claim leaves."""
-        return bool(self.flexible)
+        """Whether the claim leaves structure that a flexible correction finds in held-out trials."""
+        return bool(self.left)
+
+    @property
+    def leader(self) -> str:
+        """The effect of the claim that is likeliest alone, from which a search begins; "": none."""
+        alone = [fit.hypothesis.names[0] for fit in self.search.of_size(1)]
+        return next((name for name in alone if name in self.fit.hypothesis.names), "")
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -92,101 +98,85 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
         ruler: measures predictions of the same data.
     """
     ruler.beside(search.exact_null())
-    fits = complete(search, hopeful(search))
-    crude = fits[frozenset()]
-    options = [_option(search, ruler, fits, own) for own in fits]
-    choice = choose(options, ruler.compared) if ruler.held_out else _by_evidence(options)
-    fit = fits[choice.chosen.causes]
-    search.settled([fit, *(fits[fit_causes(fit) - {c}] for c in causes(fit)), search.best_null()])
-    without = {c: search.latest(fits[fit_causes(fit) - {c}]) for c in causes(fit)}
-    open_ = _doubtful(search, ruler, fits, options, choice)
-    fit = search.latest(fit)
+    options = Options(search, ruler)
+    rule = Rule(options.hopeful(), ruler.compared, options.less, held_out=ruler.held_out)
+    choice = rule.choose()
+    own = choice.chosen.causes
+    fit, crude = options.fits[own], options.fits[frozenset()]
+    less = {c: options.fits[one.causes] for c in own if (one := options.less(choice.chosen, c))}
+    search.settled([fit, *less.values(), search.best_null()])
+    fit, less = search.latest(fit), {c: search.latest(less[c]) for c in causes(fit)}
     left = leftovers(search.predictor, fit)
-    leader = min(fit.hypothesis.names, key=lambda n: ruler.gain(fit, without[n]).mean, default="")
     return Decision(
-        search, fit, search.latest(crude), without, choice, open_, tuple(left),
-        corrections(ruler, fit, left), leader,
-    )  # fmt: skip
-
-
-def fit_causes(fit: Fitted) -> frozenset[str]:
-    """Return the causes of a fit as a set."""
-    return frozenset(causes(fit))
-
-
-def hopeful(search: HypothesisSearch) -> list[Fitted]:
-    """Return the likeliest sets of each size, with and without free parameters, likeliest first."""
-    best = dict[frozenset[str], Fitted]()
-    for fit in sorted(search.fits.values(), key=search.score, reverse=True):
-        if np.isfinite(search.score(fit)):
-            best.setdefault(fit_causes(fit), fit)
-    count = dict[tuple[int, bool], int]()
-    found = []
-    for fit in best.values():
-        kind = len(fit.hypothesis.names), fit.hypothesis.spread > 0
-        count[kind] = count.get(kind, 0) + 1
-        if count[kind] <= MEASURED:
-            found.append(fit)
-    return found
-
-
-def complete(search: HypothesisSearch, fits: Iterable[Fitted]) -> dict[frozenset[str], Fitted]:
-    """Return the fits by their causes, with every set that one cause less makes fitted as well.
-
-    A set is fitted from the values and the noise of the larger one; otherwise the cause that it
-    lacks would be credited with what better values of the others gain. The set that is taken is the
-    likeliest under any noise: a cause gets no credit for what the rest can do under another noise.
-    """
-    found = {frozenset[str](): search.exact_null()}
-    todo = list(fits)
-    while todo:
-        fit = todo.pop(0)
-        own = fit_causes(fit)
-        if own in found:
-            continue
-        found[own] = fit
-        for cause in own:
-            if own - {cause} not in found:
-                todo += _less(search, fit, cause)
-    return found
-
-
-def _less(search: HypothesisSearch, fit: Fitted, cause: str) -> list[Fitted]:
-    """Return the likeliest fit without one cause, fitted from that fit if its noise was not."""
-    h = fit.hypothesis
-    less = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
-    own = frozenset(less.names), less.spread > 0
-
-    def known() -> list[Fitted]:
-        return [f for f in search.fits.values() if _kind(f) == own]
-
-    if not any(f.noise.structure == fit.noise.structure for f in known()):
-        search.refined([(less, fit.noise, fit.track)], REFIT)
-    some = known()
-    return [max(some, key=search.score)] if some else []
-
-
-def _kind(fit: Fitted) -> tuple[frozenset[str], bool]:
-    return frozenset(fit.hypothesis.names), fit.hypothesis.spread > 0
-
-
-def _option(
-    search: HypothesisSearch, ruler: Ruler, fits: dict[frozenset[str], Fitted], own: frozenset[str]
-) -> Option:
-    """Return a fit as an option, with the causes that a guard refuses."""
-    fit = fits[own]
-    effects = {e.name: e for e in fit.hypothesis.effects}
-    order = sum(
-        0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
-        for e in effects.values()
+        search,
+        fit,
+        search.latest(crude),
+        less,
+        choice,
+        _doubtful(options, rule, choice),
+        tuple(left),
+        corrections(ruler, fit, left),
     )
-    refused = set(_of_no_size(search, fit))
-    for name in effects:
-        less = fits.get(own - {name})
-        cut = less is not None and not {*stopped(search, fit)} <= {*stopped(search, less)}
-        if cut or (less is not None and _one_group(search, fit, less, name)):
-            refused.add(name)
-    return Option(own, search.score(fit), ruler.errors(fit), order, frozenset(refused))
+
+
+class Options:
+    """The fitted sets of causes as options of the rule."""
+
+    def __init__(self, search: HypothesisSearch, ruler: Ruler) -> None:
+        self.search, self.ruler = search, ruler
+        self.fits: dict[frozenset[str], Fitted] = {frozenset(): search.exact_null()}
+        self._known: dict[frozenset[str], Option] = {}
+
+    def hopeful(self) -> list[Option]:
+        """Return the likeliest sets of each size, with and without free parameters."""
+        count = dict[tuple[int, bool], int]()
+        for fit in sorted(self.search.fits.values(), key=self.search.score, reverse=True):
+            own, kind = (
+                frozenset(causes(fit)),
+                (len(fit.hypothesis.names), fit.hypothesis.spread > 0),
+            )
+            if not np.isfinite(self.search.score(fit)) or own in self.fits:
+                continue
+            count[kind] = count.get(kind, 0) + 1
+            if count[kind] <= MEASURED:
+                self.fits[own] = fit
+        return [self.option(own) for own in list(self.fits)]
+
+    def option(self, own: frozenset[str]) -> Option:
+        """Return a set of causes as an option, with those that a guard refuses."""
+        if own not in self._known:
+            fit, search = self.fits[own], self.search
+            order = sum(
+                0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
+                for e in fit.hypothesis.effects
+            )
+            refused = {*_of_no_size(search, fit), *no_limits(search.data, fit.hypothesis)}
+            errors, score = self.ruler.errors(fit), search.score(fit)
+            self._known[own] = Option(own, score, errors, order, frozenset(refused))
+        return self._known[own]
+
+    def less(self, option: Option, cause: str) -> Option | None:
+        """Return a set without one cause, fitted from the values and the noise of the larger one.
+
+        Otherwise the cause would be credited with what better values of the others gain. What is
+        taken is the likeliest under any noise: a cause gets no credit for what the rest can do
+        under another noise. None if that can't be filtered, or if a guard refuses the cause.
+        """
+        own, fit, search = option.causes - {cause}, self.fits[option.causes], self.search
+        if own not in self.fits:
+            h = fit.hypothesis
+            free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
+            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not any(f.noise.structure == fit.noise.structure for f in same):
+                search.refined([(free, fit.noise, fit.track)], REFIT)
+                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not same:
+                return None
+            self.fits[own] = max(same, key=search.score)
+        less = self.fits[own]
+        cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
+        loose = cause != CALIBRATION and one_group(search, fit, less, cause)
+        return None if cut or loose else self.option(own)
 
 
 def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
@@ -205,6 +195,7 @@ def _of_no_size(search: HypothesisSearch, fit: Fitted) -> list[str]:
     at, sizes = 0, dict[str, list[int]]()
     for effect in fit.hypothesis.effects:
         own = [at + k for k, q in enumerate(effect.free) if not q.grid]
+        own = own or [at + k for k in range(len(effect.free))]
         if own and not isinstance(effect.family, ParamFamily):
             sizes[effect.name] = own
         at += len(effect.free)
@@ -215,7 +206,7 @@ def _of_no_size(search: HypothesisSearch, fit: Fitted) -> list[str]:
     return [n for n, k in sizes.items() if (np.abs(theta[k]) < NO_SIZE * std[k]).all()]
 
 
-def _one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> int:
+def one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> int:
     """Return the number of trials of the only group that shows an effect without a mechanism.
 
     0 if several groups show it, or if it names a mechanism.
@@ -235,39 +226,18 @@ def _one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -
     return len(np.unique(data.trial_of[group == most])) if alone else 0
 
 
-def _by_evidence(options: Sequence[Option]) -> Choice:
-    """Return the likeliest set of which each cause is likely, where nothing can be held out."""
-    known = {option.causes: option for option in options}
-
-    def likely(option: Option) -> bool:
-        less = [known.get(option.causes - {cause}) for cause in option.causes]
-        rest = all(o is not None and option.evidence - o.evidence > CLAIM for o in less)
-        return rest and not option.refused
-
-    supported = tuple(filter(likely, options))
-    chosen = max(supported, key=lambda option: option.evidence)
-    return Choice(chosen, chosen, supported, 0.0, 0.0)
-
-
-def _doubtful(
-    search: HypothesisSearch,
-    ruler: Ruler,
-    fits: dict[frozenset[str], Fitted],
-    options: Sequence[Option],
-    choice: Choice,
-) -> tuple[Doubtful, ...]:
+def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, ...]:
     """Return the effects that are likely beside the choice but not supported, likeliest first."""
-    found, known = dict[str, Doubtful](), {option.causes: option for option in options}
-    for option in options if ruler.held_out else ():
-        (name, *more) = option.causes - choice.chosen.causes or ("",)
+    found, own, search = list[Doubtful](), choice.chosen.causes, options.search
+    for option in rule.options if rule.held_out else ():
         nats = option.evidence - choice.chosen.evidence
-        if more or not choice.chosen.causes < option.causes or nats < LIKELY:
-            continue
-        fit = fits[option.causes]
-        if name in equations(fit) and unsupported(option, known, ruler.compared, SHARE):
-            alone = _one_group(search, fit, fits[choice.chosen.causes], name)
-            found[name] = Doubtful(name, nats, fit, alone)
-    return tuple(sorted(found.values(), key=lambda one: -one.nats))
+        if own < option.causes and len(option.causes) == len(own) + 1 and nats > LIKELY:
+            (name,) = option.causes - own
+            fit = options.fits[option.causes]
+            if name in equations(fit) and rule.unsupported(option):
+                alone = one_group(search, fit, options.fits[own], name)
+                found.append(Doubtful(name, nats, fit, alone))
+    return tuple(sorted(found, key=lambda one: -one.nats))
 
 
 def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:

@@ -100,7 +100,8 @@ class Comparison:
     def _by_unit(self, values: Array) -> Array:
         """Return sums over pieces by unit, (K, U, n') of (K, P, n)."""
         found = np.zeros((len(values), int(self.unit.max()) + 1, len(self.shown)))
-        np.add.at(found, (slice(None), self.unit), values[..., self.shown])
+        for k, one in enumerate(values[..., self.shown]):
+            np.add.at(found[k], self.unit, one)
         return found
 
     def _again(self, before: Errors, after: Errors) -> float:
