@@ -5,8 +5,10 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.effects import Library
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import Library, Scales
 
 
 def only(*names):
@@ -73,3 +75,54 @@ def test_a_play_before_a_models_own_memory_is_found(play):
     claimed = [row for row in found.ranking if row.claimed]
     assert [row.effect for row in claimed] == ["backlash:pull"] * (play > 0)
     assert all(row.values["b"] == pytest.approx(play, rel=0.1) for row in claimed)
+
+
+def flushed(late, steps=260, dt=0.5):
+    """A bath with a time constant of 40 s; warm water arrives `late` steps after its valve."""
+    model = Model(
+        {"T": "degC"},
+        {"valve": "1"},
+        {"k": Param(11.0, "degC", 5.0, 30.0), "tau": Param(40.0, "s")},
+        derivative=lambda s, a, p: {"T": (p.k * a.valve - s.T) / p.tau},
+    )
+    rng, trials = np.random.default_rng(8), []
+    for levels in ((0.2, 0.9, 0.4, 0.7), (0.8, 0.1, 0.6, 0.3)):
+        valve, T = np.repeat(levels, steps // 4), [0.0]
+        for k in range(steps):
+            arrives = valve[k - late] if k >= late else 0.0
+            T.append(12.0 * arrives + (T[-1] - 12.0 * arrives) * np.exp(-dt / 40.0))
+        noisy = np.array(T)[:, None] + 0.02 * rng.normal(size=(steps + 1, 1))
+        trials.append(logged(model, noisy, valve[:, None], dt))
+    return model, trials
+
+
+@pytest.mark.parametrize(
+    ("slowest", "duration", "longest"), [(0, 40, 0.5), (9, 40, 9), (90, 40, 10)]
+)
+def test_times_are_scanned_as_far_as_the_model_is_slow_and_the_log_is_long(
+    slowest, duration, longest
+):
+    scales = Scales(dt=0.05, duration=duration, slowest=slowest)
+    model, _ = flushed(0, 8)
+    (late,) = Library().effect("delay:valve", model, scales).quantities
+    assert 0.8 * longest <= late.grid[-1] == late.high <= longest
+    assert late.grid[0] < scales.dt and (np.diff(late.grid) > 0).all()
+
+
+@pytest.mark.slow
+def test_a_dead_time_of_many_steps_is_found():
+    model, trials = flushed(14)
+    found = diagnose(model, trials, only("delay", "first_order_lag", "rate_limit", "input_gain"))
+    claimed = [row for row in found.ranking if row.claimed]
+    assert [row.effect for row in claimed if row.effect != "input_gain:valve"] == ["delay:valve"]
+    assert claimed[0].values["d"] == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_value_at_the_end_of_its_scan_is_no_cause():
+    model, trials = flushed(3, 40)
+    data = prepare(model, trials)
+    for effect in Library().candidates(model, data.scales):
+        for q in (q for q in effect.free if q.grid and np.isfinite(q.high)):
+            values = {other.name: 0.5 * max(other.grid, default=0.1) for other in effect.free}
+            assert np.isfinite(price(Predictor(data), effect, values))
+            assert price(Predictor(data), effect, values | {q.name: q.high}) == np.inf
