@@ -57,6 +57,8 @@ STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with
 Kind = Literal["derivative", "step"]
 Integrator = Literal["rk4", "euler"]
 
+FLAT = 1e-9  # slope of a differenced function that is rounding
+
 
 def history_depths(delay: Array) -> tuple[int, ...]:
     """Past inputs kept for each input, D_j = max(1, ceil(delay_j)); delay (m,) in steps."""
@@ -246,6 +248,15 @@ class System(ABC):
     @abstractmethod
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """From x (N, n), u (N, m) to the next x (N, n)."""
+
+    def reads(self, p: Array, dt: float) -> NDArray[np.bool_]:
+        """Which states and inputs each output of the user's function depends on, (n, n + m).
+
+        Of a black box, its next states, by slopes at a few points.
+        """
+        both = np.random.default_rng(0).uniform(0.2, 1.0, (8, self.n + self.m))
+        slopes = self.linearise(both[:, : self.n], both[:, self.n :], p, dt)
+        return np.asarray(np.abs(np.concatenate(slopes, axis=2)).max(axis=0) > FLAT)
 
     @abstractmethod
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:

@@ -37,15 +37,17 @@ from grounded.effects.family import (
     Quantity,
     Site,
     beyond,
+    scanned_time,
     speed_limit,
 )
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import per_second
 
-LONGEST_DELAY = 0.5  # longest delay of a scan [s]; four steps if these are longer
+# Usual times of scans, which `scanned_time` continues.
+LONGEST_DELAY = 0.5  # longest delay [s]; four steps if these are longer
 NEARBY = (0.05, 0.15, 0.4, 0.8, 1.3, 2.0)  # scanned changes of an adopted delay, in steps
-LONGEST_LAG = 2.0  # longest time constant of a scan [s]; 40 steps if these are longer
+LONGEST_LAG = 2.0  # longest time constant [s]; 40 steps if these are longer
 NARROWEST = 0.95  # L of `input_curve` is at most this fraction of U
 ONE_SIDED = 0.05  # fraction of an input's peak below which the weaker side counts as not used
 
@@ -200,8 +202,8 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
     dt = site.scales.dt
     longest = min(max(LONGEST_DELAY, 4 * dt), site.scales.duration / 4)
     count = int(min(max(round(2 * longest / dt), 6), 14))
-    grid = tuple(float(v) for v in longest * (np.arange(1, count + 1) / count) ** 1.5)
-    return (Quantity("d", "s", grid, 0.0, longest, places=6),)
+    grid = longest * (np.arange(1, count + 1) / count) ** 1.5
+    return scanned_time(site, "d", grid, 6)
 
 
 def delay_again(effect: Effect, known: float, room: float) -> Effect:
@@ -226,11 +228,9 @@ def delay_again(effect: Effect, known: float, room: float) -> Effect:
 
 def _lag(site: Site) -> tuple[Quantity, ...]:
     dt = site.scales.dt
-    top = min(max(LONGEST_LAG, 40 * dt), site.scales.duration / 4)
-    last = max(top, dt)
+    last = max(min(max(LONGEST_LAG, 40 * dt), site.scales.duration / 4), dt)
     first = min(max(0.3 * dt, 0.005), 0.5 * last)
-    grid = tuple(float(v) for v in np.geomspace(first, last, 10))
-    return (Quantity("tau", "s", grid, 0.0, max(2 * top, last), places=6),)
+    return scanned_time(site, "tau", np.geomspace(first, last, 10), 6, 2.0)
 
 
 def _backlash(site: Site) -> tuple[Quantity, ...]:

@@ -87,6 +87,7 @@ class Scales:
         quantiles: (21,) quantiles of the absolute values of each signal, by name.
         dt: control step [s].
         duration: longest trial [s].
+        slowest: slowest time constant of the model that a trial is long enough to excite [s].
     """
 
     low: Mapping[str, float] = field(default_factory=dict)
@@ -94,6 +95,7 @@ class Scales:
     quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     dt: float = 0.05
     duration: float = 10.0
+    slowest: float = 0.0
 
     def peak(self, name: str) -> float:
         """Return the largest absolute value of a signal, 1 if it is unknown or zero."""
@@ -168,6 +170,28 @@ def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     fastest = max(spreads) / site.scales.dt
     grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * min(spreads), 12))
     return (Quantity("r", unit, grid, 0.0, np.inf, start=2 * fastest, places=6),)
+
+
+def scanned_time(
+    site: Site, name: str, grid: Array, places: float, reach: float = 1.0
+) -> tuple[Quantity, ...]:
+    """Return a time that is scanned as far as the model and the log allow.
+
+    What the model itself answers slowly may be late or slow by as much. Of more than a quarter of
+    a trial, too little is left in it.
+
+    Args:
+        site: where the effect acts.
+        name: of the quantity.
+        grid: usual values [s], ascending; continued at the ratio of the last two.
+        places: number of independent values among these.
+        reach: how far beyond its grid an estimate may lie, as a factor.
+    """
+    far, ratio = min(site.scales.slowest, site.scales.duration / 4), grid[-1] / grid[-2]
+    more = max(int(np.log(max(far / grid[-1], 1.0)) / np.log(ratio)), 0)
+    whole = (*grid.tolist(), *(grid[-1] * ratio ** np.arange(1, more + 1)).tolist())
+    places *= len(whole) / len(grid)
+    return (Quantity(name, "s", whole, 0.0, reach * whole[-1], places=places),)
 
 
 @dataclass(frozen=True)
@@ -407,4 +431,19 @@ def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: f
             low[name], high[name] = (float(q) for q in np.quantile(column, [0.002, 0.998]))
             marks = np.quantile(np.abs(column), np.linspace(0, 1, 21))
             quantiles[name] = tuple(float(q) for q in marks)
-    return Scales(low, high, quantiles, dt, duration)
+    slowest = _slowest(model, np.nan_to_num(states), np.nan_to_num(inputs), dt, duration)
+    return Scales(low, high, quantiles, dt, duration, slowest)
+
+
+def _slowest(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> float:
+    """Return the slowest time constant dt / |ln eigenvalue| within a duration, along a log."""
+    x, u = (a[np.linspace(0, len(a) - 1, SAMPLES).astype(int)] for a in (states, inputs))
+    with np.errstate(all="ignore"):
+        F = model.system.linearise(x, u, model.values, dt)[0]
+        if not np.isfinite(F).all():
+            return 0.0
+        times = dt / np.abs(np.log(np.linalg.eigvals(F).astype(complex)))
+    return float(np.median(np.where(times < duration, times, 0.0).max(axis=1)))
+
+
+SAMPLES = 8

@@ -20,21 +20,21 @@ from grounded.effects.family import (
     SensorFamily,
     SensorLagFamily,
     Site,
+    scanned_time,
 )
 
 
 def _delay(site: Site) -> tuple[Quantity, ...]:
     dt = site.scales.dt
     longest = min(max(0.3, 3 * dt), site.scales.duration / 4)
-    grid = tuple(float(v) for v in longest * (np.arange(1, 7) / 6) ** 1.5)
-    return (Quantity("d", "s", grid, 0.0, longest, places=4),)
+    return scanned_time(site, "d", longest * (np.arange(1, 7) / 6) ** 1.5, 4)
 
 
 def _lag(site: Site) -> tuple[Quantity, ...]:
     dt = site.scales.dt
     longest = min(max(0.3, 3 * dt), site.scales.duration / 4)
-    grid = tuple(float(v) for v in np.geomspace(min(0.3 * dt, 0.5 * longest), longest, 6))
-    return (Quantity("tau", "s", grid, 0.0, 2 * longest, places=4),)
+    grid = np.geomspace(min(0.3 * dt, 0.5 * longest), longest, 6)
+    return scanned_time(site, "tau", grid, 4, 2.0)
 
 
 def lagging(behind: Any, moved: Any, tau: Any, dt: Any) -> Any:

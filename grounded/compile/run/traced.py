@@ -13,6 +13,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.compile.problem import STAGES, Integrator
 from grounded.compile.run.interpreted import Interpreted
@@ -56,6 +57,10 @@ class TracedSystem(Interpreted):
             raise GroundedError(f"{found}; with these parameters only; use np.where")
         self._variants.append(Variant(found, self.sizes))
         return self._variants[-1]
+
+    def reads(self, p: Array, dt: float) -> NDArray[np.bool_]:
+        """See `System.reads`; by the graph."""
+        return self.variant(p, dt).reads
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The graph at N samples."""

@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
@@ -181,6 +184,13 @@ class Variant:
         column = {v: c for c, v in enumerate(variables)}
         rows = jacobian(self.trace.graph, self.trace.outputs, variables)
         return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
+
+    @property
+    def reads(self) -> NDArray[np.bool_]:
+        """Which of x and u each output depends on, (r, n + m)."""
+        graph, outputs = self.trace.graph, self.trace.outputs
+        leaves = np.array(self._variables(self.sizes[0] + self.sizes[1]))
+        return np.array([np.isin(leaves, graph.live([output])) for output in outputs])
 
     def operations(self) -> int:
         """Nodes of the values and of their derivatives by state and input."""

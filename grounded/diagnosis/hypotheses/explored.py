@@ -184,7 +184,9 @@ def price(
         return _of_change(effect, values, data.steps)
     if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * data.dt:
         return math.inf
-    if any(abs(values.get(q.name, 0.0)) > q.absurd for q in effect.free):
+    # a scanned value at its upper end: the data ask for more than was scanned
+    each = ((q, values.get(q.name, 0.0)) for q in effect.free)
+    if any(abs(v) > q.absurd or (q.grid and v >= q.high) for q, v in each):
         return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague

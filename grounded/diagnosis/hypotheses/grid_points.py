@@ -10,9 +10,7 @@ import numpy as np
 from grounded.effects import Effect
 from grounded.frozen import Array
 
-NEAR = 3.0  # nats below the best gain within which another grid point is tried too,
-NEARLY = 0.7  # or fraction of the best gain, whichever is lower
-MOST_OTHERS = 2
+MOST_OTHERS = 2  # places beside the best from which a fit starts
 FAINT = 0.05  # least way from a weaker grid point, so that a fit has a slope to start from
 
 
@@ -31,27 +29,21 @@ def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:
 def elsewhere(
     effect: Effect, looks: list[tuple[float, dict[str, float]]]
 ) -> tuple[dict[str, float], ...]:
-    """Return further grid points that gain nearly as much and are not neighbours of each other."""
-    best = looks[0][0]
-    enough = min(best - NEAR, NEARLY * best)
-    taken = [looks[0][1]]
-    for gain, values in looks[1:]:
-        if gain < enough or len(taken) > MOST_OTHERS:
-            break
-        if all(apart(effect, values, other) for other in taken):
-            taken.append(values)
-    return tuple(taken[1:])
+    """Return the best of the other local maxima of the gain over the grid, given best first.
 
-
-def apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> bool:
-    """Check that two grid points are not neighbours."""
-    for q in effect.free:
-        if q.grid:
-            grid = np.sort(np.array(q.grid))
-            i, j = (int(np.argmin(np.abs(grid - v[q.name]))) for v in (one, other))
-            if abs(i - j) > 1:
-                return True
-    return False
+    A change is linear only near the fit that is scanned, so the best grid point need not lead to
+    the best fit. A local maximum has no grid point beside it that gains more.
+    """
+    grids = {q.name: np.sort(np.array(q.grid)) for q in effect.free if q.grid}
+    at = np.array(
+        [[np.argmin(np.abs(grid - v[n])) for n, grid in grids.items()] for _, v in looks], int
+    )
+    found = [
+        values
+        for k, (gain, values) in enumerate(looks)
+        if gain > 0 and (np.abs(at[:k] - at[k]).max(axis=1, initial=0) > 1).all()
+    ]
+    return tuple(found[1 : 1 + MOST_OTHERS])
 
 
 def between(

@@ -229,8 +229,10 @@ class _Context(SentOnce):
             h = self.fit.hypothesis.plus(effect, values)
             acts = isinstance(effect.family, InputFamily | MemoryFamily)
             received = predictor.inputs(h) if acts else self.u
-            after = predictor.advance(h, self.x, received, data.time)
+            start = self.predictor.remembered(h, self.fit.track)[:-1]
+            after = predictor.advance(h, start, received, data.time)
             d = data.model.difference(after, base) / amount
+            d[..., data.exact] = 0.0
             found.append(_Column(i, point, name, d, _EMPTY))
         return found
 

@@ -122,7 +122,7 @@ class HypothesisSearch(FittedHypotheses):
 
     def fresh(self, h: Hypothesis) -> Start:
         """Return a start from the log as the track, with the noise of the residuals about it."""
-        data, track = self.data, self.data.y.copy()
+        data, track = self.data, self.predictor.remembered(h, self.data.y.copy())
         predicted = self.predictor.next(h, track[:-1])
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.likelihood.groups import Group, Signals, folds
+from grounded.diagnosis.likelihood.memories import memories, recalled
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Scales, scales_of
 from grounded.errors import GroundedError, NextCommand
@@ -56,6 +57,7 @@ class Data:
     skipped: int  # runs left out because there are too many
     ids: tuple[str, ...]
     hidden: tuple[int, ...] = ()  # states without a sensor: only their start is known
+    exact: tuple[int, ...] = ()  # those of them that the commands alone determine (`memories`)
     filters: Mapping[int, float] = field(default_factory=dict)  # sensor time constants [s] by state
     between: frozenset[str] = frozenset()  # sensors shifted in time by a fraction of a sample
     interpolated_s: float = 0.0  # as std of times: states were interpolated
@@ -133,7 +135,7 @@ class Data:
         if self.hidden:
             begins = np.isin(self.state_at, np.cumsum([0, *(self.lengths + 1)]))
             there[..., list(self.hidden)] &= begins[..., None]
-            there[..., list(self.behind)] = False
+            there[..., [*self.behind, *self.exact]] = False
         run = np.concatenate([np.ones((len(self.valid), 1)), self.valid], axis=1)
         return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
 
@@ -189,7 +191,8 @@ def prepare(
             after the last finite state are dropped; gaps in single states stay (as missing).
         latency: transport delay of the inputs [s] that is already modelled (m,).
         past: the input held before t = 0 in trials that do not record it (m,).
-        hidden: names of states without a sensor (the memory of adopted effects). Their start is
+        hidden: names of states without a sensor (the memory of adopted effects; exact memories of
+            the model's own are found). Their start is
             taken as known; their later values in the trials are only the initial track of the fit.
             True values behind a delayed log are not known at all. Their track starts from the log,
             because a model that carried them on from the start of a long trial drifts, and
@@ -218,6 +221,12 @@ def prepare(
         commands[i, T:] = trial.inputs[T - 1]
         held[i] = before if trial.start_inputs is None else trial.start_inputs
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
+    never = np.flatnonzero(~np.isfinite(states).any(axis=0))
+    if exact := memories(model, never, dt):
+        path = recalled(model, exact, commands, model.values, dt)
+        states[:, list(exact)] = np.concatenate(
+            [own[: T + 1] for own, T in zip(path, lengths, strict=True)]
+        )
     behind = true_values(model.state_names, hidden)
     states[:, list(behind)] = states[:, list(behind.values())]
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
@@ -246,7 +255,8 @@ def prepare(
         scales=scales_of(model, states, steps, dt, float(lengths.max() * dt)),
         skipped=len(step_at) - len(keep),
         ids=tuple(trial.id for trial, _ in used),
-        hidden=tuple(model.state_names.index(name) for name in hidden),
+        hidden=(*(model.state_names.index(name) for name in hidden), *exact),
+        exact=exact,
         groups=tuple(_signals(model, used, hidden).groups()),
     )
 

@@ -123,8 +123,10 @@ def linearise(
             other, moved = _nudged(h, theta, j, size)
             if moved == 0:
                 continue
-            nudged = near.advance(other, x, near.inputs(other), data.time)
+            start = predictor.remembered(other, track)[:-1]
+            nudged = near.advance(other, start, near.inputs(other), data.time)
             by_d = model.difference(nudged, base) / moved
+            by_d[..., data.exact] = 0.0  # they start where the nudged commands have led
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
             by_r = (shown - other_shown + offset - shifted) / moved

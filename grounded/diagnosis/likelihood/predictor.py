@@ -39,6 +39,7 @@ from grounded.diagnosis.likelihood.hypothesis import (
     rates_of,
 )
 from grounded.diagnosis.likelihood.marching import March
+from grounded.diagnosis.likelihood.memories import recalled
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
@@ -155,10 +156,29 @@ class Predictor(SentOnce):
         acting = self.acting(h)
         return self._kept("begun", acting, lambda: memories_moved(acting, self.data))
 
-    def _kept(self, what: str, acting: Acting, make: Callable[[], Array]) -> Array:
-        """Return the cached result for the same effects and values, or make it."""
+    def remembered(self, h: Hypothesis, track: Array) -> Array:
+        """Return a track (L + 1, B, n) with exact memories of the inputs that h makes received."""
+        data, p = self.data, self.params(h)
+        if not data.exact:
+            return track
+
+        def make() -> Array:
+            path = recalled(data.model, data.exact, self.received(h), p, data.dt)
+            whole = zip(path, data.lengths, strict=True)
+            flat = np.concatenate([own[: T + 1] for own, T in whole])
+            return np.asarray(flat[data.state_at.T])
+
+        found = track.copy()
+        found[..., data.exact] = self._kept("memories", self.acting(h), make, p.tobytes())
+        return found
+
+    def _kept(
+        self, what: str, acting: Acting, make: Callable[[], Array], beside: bytes = b""
+    ) -> Array:
+        """Return the cached result for the same effects and values (and `beside`), or make it."""
         found = self._inputs.setdefault(what, {})
-        key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
+        key: Any = (beside,)
+        key += tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
         if (one := found.get(key)) is None:
             one = make()
             if len(found) > max(64, MOST_KEPT // max(one.size, 1)):

@@ -224,6 +224,8 @@ def _iterate(
     (L, _), n, runs = data.time.shape, data.model.n, B * len(works)
     d, r = np.zeros((L, runs, n, width)), np.zeros((L + 1, runs, n, width))
     own = [slice(i * B, (i + 1) * B) for i in range(len(works))]
+    for work in works:
+        work.track = predictor.remembered(work.h, work.track)
     F = [
         linearise(work.along or predictor, work.h, work.track, (d[:, i], r[:, i]))[0]
         for work, i in zip(works, own, strict=True)
@@ -318,6 +320,7 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
             return fit
+        work.track = predictor.remembered(work.h, work.track)
         F, d, r = linearise(predictor, work.h, work.track)
         try:
             g = gains_of(predictor, work.h, work.noise, work.track, F)

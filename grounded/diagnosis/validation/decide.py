@@ -65,7 +65,7 @@ class Decision:
 
     @property
     def gap(self) -> bool:
-        """Whether the claim leaves structure that a flexible correction finds in held-out trials."""
+        """Whether the claim leaves structure that a flexible correction predicts."""
         return bool(self.left)
 
     @property

@@ -41,11 +41,13 @@ def test_a_limit_between_two_grid_values_is_found():
     assert found == {"c": pytest.approx(weak + 0.4 * (strong - weak))}
 
 
-def test_other_places_are_kept_where_they_are_no_neighbours():
+def test_fits_start_from_every_local_maximum_of_the_scan():
     effect = Library().effect("delay:throttle", car)
+    gains = [3.0, 1.0, 90.0, 100.0, 95.0, 2.0, 4.0, 5.0, 1.0, -2.0, -1.0]
     grid = sorted(effect.free[0].grid)
-    looks = [(100.0, {"d": grid[3]}), (99.0, {"d": grid[4]}), (80.0, {"d": grid[7]})]
-    assert elsewhere(effect, [*looks, (10.0, {"d": grid[0]})]) == ({"d": grid[7]},)
+    looks = [(gain, {"d": d}) for gain, d in zip(gains, grid, strict=False)]
+    found = elsewhere(effect, sorted(looks, key=lambda look: -look[0]))
+    assert found == ({"d": grid[7]}, {"d": grid[0]})
 
 
 def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():

@@ -1,0 +1,128 @@
+"""What is searched, and how far, follows from the model and the log."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.hypotheses.explored import price
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import Library, Scales
+
+
+def only(*names):
+    """Options of a diagnosis by a few families."""
+    library = Library()
+    return DiagnosisOptions(library=Library(tuple(library.family(name) for name in names)))
+
+
+def logged(model, states, inputs, dt):
+    """A trial of a model, with its names."""
+    return Trial(np.array(states), np.array(inputs), dt, model.state_names, model.input_names)
+
+
+def slide(s, a, p, dt):
+    """The force of a slide that is dragged past a spring; `was` is where its handle was."""
+    return {"f": p.k * np.tanh((a.pull - s.was) / 2e-3), "was": a.pull}
+
+
+def branching(s, a, p, dt):
+    """The same, of a function that can't be traced."""
+    return slide(s, a, p, dt) if a.pull < 1e9 else {"f": 0.0, "was": 0.0}
+
+
+def dragged(step, play, count=160, dt=0.04):
+    """Two logs of the slide, whose handle has some play; where it was is in none of them."""
+    k = Param(30.0, "N", std=3.0)
+    model = Model({"f": "N", "was": "m"}, {"pull": "m"}, {"k": k}, step=step)
+    rng, trials = np.random.default_rng(2), []
+    for size, rate in ((0.09, 2.1), (0.14, 1.4)):
+        pull, at = size * np.sin(rate * np.arange(count) * dt), [0.0]
+        for now in pull:
+            at.append(min(max(at[-1], now - play / 2), now + play / 2))
+        force = np.r_[0.0, 30.0 * np.tanh(np.diff(at) / 2e-3)] + 0.4 * rng.normal(size=count + 1)
+        states = np.c_[force, np.full(count + 1, np.nan)]
+        trials.append(logged(model, states, pull[:, None], dt))
+    return model, trials
+
+
+@pytest.mark.parametrize("step", [slide, branching])
+def test_a_state_that_the_commands_alone_determine_is_an_exact_memory(step):
+    model, trials = dragged(step, 0.0, 20)
+    data = prepare(model, trials)
+    assert data.exact == data.hidden == (1,)
+    np.testing.assert_allclose(data.states[1:21, 1], trials[0].inputs[:, 0])
+
+
+def test_what_is_measured_or_reads_it_or_moves_is_no_exact_memory():
+    def servo(s, a, p):
+        return {"q": s.w, "w": 4 * a.u - s.w, "d": 9 * (a.u - s.d), "e": s.q - s.e}
+
+    model = Model({"q": "rad", "w": "rad/s", "d": "1", "e": "rad"}, {"u": "1"}, derivative=servo)
+    x = np.random.default_rng(0).normal(size=(41, 4))
+    x[:, 1:] = np.nan
+    assert prepare(model, [logged(model, x, np.ones((40, 1)), 0.1)]).exact == (2,)
+    x[3, 2] = 0.1
+    assert prepare(model, [logged(model, x, np.ones((40, 1)), 0.1)]).exact == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("play", [0.0, 0.021])
+def test_a_play_before_a_models_own_memory_is_found(play):
+    model, trials = dragged(slide, play)
+    found = diagnose(model, trials, only("backlash", "dead_zone", "input_gain", "parameter"))
+    claimed = [row for row in found.ranking if row.claimed]
+    assert [row.effect for row in claimed] == ["backlash:pull"] * (play > 0)
+    assert all(row.values["b"] == pytest.approx(play, rel=0.1) for row in claimed)
+
+
+def flushed(late, steps=260, dt=0.5):
+    """A bath with a time constant of 40 s; warm water arrives `late` steps after its valve."""
+    model = Model(
+        {"T": "degC"},
+        {"valve": "1"},
+        {"k": Param(11.0, "degC", 5.0, 30.0), "tau": Param(40.0, "s")},
+        derivative=lambda s, a, p: {"T": (p.k * a.valve - s.T) / p.tau},
+    )
+    rng, trials = np.random.default_rng(8), []
+    for levels in ((0.2, 0.9, 0.4, 0.7), (0.8, 0.1, 0.6, 0.3)):
+        valve, T = np.repeat(levels, steps // 4), [0.0]
+        for k in range(steps):
+            arrives = valve[k - late] if k >= late else 0.0
+            T.append(12.0 * arrives + (T[-1] - 12.0 * arrives) * np.exp(-dt / 40.0))
+        noisy = np.array(T)[:, None] + 0.02 * rng.normal(size=(steps + 1, 1))
+        trials.append(logged(model, noisy, valve[:, None], dt))
+    return model, trials
+
+
+@pytest.mark.parametrize(
+    ("slowest", "duration", "longest"), [(0, 40, 0.5), (9, 40, 9), (90, 40, 10)]
+)
+def test_times_are_scanned_as_far_as_the_model_is_slow_and_the_log_is_long(
+    slowest, duration, longest
+):
+    scales = Scales(dt=0.05, duration=duration, slowest=slowest)
+    model, _ = flushed(0, 8)
+    (late,) = Library().effect("delay:valve", model, scales).quantities
+    assert 0.8 * longest <= late.grid[-1] == late.high <= longest
+    assert late.grid[0] < scales.dt and (np.diff(late.grid) > 0).all()
+
+
+@pytest.mark.slow
+def test_a_dead_time_of_many_steps_is_found():
+    model, trials = flushed(14)
+    found = diagnose(model, trials, only("delay", "first_order_lag", "rate_limit", "input_gain"))
+    claimed = [row for row in found.ranking if row.claimed]
+    assert [row.effect for row in claimed if row.effect != "input_gain:valve"] == ["delay:valve"]
+    assert claimed[0].values["d"] == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_value_at_the_end_of_its_scan_is_no_cause():
+    model, trials = flushed(3, 40)
+    data = prepare(model, trials)
+    for effect in Library().candidates(model, data.scales):
+        for q in (q for q in effect.free if q.grid and np.isfinite(q.high)):
+            values = {other.name: 0.5 * max(other.grid, default=0.1) for other in effect.free}
+            assert np.isfinite(price(Predictor(data), effect, values))
+            assert price(Predictor(data), effect, values | {q.name: q.high}) == np.inf
