@@ -35,6 +35,7 @@ MOST_NUMBERS = 1.2e6  # size of one (L, B, N, N) array above which only informat
 SIMULATED = 800  # total steps kept for a simulator, since each is evaluated thousands of times
 SESSION, ROOMY = 16, 2.5  # runs of a session at the robot, all kept up to ROOMY times that size
 UNKNOWN = 10  # samples of a run until a state is known that no sensor shows
+SHOWN = 3  # samples at the start of a log that show which input was held before it
 BEGINNINGS = 8  # most runs kept only because a trial begins with them
 
 
@@ -190,7 +191,8 @@ def prepare(
         trials: at least one with two finite steps. Samples after the first gap in the inputs or
             after the last finite state are dropped; gaps in single states stay (as missing).
         latency: transport delay of the inputs [s] that is already modelled (m,).
-        past: the input held before t = 0 in trials that do not record it (m,).
+        past: the input held before t = 0 in trials that do not record it (m,); None: none, or the
+            first command, whichever the first samples fit.
         hidden: names of states without a sensor (the memory of adopted effects; exact memories of
             the model's own are found). Their start is
             taken as known; their later values in the trials are only the initial track of the fit.
@@ -215,11 +217,11 @@ def prepare(
     lengths = np.array([T for _, T in used])
     commands = np.empty((len(used), int(lengths.max()), m))
     held = np.zeros((len(used), m))
-    before = np.zeros(m) if past is None else past
     for i, (trial, T) in enumerate(used):
         commands[i, :T] = trial.inputs[:T]
         commands[i, T:] = trial.inputs[T - 1]
-        held[i] = before if trial.start_inputs is None else trial.start_inputs
+        before = past if trial.start_inputs is None else trial.start_inputs
+        held[i] = _before(model, trial, T) if before is None else before
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
     never = np.flatnonzero(~np.isfinite(states).any(axis=0))
     if exact := memories(model, never, dt):
@@ -273,6 +275,26 @@ def _signals(model: Model, used: Sequence[tuple[Trial, int]], hidden: Sequence[s
     ]
     shown = [model.state_names[i] for i in which]
     return Signals([*shown, *model.input_names], each, [trial.group for trial, _ in used])
+
+
+def _before(model: Model, trial: Trial, steps: int) -> Array:
+    """Return the input that was probably held before a log began that does not tell it, (m,).
+
+    Either none, and the first command was a step, or the first command itself, as in a log that
+    begins in the middle of a motion: whichever the first samples fit better.
+    """
+    first = slice(0, min(SHOWN, steps))
+    x = _filled(trial.states[: first.stop + 1])
+    held = np.stack([np.zeros(model.m), trial.inputs[0]])
+    after = [
+        model.system.step(x[:-1], np.tile(u, (first.stop, 1)), model.values, trial.dt) for u in held
+    ]
+    off = [
+        model.difference(one, x[1:]) / (np.std(trial.states[:steps], axis=0) + 1e-12)
+        for one in after
+    ]
+    size = [float(np.nansum(one**2)) for one in off]
+    return held[int(size[1] <= size[0])]
 
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:
