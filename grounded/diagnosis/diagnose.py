@@ -230,7 +230,7 @@ def diagnose(
             tick("predict")
             decision, left_out = decide(search, ruler), set[str]()
             while decision.gap or options.max_effects:
-                leader, before = decision.leader, decision.causes
+                leader, before = decision.leader, decision.fit
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
                 again = decision.gap and leader and leader not in left_out and not left_out
@@ -243,7 +243,7 @@ def diagnose(
                 else:
                     break
                 decision = decide(search, ruler)
-                if decision.causes == before and not again:
+                if not again and not ruler.gain(before, decision.fit).clear:
                     break
         except KeyboardInterrupt:
             if decision is None:
