@@ -125,6 +125,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     known = {**constants, **params}
     words = {name: quantity(e) for name, e in known.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
+    words |= {"has": "has", "es": "es"} if len(targets) == 1 else {"has": "have", "es": ""}
     centre = [name for name in places.position(model) if f"{name}0" in known]  # of a patch
     words["place"] = listed(f"{name} = {words[f'{name}0']}" for name in centre)
     clear = "L" in known and known["L"].value > 0

@@ -113,7 +113,7 @@ def _end_to_end(name: str, value: float) -> float:
 input_bias = InputFamily(
     name="input_bias",
     equation="u_eff = u + b",
-    sentence="{target} has an offset of {b}",
+    sentence="{target} {has} an offset of {b}",
     targets=places.inputs,
     quantities=lambda site: (Quantity("b", site.unit(site.target)),),
     lookalikes=("offset", "input_fade", "dead_zone"),
@@ -147,7 +147,7 @@ dead_zone = InputFamily(
 stall = InputFamily(
     name="stall",
     equation="u_eff = u where |u| > c, 0 elsewhere",
-    sentence="{target} does nothing below {c}",
+    sentence="{target} do{es} nothing below {c}",
     targets=places.inputs,
     quantities=_threshold,
     lookalikes=("dead_zone", "stiction"),
@@ -157,7 +157,7 @@ stall = InputFamily(
 saturation = InputFamily(
     name="saturation",
     equation="u_eff = clip(u, -c, c)",
-    sentence="{target} saturates at {c}",
+    sentence="{target} saturate{s} at {c}",
     targets=places.inputs,
     quantities=_limit,
     lookalikes=("rate_limit", "slew_limit", "input_gain", "quadratic_drag"),
@@ -357,7 +357,7 @@ rate_limit = MemoryFamily(
 backlash = MemoryFamily(
     name="backlash",
     equation="u_eff+ = clip(u_eff, u - b/2, u + b/2)",
-    sentence="{target} has a play of {b}",
+    sentence="{target} {has} a play of {b}",
     targets=places.inputs,
     quantities=_backlash,
     lookalikes=("dead_zone", "delay", "first_order_lag"),

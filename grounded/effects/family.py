@@ -201,11 +201,11 @@ class Family:
     Args:
         name: such as `dead_zone`.
         equation: one line of maths for docs and messages.
-        sentence: its meaning in plain words. {target} and quantities are filled in. {s} is a
-            verb's ending, {g%} a percentage, {g%stronger|weaker} a percentage with its direction.
-            {k>by|less, by} chooses words by the sign of a quantity, whose absolute value is then
-            shown. Text in [] is left out if a quantity {b} in it is a constant or zero; of parts
-            separated by &, at least one is shown.
+        sentence: its meaning in plain words. {target} and quantities are filled in. {s}, {es}
+            and {has} agree with its number, {g%} is a percentage, {g%stronger|weaker} one with its
+            direction. {k>by|less, by} chooses words by the sign of a quantity, whose absolute value
+            is then shown. Text in [] is left out if a quantity {b} in it is a constant or zero; of
+            parts separated by &, at least one is shown.
         targets: all targets of a model to which it can apply; several signals are joined by "+".
         quantities: the numbers to estimate at a site.
         lookalikes: families that may explain the same data.

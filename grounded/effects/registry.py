@@ -168,12 +168,12 @@ class Library:
 
 
 def _part_of(family: Family, target: str, known: Iterable[str]) -> bool:
-    """Check whether a target is several of the inputs, in their order, that a known one joins."""
+    """Check whether a target is several of the inputs that the family takes, in their order."""
     if not isinstance(family, InputFamily | MemoryFamily):
         return False
     parts = target.split("+")
-    joint = ([name for name in one.split("+") if name in parts] for one in known)
-    return len(parts) > 1 and parts in list(joint)
+    each = dict.fromkeys(name for one in known for name in one.split("+"))
+    return len(parts) > 1 and parts == [name for name in each if name in parts]
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:

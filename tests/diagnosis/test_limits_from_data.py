@@ -1,5 +1,7 @@
 """What is searched, and how far, follows from the model and the log."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,8 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, Scales
+from grounded.diagnosis.validation.limits import knowable
+from grounded.effects import InputFamily, Library, MemoryFamily, Scales
 
 
 def only(*names):
@@ -126,3 +129,58 @@ def test_a_value_at_the_end_of_its_scan_is_no_cause():
             values = {other.name: 0.5 * max(other.grid, default=0.1) for other in effect.free}
             assert np.isfinite(price(Predictor(data), effect, values))
             assert price(Predictor(data), effect, values | {q.name: q.high}) == np.inf
+
+
+def cart(right, turns):
+    """Logs of a cart of two wheels under proportional commands, each of which acts 0.3 too far."""
+    model = Model(
+        {"v": "m/s", "w": "rad/s"},
+        {"a": "1", "b": "1"},
+        {"k": Param(2.0, "1/s", std=0.02)},
+        derivative=lambda s, u, p: {
+            "v": p.k * (u.a + u.b - s.v),
+            "w": p.k * (turns * (u.a - u.b) - s.w),
+        },
+    )
+    rng, trials = np.random.default_rng(3), []
+    for _ in range(2):
+        u = np.repeat(rng.uniform(-1, 1, 8), 10)[:, None] * [1.0, right]
+        x = [np.zeros(2)]
+        for now in u:
+            x.append(model.system.step(x[-1][None], now[None] + 0.3, model.values, 0.1)[0])
+        trials.append(logged(model, np.array(x) + 4e-3 * rng.normal(size=(81, 2)), u, 0.1))
+    return model, trials
+
+
+@pytest.mark.parametrize(
+    ("right", "turns", "single"), [(1.0, 0.0, False), (0.4, 0.0, False), (1.0, 3.0, True)]
+)
+def test_of_inputs_that_no_trial_tells_apart_only_all_together_are_blamed(right, turns, single):
+    """Wheels that also turn the cart are told apart by that, whatever they are sent."""
+    model, trials = cart(right, turns)
+    data, library = prepare(model, trials), Library()
+    offered = knowable(data, library.candidates(model, data.scales))
+    acting = [e for e in offered if isinstance(e.family, InputFamily | MemoryFamily)]
+    of_all = {e.family.name for e in acting if e.site.targets == ("a", "b")}
+    assert len(acting) == len({e.name for e in acting})
+    assert of_all == {e.family.name for e in acting}
+    assert any(len(e.site.targets) == 1 for e in acting) == single
+    for effect in acting:
+        assert library.effect(effect.name, model, data.scales).site.targets == effect.site.targets
+
+
+def test_inputs_that_are_sent_apart_are_blamed_alone():
+    model, trials = cart(1.0, 0.0)
+    other = np.outer(np.arange(80) == 5, [0.0, 0.1])
+    data = prepare(model, [replace(trial, inputs=trial.inputs + other) for trial in trials])
+    offered = {e.name for e in knowable(data, Library().candidates(model, data.scales))}
+    assert {"input_bias:a", "input_bias:b", "input_gain:a+b"} <= offered
+    assert "input_bias:a+b" not in offered
+
+
+@pytest.mark.slow
+def test_an_offset_of_all_copies_is_found():
+    model, trials = cart(1.0, 0.0)
+    found = diagnose(model, trials, only("input_bias", "input_gain", "dead_zone", "offset"))
+    (row,) = (row for row in found.ranking if row.claimed)
+    assert row.effect == "input_bias:a+b" and row.values["b"] == pytest.approx(0.3, rel=0.05)

@@ -150,3 +150,22 @@ def test_adopted_lags_begin_where_the_commands_before_left_them(seed):
     trial = Trial(x, sent, dt, model.state_names, model.input_names)
     (acts,) = how_inputs_act(model, trial, range(2))
     assert acts.sign == 1 and acts.share == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("drag", [0.7, 0.9])
+def test_what_acts_by_more_than_a_reversed_motor_could_is_not_reversed(drag):
+    """A fan is driven in proportion to a drag that the model lacks, and would explain it."""
+    sled = Model(
+        {"x": "m", "v": "m/s"},
+        {"motor": "1", "fan": "1"},
+        derivative=lambda s, a, p: {"x": s.v, "v": 8.0 * (a.motor + a.fan)},
+    )
+    rng, v, states, inputs = np.random.default_rng(1), 0.0, [[0.0, 0.0]], []
+    for k in range(600):
+        inputs.append([np.sin(0.05 * k) + 0.6 * np.sin(0.13 * k), 0.02 * v * abs(v)])
+        rate = 8.0 * sum(inputs[-1]) - drag * v * abs(v)
+        states.append([states[-1][0] + 0.02 * v, v := v + 0.02 * rate])
+    noisy = np.array(states) + [1e-4, 1e-3] * rng.standard_normal((601, 2))
+    trial = Trial(noisy, np.array(inputs), 0.02, sled.state_names, sled.input_names)
+    motor, fan = how_inputs_act(sled, trial, range(2))
+    assert motor.sign == 1 and fan.sign == 0 and not fan.share > -2.5

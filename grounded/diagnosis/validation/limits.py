@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from grounded.effects.sensed import moved_model
 from grounded.frozen import Array
 from grounded.instruments.finding import Finding
 from grounded.model import Model, Param
-from grounded.places import integrals, told_by
+from grounded.places import LITTLE, integrals, told_by
 from grounded.result import listed
 from grounded.trial import Trial
 
@@ -44,6 +45,7 @@ DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by
 PART = 0.2  # namely on those that contribute at least this part of its variance
 FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
 ROUNDING = 1e-9  # of a channel's largest value: smaller differences are rounding, not noise
+SAMPLES = 20  # of the slopes by which inputs are compared
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 
@@ -219,14 +221,16 @@ def knowable(
     """Return the effects that these data could show.
 
     An effect of several inputs is that of those which move: a delay of all commands shows in two of
-    four joints while the others stand still.
+    four joints while the others stand still. An effect of an input is that of all its copies, too.
 
     Args:
         data: the trials.
         effects: all candidates.
         whole: names of effects that the model has already, which stay as they are.
     """
-    effects = _of_moving(data, effects, whole)
+    alike = copies(data)
+    effects = _of_moving(data, effects, whole, alike)
+    same = {name for name, group in alike.same.items() if len(group) > 1}
     still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     memory = {data.model.state_names[i] for i in data.hidden}
@@ -241,6 +245,8 @@ def knowable(
         lost = still - targets if effect.name in whole and not targets <= still else still
         if isinstance(family, InputFamily | MemoryFamily | RateFamily) and targets & lost:
             continue
+        if isinstance(family, RateFamily) and targets & same:
+            continue  # one of several copies: none of them can be blamed
         if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
             continue
         if isinstance(family, RateFamily | LossFamily | MediumFamily) and targets & unmoved:
@@ -255,21 +261,67 @@ def knowable(
     return tuple(kept)
 
 
-def _of_moving(data: Data, effects: Sequence[Effect], whole: Collection[str]) -> list[Effect]:
-    """Replace effects of several inputs by those of the inputs that move, if these are several."""
+@dataclass(frozen=True)
+class Copies:
+    """Which inputs have the same commands up to a factor, {input: all of them, itself included}.
+
+    `sent`: in all trials. `same`: those of them that also move all states alike, so that no trial
+    tells whose effect it is.
+    """
+
+    sent: Mapping[str, tuple[str, ...]]
+    same: Mapping[str, tuple[str, ...]]
+
+
+def copies(data: Data) -> Copies:
+    """Return the inputs that are copies of each other, constant ones excluded."""
+    model, still = data.model, set(constant_inputs(data))
+    sent = np.concatenate([data.commands[i, :T] for i, T in enumerate(data.lengths)])
+    like = same = _proportional(sent, ROUNDING)
+    if like.sum() > model.m:
+        x, u = data.y[:-1].reshape(-1, model.n), data.runs(data.commands).reshape(-1, model.m)
+        at = np.linspace(0, len(x) - 1, SAMPLES).astype(int)
+        with np.errstate(all="ignore"):
+            slopes = model.system.linearise(x[at], u[at], model.values, data.dt)[1]
+        same = like & _proportional(slopes.reshape(-1, model.m), LITTLE)
+
+    def groups(like: Any) -> dict[str, tuple[str, ...]]:
+        names = {name: j for j, name in enumerate(model.input_names) if name not in still}
+        return {one: tuple(n for n in names if like[names[one], names[n]]) for one in names}
+
+    return Copies(groups(like), groups(same))
+
+
+def _proportional(columns: Array, off: float) -> Any:
+    """Return which columns (N, m) are multiples of each other, (m, m), `off` relative to them."""
+    peak = columns[np.abs(columns).argmax(axis=0), np.arange(columns.shape[1])]
+    unit = columns / np.where(peak == 0, 1.0, peak)
+    away = (np.abs(unit[:, :, None] + sign * unit[:, None]).max(axis=0) for sign in (-1, 1))
+    return (np.minimum(*away) <= off) | np.eye(columns.shape[1], dtype=bool)
+
+
+def _of_moving(
+    data: Data, effects: Sequence[Effect], whole: Collection[str], alike: Copies
+) -> list[Effect]:
+    """Replace effects of inputs by those of the inputs that move and of all of their copies."""
     still, on_off = set(constant_inputs(data)), switches(data)
-    named, found = {effect.name for effect in effects}, []
+    named, found = set[str](), list[Effect]()
     for effect in effects:
         site, family = effect.site, effect.family
         lost = still | on_off if isinstance(family, InputFamily) else still
         shown = tuple(name for name in site.targets if name not in lost)
-        inputs = isinstance(family, InputFamily | MemoryFamily)
-        if inputs and 1 < len(shown) < len(site.targets) and effect.name not in whole:
-            effect = family.at(replace(site, targets=shown))
-            if effect.name in named:
-                continue
-            named.add(effect.name)
-        found.append(effect)
+        if not isinstance(family, InputFamily | MemoryFamily) or effect.name in whole:
+            found.append(effect)
+            continue
+        targets = shown if len(shown) > 1 else site.targets
+        # of those that no trial tells apart, and of all that are sent the same
+        for groups in (alike.same, alike.sent):
+            joined = {name for one in targets for name in groups.get(one, (one,))}
+            several = tuple(name for name in data.model.input_names if name in joined)
+            name = replace(effect, site=replace(site, targets=several)).name
+            if name not in named:
+                named.add(name)
+                found.append(family.at(replace(site, targets=several)))
     return found
 
 

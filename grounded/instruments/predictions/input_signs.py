@@ -4,9 +4,13 @@ How strongly an input acts is fitted to predictions a quarter of a second ahead 
 everything linear in the states is removed from them. Friction, springs and the feedback itself are
 linear, and would make a right input seem to act the wrong way round. Only predictions count in
 which the effect of an input is nearly linear in it: an arm that whirls ends anywhere, and with the
-commands of one sign the prediction may diverge and with the other not. A model may be crude, but
-its signs are right in most cases: if trials contradict each other, the fewer are wrong, and of
-equally many those that contradict the model.
+commands of one sign the prediction may diverge and with the other not.
+
+A model may be crude, but its signs are right in most cases: if trials contradict each other, the
+fewer are wrong, and of equally many those that contradict the model. A reversed motor does about -1
+times what is modelled. An input that hardly moves by itself explains what the model lacks, by any
+factor and with any significance. So a sign counts by its size, and only of an input that moves on
+its own: by more than follows linearly from the states.
 
 Feedback through late or lagging commands makes a robot swing. A swing is all but linear in the
 states, up to harmonics, and a third harmonic is turned round by a delay of a sixth of the period:
@@ -33,6 +37,7 @@ STARTS = 120  # samples to predict from
 # standard errors from 0 from which on an input acts the other way round, or as in the model
 SURE, USUAL = 6.0, 3.0
 SHOWN = 0.2  # least share of its modelled effect from which on an input shows its sign
+STRONGER = 2.0  # largest share of one the other way round: a crude model's gain is within a factor
 DELAYS, LONGEST = 13, 0.3  # number of delays tried from 0 to the longest [s]
 AS_WELL = 0.5  # [nats] by which a fit with the other sign must be worse
 BETTER = 0.1  # [nats] by which a fit in which an input does nothing must be better
@@ -79,7 +84,7 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
     with np.errstate(all="ignore"):
         prompt = Acting(ahead, 0)
         fit = prompt.strengths(prompt.even)
-        found = tuple(map(_acts, fit.factors, fit.errors)) if fit else (UNKNOWN,) * model.m
+        found = _each(fit) if fit else (UNKNOWN,) * model.m
         if any(one.sign < 0 for one in found):
             fits = _by_longest_delay(ahead, prompt)
             found = tuple(_agreed(fits, i) for i in range(model.m))
@@ -96,7 +101,7 @@ def act_on_each(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, t
     with np.errstate(all="ignore"):
         prompt = Acting(ahead, 0)
         fits = {i: prompt.strengths(prompt.even, k) for k, i in enumerate(ahead.shown)}
-    return {i: tuple(map(_acts, fit.factors, fit.errors)) for i, fit in fits.items() if fit}
+    return {i: _each(fit) for i, fit in fits.items() if fit}
 
 
 def _ahead_of(model: Model, trial: Trial, shown: Sequence[int]) -> Ahead | None:
@@ -109,8 +114,13 @@ def _ahead_of(model: Model, trial: Trial, shown: Sequence[int]) -> Ahead | None:
     return ahead if ahead.enough else None
 
 
-def _acts(share: float, error: float) -> Acts:
-    wrong = share < min(-SHOWN, -SURE * error)
+def _each(fit: Strengths) -> tuple[Acts, ...]:
+    return tuple(_acts(fit, i) for i in range(len(fit.factors)))
+
+
+def _acts(fit: Strengths, i: int) -> Acts:
+    share, error = float(fit.factors[i]), float(fit.errors[i])
+    wrong = -STRONGER - error < share < min(-SHOWN, -SURE * error) and fit.own[i] > SHOWN
     return Acts(-1 if wrong else int(share > max(SHOWN, USUAL * error)), share, error)
 
 
@@ -132,7 +142,7 @@ def _by_longest_delay(ahead: Ahead, prompt: Acting) -> list[list[Strengths]]:
 
 def _agreed(found: list[list[Strengths]], i: int) -> Acts:
     """Return how input i acts, with sign 0 unless all longest delays that show one agree on it."""
-    best = [_acts(fits[0].factors[i], fits[0].errors[i]) for fits in found if fits]
+    best = [_acts(fits[0], i) for fits in found if fits]
     sure = [one for one in best if one.sign]
     doubtful = not found[-1] or any(_contested(fits, i) for fits in found)
     if doubtful or len({one.sign for one in sure}) > 1:
@@ -148,8 +158,8 @@ def _contested(fits: list[Strengths], i: int) -> bool:
     """
     if not fits:
         return False
-    if not _acts(fits[0].factors[i], fits[0].errors[i]).sign:
-        known = [f for f in fits[1:] if _acts(f.factors[i], f.errors[i]).sign]
+    if not _acts(fits[0], i).sign:
+        known = [f for f in fits[1:] if _acts(f, i).sign]
         return bool(known) and known[0].score > fits[0].score + BETTER
     near = [fit.factors[i] for fit in fits if fit.score < fits[0].score + AS_WELL]
     return any(factor * near[0] < 0 for factor in near)
@@ -212,11 +222,13 @@ class Strengths:
             it.
         errors: their standard errors (m,).
         score: sum of the logarithms of the errors that are left [nats].
+        own: the part of what they do that does not follow the states linearly (m,).
     """
 
     factors: Array
     errors: Array
     score: float
+    own: Array
 
 
 class Acting:
@@ -253,11 +265,13 @@ class Acting:
         counts = np.ones(self.off.shape[1]) if only is None else np.eye(self.off.shape[1])[only]
         off, by = self.off[rows] * counts, self.by[rows] * counts[:, None]
         off = off - linear @ (linear.T @ off)
+        size, varies = size_of(off), by - by.mean(axis=0)
         by = by - np.einsum("nc,cki->nki", linear, np.einsum("nc,nki->cki", linear, by))
-        size = size_of(off)
+        whole, left = (np.einsum("nki,k->i", a**2, size**-2.0) for a in (varies, by))
+        own = np.sqrt(left / np.maximum(whole, 1e-300))
         acts = np.asarray((np.sqrt((by**2).mean(axis=0)) > self.ahead.least[:, None]).any(axis=0))
         if not acts.any():
-            return Strengths(found, error, float(np.log(size).sum()))
+            return Strengths(found, error, float(np.log(size).sum()), own)
         by = by[:, :, acts]
         for _ in range(ROUNDS):
             slopes = by / size[:, None]
@@ -268,7 +282,7 @@ class Acting:
         pulls = _in_blocks(np.einsum("nki,nk->ni", slopes, left / size))
         found[acts] = 1.0 + change
         error[acts] = np.sqrt(np.diag(inverse @ (pulls.T @ pulls) @ inverse))
-        return Strengths(found, error, float(np.log(size).sum()))
+        return Strengths(found, error, float(np.log(size).sum()), own)
 
 
 def _in_blocks(each: Array) -> Array:
