@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.validation.decide import LIKELY
 
 from grounded import Model, Param, Reward, Task, Trial
 from grounded.diagnosis.cause_words import meaning
@@ -17,8 +18,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
-from grounded.diagnosis.validation.own_numbers import SURE
-from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
@@ -87,7 +87,7 @@ def calibrated(trials):
     noise = NoiseModel(Structure(), logs - 4, logs, logs.copy(), np.full(2, -60.0))
     h = replace(Hypothesis(), shift=np.zeros(data.model.system.k), spread=1.0)
     fit = refine(predictor, [(h, noise, data.y.copy())], iterations=30, fixed_noise=True)[0]
-    _, half = standard_deviations(predictor, fit, folds(data))
+    _, half = standard_deviations(predictor, fit, data.folds)
     scale = model.params["gain"].spread
     fisher = float(np.sqrt(fit.covariance[0, 0])) * scale
     return 1.0 + float(fit.hypothesis.shift[0]), half[0] * scale, fisher
@@ -166,7 +166,7 @@ def test_an_adopted_delay_is_made_longer_or_shorter(adopted):
     assert predictor.received(h) == pytest.approx(whole.received(Hypothesis()))
     assert min(effect.free[0].grid) < 0 < max(effect.free[0].grid)
     search = HypothesisSearch(data, [effect])
-    assert search.price(effect, {"d": change}) < SURE  # a tenth of a step is no matter of stamps
+    assert search.price(effect, {"d": change}) < LIKELY  # a tenth of a step is no matter of stamps
     search.nulls()
     search.extended(search.exact_null(), 1)
     (best,) = search.of_size(1)

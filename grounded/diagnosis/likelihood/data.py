@@ -294,7 +294,7 @@ def _before(model: Model, trial: Trial, steps: int) -> Array:
         for one in after
     ]
     size = [float(np.nansum(one**2)) for one in off]
-    return held[int(size[1] <= size[0])]
+    return np.asarray(held[int(size[1] <= size[0])])
 
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:

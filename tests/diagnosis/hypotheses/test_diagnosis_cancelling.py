@@ -1,13 +1,10 @@
 """Effects that cancel explain nothing, however likely they make the data."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.cause_words import meaning
-from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -132,22 +129,3 @@ def pushed():
     trial = Trial(np.array(states), F[:, None], dt, model.state_names, model.input_names)
     data = prepare(model, [trial])
     return FittedHypotheses(data, Library().candidates(model, data.scales))
-
-
-@pytest.mark.parametrize(
-    ("values", "shift", "undone"),
-    [
-        ({"input_gain:F": {"g": 0.2}}, [0.4, 0.0], ["input_gain:F"]),
-        ({"input_gain:F": {"g": 0.2}, "parameter:m": {"d": 0.4}}, None, ["input_gain:F"]),
-        ({"viscous_friction:v": {"k": 0.25}}, [0.0, -0.5], ["viscous_friction:v"]),
-        ({"viscous_friction:v": {"k": 0.25}}, [0.4, 0.0], []),
-        ({"input_gain:F": {"g": 0.2}}, [-0.4, 0.0], []),  # both the same way
-        ({"input_gain:F": {"g": 0.2}}, [0.1, 0.0], []),  # most of it stays
-        ({"input_gain:F": {"g": 0.2}}, None, []),
-    ],
-)
-def test_what_a_parameter_undoes_is_no_second_cause(pushed, values, shift, undone):
-    h = of(pushed, values)
-    if shift is not None:
-        h = replace(h, shift=np.array(shift), spread=1.0)
-    assert counterparts(pushed.predictor, h) == undone

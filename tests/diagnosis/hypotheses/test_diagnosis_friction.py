@@ -1,7 +1,6 @@
 """The dry friction of a motor's joint: one cause, at its plainest, beside a gain and a lag."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.swaps import swapped
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation import decide
 from grounded.effects import Library
 from grounded.effects.joint import has_viscous
 
@@ -138,46 +136,6 @@ def test_a_friction_that_does_not_hold_keeps_its_name():
     fit = fitted(greased, (coulomb.tuned("width", 0.4), {"c": 5.2, "width": 0.4}))
     assert holding(greased, fit) is fit
     assert not any(JOINT in names for _, _, names in greased.fits)
-
-
-@pytest.mark.parametrize(
-    ("nats", "better", "claimed"),
-    [
-        (48.0, False, "plain"),  # a motor's: likelier by 48 nats, and yet called a tie only
-        (-2.0, False, "plain"),
-        (48.0, True, "loaded"),  # predictions refuse it
-        (-9.0, False, "loaded"),
-    ],
-)
-def test_of_two_frictions_that_tie_the_plain_one_is_claimed(monkeypatch, nats, better, claimed):
-    """Predictions with the load-dependent one were better by 3 %, which separates no two causes."""
-    gain = SimpleNamespace(beyond=lambda *bar: better)
-    ruler = SimpleNamespace(held_out=True, gain=lambda *fits: gain)
-    search = SimpleNamespace(score={"plain": nats, "loaded": 0.0}.get)
-    monkeypatch.setattr(decide, "plainer", lambda s, f: ["plain"] if f == "loaded" else [])
-    monkeypatch.setattr(decide, "_pays", lambda *given: True)
-    assert decide._plainest(search, "loaded", ruler, white=False) == claimed
-
-
-@pytest.mark.parametrize("pays", [True, False])
-def test_a_richer_friction_that_predictions_refused_is_not_named_as_likelier(monkeypatch, pays):
-    """A ball's beam: 16 % of the load with the right gain, 12 nats ahead of a gain 15 % off."""
-
-    def fit(*names):
-        return SimpleNamespace(hypothesis=SimpleNamespace(names=names, spread=0.1, effects=()))
-
-    plain, loaded, other = fit("x", "plain"), fit("x", "loaded"), fit("x", "drag")
-    nats = {id(plain): 0.0, id(loaded): 12.0, id(other): 5.0}
-    search = SimpleNamespace(
-        score=lambda f: nats[id(f)], of_size=lambda count: [loaded, other, plain]
-    )
-    gain = SimpleNamespace(beyond=lambda *bar: False)
-    ruler = SimpleNamespace(held_out=True, gain=lambda *fits: gain)
-    monkeypatch.setattr(decide, "plainer", lambda s, f: [plain] if f is loaded else [])
-    monkeypatch.setattr(decide, "_pays", lambda *given: pays)
-    monkeypatch.setattr(decide, "set_by_bound", lambda *given: False)
-    named = decide._likelier(search, plain, ruler, white=False)
-    assert named is (loaded if pays else other)  # what differs otherwise is still found
 
 
 def test_what_a_swap_gives_gets_constants_of_its_own(search):

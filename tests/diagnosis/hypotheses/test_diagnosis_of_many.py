@@ -1,16 +1,10 @@
 """Five causes at once: more effects are looked for where the first three leave a gap."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.attribution import attribute, promised
-from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.validation.own_numbers import SURE
-from grounded.diagnosis.writer import Writer
 from grounded.effects import Library
 
 DT = 0.02
@@ -64,55 +58,3 @@ def test_more_than_three_effects_are_looked_for_where_three_leave_more_than_nois
     two, stages = Library(tuple(map(library.family, ("delay", "dead_zone")))), list[str]()
     few = diagnose(SLED, driven(2), DiagnosisOptions(library=two), progress=stages.append)
     assert len(few.verdict.effects) <= 2 and not any("more effects" in one for one in stages)
-
-
-@pytest.mark.slow
-def test_no_effect_is_named_that_predictions_gain_next_to_nothing_by(monkeypatch):
-    """A noise-free car's circle: a patch of the ground worth 0.2 % was the sixth cause."""
-    monkeypatch.setattr(Writer, "unfinished", True)
-    library = Library(
-        tuple(map(Library().family, ("delay", "dead_zone", "input_bias", "coupling")))
-    )
-    stages, trials = list[str](), driven(bias=0.0, damping=0.0, drag=0.002)
-    options = DiagnosisOptions(library=library)
-    found = diagnose(SLED, trials, options, progress=stages.append)
-    assert {"delay:u", "dead_zone:u"} <= set(found.effects)
-    assert all(one.share > 0.01 for one in found.credit)
-    assert sum("more effects" in one for one in stages) == 1 and not found.verdict.look_for
-
-
-def test_evidence_tells_what_one_effect_more_promises():
-    names = ("delay", "dead_zone", "viscous_friction")
-    library = Library(tuple(map(Library().family, names)))
-    data = prepare(SLED, driven(2, steps=120, bias=0.0, damping=0.0, drag=0.0))
-    candidates = library.candidates(SLED, data.scales)
-    found = {}
-    for most in (1, 2):
-        search, best = attribute(data, candidates, max_effects=most)
-        known = dict(search.fits)
-        with np.errstate(all="ignore"):
-            found[most] = promised(search, best)
-        assert len(best.hypothesis.names) == most and search.fits == known
-    assert found[1] > SURE > found[2]
-
-
-@pytest.mark.parametrize(
-    ("source", "nats", "more"),
-    [("short horizon", 60.0, True), ("short horizon", 5.0, False), ("repeats", 60.0, False)],
-)
-def test_evidence_is_asked_where_the_noise_floor_is_a_bound_only(monkeypatch, source, nats, more):
-    """A ball's camera was 50 ms late, 119 nats: nothing stood above a floor that held the delay."""
-    monkeypatch.setattr("grounded.diagnosis.writer.promised", lambda search, fit: nats)
-    writer = SimpleNamespace(
-        known=SimpleNamespace(no_cause=False),
-        claims=SimpleNamespace(names=("a", "b", "c")),
-        measured=SimpleNamespace(remainders=tuple, source=source),
-        most=3,
-        search=SimpleNamespace(
-            chosen=lambda most: SimpleNamespace(hypothesis=SimpleNamespace(names=("a", "b", "c")))
-        ),
-        best=None,
-    )
-    assert Writer.unfinished.fget(writer) is more
-    writer.most = 4  # fewer were claimed than were looked for: evidence was heard
-    assert Writer.unfinished.fget(writer) is False

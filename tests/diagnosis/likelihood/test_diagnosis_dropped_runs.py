@@ -12,7 +12,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.held_out import utility_prediction
-from grounded.diagnosis.validation.ruler import Ruler, _uneven, folds, repeated
+from grounded.diagnosis.validation.ruler import Ruler, _uneven, repeated
 from small_tasks import DT, pushed_cart, pushed_cart_task
 
 STEPS = 450  # three runs of 150 steps
@@ -141,22 +141,6 @@ def test_repeats_are_found_by_candidate_or_by_their_commands(known):
     assert repeated(trials, predictor.data, len(trials)) == [[0, 2], [1, 3]]
     named = [replace(t, candidate="c0001" if k in (0, 1) else "") for k, t in enumerate(trials)]
     assert [0, 1] in [group[:2] for group in repeated(named, predictor.data, len(trials))]
-
-
-def test_a_trial_that_holds_most_is_left_out_piece_by_piece(known):
-    predictor, _, trials = known
-    alike, longer = (
-        predictor.data,
-        [
-            trials[0],
-            replace(trials[1], states=trials[1].states[:101], inputs=trials[1].inputs[:100]),
-        ],
-    )
-    assert list(folds(alike)) == list(alike.trial_of)  # four trials, a quarter each
-    data = prepare(alike.model, longer)
-    one = folds(data)
-    assert len(set(one[data.trial_of == 0])) == (data.trial_of == 0).sum()
-    assert set(one[data.trial_of == 1]) == {1}
 
 
 def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):

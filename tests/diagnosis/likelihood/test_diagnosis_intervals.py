@@ -19,7 +19,6 @@ from grounded.diagnosis.likelihood.intervals import (
 )
 from grounded.diagnosis.validation.blame import moved_parameters
 from grounded.diagnosis.validation.limits import counted_once
-from grounded.diagnosis.validation.ruler import folds
 from grounded.effects import Library
 from grounded.models.car import model as car
 
@@ -66,7 +65,7 @@ def test_correlated_innovations_hold_less_information():
     search = HypothesisSearch(prepare(drift, trials), ())
     search.nulls()
     fit = next(f for (_, spread, _), f in search.fits.items() if spread > 0)
-    of = search.predictor, fit, folds(search.data)
+    of = search.predictor, fit, search.data.folds
     (whole, _), (less, _) = (standard_deviations(*of, worth) for worth in (1.0, 1e-6))
     assert less[0] == pytest.approx(fit.hypothesis.spread, rel=0.01) and less[0] > whole[0]
 

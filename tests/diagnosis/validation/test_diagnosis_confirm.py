@@ -2,7 +2,6 @@
 
 from copy import copy
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,21 +11,18 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.report import Diagnosis, Ranked, Unconfirmed, Verdict
 from grounded.diagnosis.unconfirmed import marked, unconfirmed
-from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.credit import losses, shares
-from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide
+from grounded.diagnosis.validation.decide import Decision, causes, decide
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
-from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 from grounded.experiments.pendulum import model as real_pendulum
 from grounded.experiments.pendulum import pendulum_task
-from grounded.filter.tempering import Tempering
 from grounded.models.pendulum import model as crude_pendulum
 from grounded.plant import Plant
 from grounded_trials.report.diagnosis_words import in_vain
@@ -154,48 +150,6 @@ def test_without_a_claim_the_diagnosed_model_is_the_crude_one(wavy, monkeypatch)
     assert found.search is search  # all that was fitted is ranked
 
 
-def test_without_a_calibration_effects_are_weighed_against_effects_without_one(wavy, ruler):
-    search, best = copy(wavy[0]), wavy[1]
-    search.fits = dict(search.fits)
-    claimed = next(
-        f for f in search.of_size(2) if set(f.hypothesis.names) <= {*best.hypothesis.names}
-    )
-    h = replace(claimed.hypothesis, shift=None, spread=0.0)
-    plain = search.refined([(h, claimed.noise, claimed.track)], 12)[0]
-    for size in (1, 2):  # likelier by far, by the help of parameters that the claim leaves alone
-        for f in search.of_size(size):
-            free = replace(f, evidence=f.evidence + 300.0)
-            free = replace(free, hypothesis=replace(f.hypothesis, spread=0.1, shift=np.zeros(1)))
-            search.fits[f.noise.structure, 0.1, tuple(sorted(f.hypothesis.names))] = free
-    known = limits(search.data)
-    decision = Decision(search, search, plain, search.exact_null(), {})
-    claims = Claims(decision, dict.fromkeys(h.names, 0.5), known, ruler)
-    assert min(claims.parts().values()) > 0
-    assert all(f.hypothesis.spread == 0 for n in h.names for _, f in claims.rivals(n))
-
-
-def test_noise_that_absorbs_an_effect_is_no_evidence_against_it(wavy, ruler):
-    """Strangers read claims of -57 nats, tied with effects that predictions had refused."""
-    search, best = copy(wavy[0]), wavy[1]
-    search.fits = dict(search.fits)
-    h = replace(best.hypothesis, shift=None, spread=0.0)
-    claimed = search.refined([(h, best.noise, best.track)], 12)[0]
-    search.refined([(h.minus(n), best.noise, best.track) for n in h.names], 12)
-    other = Structure(0.1 if claimed.noise.structure.tau != 0.1 else 0.3)
-    for f in [f for f in search.of_size(len(h.names) - 1) if not f.hypothesis.spread]:
-        noise = replace(f.noise, structure=other)
-        likelier = replace(f, noise=noise, evidence=claimed.evidence + 300.0)
-        search.fits[other, 0.0, tuple(sorted(f.hypothesis.names))] = likelier
-    decision = Decision(search, search, claimed, search.exact_null(), {})
-    claims = Claims(decision, dict.fromkeys(h.names, 0.5), limits(search.data), ruler)
-    assert min(claims.parts().values()) > 3
-    rival = replace(claimed, evidence=claimed.evidence + 100.0)
-    for refused in (True, False):
-        gain = SimpleNamespace(beyond=lambda *bar, by=refused: by)
-        claims.ruler = SimpleNamespace(held_out=True, gain=lambda a, b, found=gain: found)
-        assert claims._ties(h.names[0], "slope:v", rival) is not refused
-
-
 def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
     """A blind case: a drag of 6.5 nats was named, an input's curve of 7.3 with them was not."""
     search = copy(wavy[0])
@@ -227,82 +181,15 @@ def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
     assert not rivals(1.0, beside=worth + 100)  # it is another cause, not another name of this one
 
 
-def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
-    search, _ = wavy
-    alone = Said(lambda c: 1.0)
-    singles = [f for f in search.of_size(1) if f.hypothesis.spread == 0][:4]
-    likelier = _likelier(search, singles[-1], alone, white=False)
-    assert likelier is not None and likelier.hypothesis.spread == 0
-    assert search.score(likelier) > search.score(singles[-1])
-    assert likelier.hypothesis.names != singles[-1].hypothesis.names
-    assert _likelier(search, likelier, alone, white=False) is None
-
-
-def test_of_stand_ins_that_predict_alike_the_likelier_is_named(wavy):
-    """Understeer was named, 79 nats, though 5 ms more of an adopted delay had 350."""
-    search = copy(wavy[0])
-    search.fits = dict(search.fits)
-    (first, other) = (
-        replace(f, hypothesis=replace(f.hypothesis, spread=0.1, shift=np.zeros(1)))
-        for f in search.of_size(1)[:2]
-    )
-    other = replace(other, evidence=first.evidence + 100.0)
-    for f in (first, other):
-        key = f.noise.structure, 0.1, tuple(sorted(f.hypothesis.names))
-        search.fits = {k: v for k, v in search.fits.items() if k[2] != key[2]} | {key: f}
-    alike, worse = (
-        Said(lambda c: 1.0),
-        Said(lambda c: 0.5 if {*c} >= {*first.hypothesis.names} else 1.0),
-    )
-    assert _likelier(search, first, alike, white=False) is other
-    assert _likelier(search, first, worse, white=False) is None
-    assert _likelier(search, other, alike, white=False) is None
-
-
-def test_noise_can_not_hide_what_predicts_far_better(wavy):
-    """The likeliest claims nothing; under another noise there is one that predicts."""
-    search, _ = wavy
-    null = search.best_null()
-    found = decide(search, null, Said(lambda c: 0.1 if c else 1.0), 3)
-    assert found.causes and found.fit is not null
-    for little in (0.95, 0.8):  # what noise explains alone must be far worse explained by it
-        assert not decide(search, null, Said(lambda c, r=little: r if c else 1.0), 3).causes
-
-
 @pytest.mark.slow
 def test_one_long_log_is_held_out_by_pieces():
     model, trials = axis(WAVE, trials=1, steps=300)
     data = prepare(model, trials, np.zeros(1))
-    assert len(np.unique(folds(data))) == 5
+    assert len(np.unique(data.folds)) == 5
     found = diagnose(model, trials)
     assert found.prediction_error[0].held_out == "pieces" and found.effects
     short = diagnose(model, [trials[0].until(60)])
     assert short.no_cause and short.prediction_error[0].held_out == "no"
-
-
-def test_an_effect_of_one_channel_pays_there():
-    noisy = {"mean": 0.015, "scatter": 0.014, "largest": 0.3}
-    clear = Gain(**noisy, channels=np.array([0.09, -0.05]), scatters=np.array([0.025, 0.055]))
-    assert clear.pays(2.0, 0.01) and not clear.beyond(2.0, 0.01) and not clear.pays(3.0, 0.01)
-    vague = Gain(**noisy, channels=np.array([0.06, -0.03]), scatters=np.array([0.025, 0.055]))
-    assert not vague.pays(2.0, 0.01)
-    worse = Gain(-0.01, 0.014, 0.3, clear.channels, clear.scatters)
-    assert not worse.pays(1.0, 0.01)
-
-
-def test_what_two_of_eight_trials_show_is_seen_again():
-    """Its scatter over trials is that of how much each shows, and says nothing of noise."""
-    trial, visited = np.repeat(np.arange(8), 10), np.zeros(80)
-    visited[[2, 3, 4, 5, 6]], visited[[52, 53, 54, 55, 56]] = 1.0, 0.2
-
-    def shown(pieces):
-        noise = 0.01 * np.random.default_rng(1).standard_normal(80)
-        no_channel = np.zeros(1)
-        return Gain(0.1, 0.07, 0.3, no_channel, no_channel + 1, pieces + noise, trial)
-
-    assert not shown(visited).beyond(2.0, 0.01) and shown(visited).pays(2.0, 0.01)
-    once = np.where(trial == 0, visited, 0.0)
-    assert not shown(once).pays(2.0, 0.01) and not shown(0 * visited).pays(2.0, 0.01)
 
 
 def pushed_hard_once(seed=0):
@@ -380,19 +267,6 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     assert Unconfirmed.from_json(one.to_json()) == one
 
 
-def test_trials_that_each_gain_outweigh_one_that_rules_the_sums():
-    def gain(own):
-        return Gain(0.2, 0.25, 0.5, np.zeros(2), np.ones(2), own=np.array(own))
-
-    assert gain([0.3, 0.2, 0.4, 0.3, 0.2]).pays(2.0, 0.01)
-    assert not gain([1.5, 0.0, -0.1, 0.1, 0.0]).pays(2.0, 0.01)
-    assert gain([0.3]).chance == gain([0.0, 0.0, 0.0]).chance == 1.0
-    assert gain([0.0, -0.2, 0.0, 0.7]).alone == 3
-    for own in ([0.0, 0.3, 0.0, 0.7], [0.0, 0.0, 0.0, 0.05], [0.0, 0.0, 0.7], [0.0]):
-        assert gain(own).alone is None
-    assert replace(gain([0.0, -0.8, 0.0, 0.7]), mean=-0.1).alone is None
-
-
 @pytest.mark.slow
 def test_what_is_left_without_the_only_effect_is_the_calibrated_model():
     task, trials = pendulum_task(crude_pendulum), []
@@ -406,39 +280,6 @@ def test_what_is_left_without_the_only_effect_is_the_calibrated_model():
     assert set(without) == {"coulomb_friction:omega", "calibration"}
     row = [r for r in found.prediction_error if not r.whole_trial][-1]
     assert dict(without["coulomb_friction:omega"]) == pytest.approx(dict(row.calibrated))
-
-
-@pytest.mark.slow
-def test_a_further_effect_beyond_doubt_need_only_gain_where_noise_is_white(rare, monkeypatch):
-    """Half a scatter is enough: all trials show the friction, and white noise is what is left."""
-    search, best = rare
-    both = {"viscous_friction:v", "saturation:u"}
-
-    def gains(more, scatters, first=0.5):
-        rest = np.exp(-0.02 * scatters)
-        return Said(lambda c: (first if both - {more} <= set(c) else 1.0) * rest ** (more in c))
-
-    assert set(decide(search, best, gains("viscous_friction:v", 0.8), 3).causes) == both
-    assert set(decide(search, best, gains("viscous_friction:v", -0.8), 3).causes) == both - {
-        "viscous_friction:v"
-    }
-    once = decide(search, best, gains("saturation:u", 0.8), 3)  # of one trial
-    assert once.causes == ("viscous_friction:v",)
-    monkeypatch.setattr(search, "tempering", Tempering(0.5))
-    less = decide(search, best, gains("viscous_friction:v", 0.8), 3)
-    assert less.causes == ("saturation:u",)
-
-
-@pytest.mark.slow
-def test_a_sole_effect_of_few_nats_has_to_gain_twice_its_scatter(rare, monkeypatch):
-    """A gain of 3 % is 1.5 scatters here; that so small a one is not claimed is another rule."""
-    search, _ = rare
-    monkeypatch.setattr(decide_module, "SEEN", 0.0)
-    alone = next(f for f in search.of_size(1) if f.hypothesis.names == ("viscous_friction:v",))
-    some = Said(lambda c: np.exp(-0.03) if "viscous_friction:v" in c else 1.0)
-    assert decide(search, alone, some, 1).causes == ("viscous_friction:v",)
-    monkeypatch.setattr(decide_module, "SURE", np.inf)
-    assert not decide(search, alone, some, 1).causes
 
 
 def slid(trials, rate, low=-1.0, steps=240):
