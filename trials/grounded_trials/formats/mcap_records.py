@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded_trials.formats.budget import room
-
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
@@ -202,12 +200,15 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 }
 
 
-def chunk_content(content: bytes | memoryview, limit: int) -> tuple[bytes, bool]:
+def chunk_content(
+    content: bytes | memoryview, limit: int, *, packed: bool = True
+) -> tuple[bytes, bool]:
     """Return the decompressed records of a chunk, and whether it has a checksum.
 
     Args:
         content: of the chunk record.
         limit: largest size when decompressed [bytes].
+        packed: whether it may be compressed.
 
     Raises:
         BadRecord: for a wrong checksum, and see `decompress`.
@@ -220,8 +221,10 @@ def chunk_content(content: bytes | memoryview, limit: int) -> tuple[bytes, bool]
         raise BadRecord("it is too short for its contents") from None
     if start + stored > len(content):
         raise BadRecord("it is too short for its contents")
-    packed = bytes(content[start : start + stored])
-    data = decompress(name.decode("utf-8", "replace"), packed, size, limit)
+    if name and not packed:
+        raise BadRecord("it is compressed, which grounded's own files never are")
+    stored_bytes = bytes(content[start : start + stored])
+    data = decompress(name.decode("utf-8", "replace"), stored_bytes, size, limit)
     if crc and zlib.crc32(data) != crc:
         raise BadRecord("its checksum does not match its content")
     return data, bool(crc)
@@ -246,7 +249,6 @@ def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
     if compression == "":
         content, error = data, None
     else:
-        room(2 * size)
         content, error = _expand(compression, data, size + 1, whole=True)
     if error is not None:
         raise BadRecord(f"it can't be decompressed ({error})")
@@ -273,7 +275,6 @@ def _expand(
         for part in pieces(data, limit, whole) if pieces else (data,) * (compression == ""):
             parts.append(part)
             size += len(part)
-            room(2 * size)
             if size >= limit:
                 break
     except (RuntimeError, EOFError, ValueError, MemoryError) as error:

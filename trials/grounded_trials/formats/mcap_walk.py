@@ -24,7 +24,6 @@ from typing import BinaryIO
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -71,7 +70,7 @@ class DamagedFile(GroundedError):
 
 
 def read_records(
-    source: BinaryIO | bytes, name: str, *, limit: int = RECORD_LIMIT
+    source: BinaryIO | bytes, name: str, *, limit: int = RECORD_LIMIT, packed: bool = True
 ) -> Iterator[Record]:
     """Yield the records of an MCAP stream in order, ending with `End`.
 
@@ -79,17 +78,20 @@ def read_records(
         source: a seekable binary file, read from its beginning, or the bytes of one.
         name: of the file, for messages.
         limit: largest record, and largest chunk when decompressed [bytes].
+        packed: whether chunks may be compressed; if not, reading takes time and memory in
+            proportion to the size of the file.
 
     Raises:
         DamagedFile: if it is not a complete, undamaged MCAP file.
     """
-    yield from _Walk(source, name, limit).records()
+    yield from _Walk(source, name, limit, packed).records()
 
 
 class _Walk:
     """One pass over a file; `buffer[pos:]` has been read, but not used yet."""
 
-    def __init__(self, source: BinaryIO | bytes, name: str, limit: int) -> None:
+    def __init__(self, source: BinaryIO | bytes, name: str, limit: int, packed: bool) -> None:
+        self.packed = packed
         self.buffer, self.pos, self.base = b"", 0, 0
         if isinstance(source, bytes):
             self.buffer, source = source, io.BytesIO()
@@ -134,7 +136,6 @@ class _Walk:
         self.base += self.pos
         parts = [self.buffer[self.pos :]]
         have = len(parts[0])
-        room(2 * count)
         while have < count:
             block = self.stream.read(max(BLOCK, count - have))
             if not block:
@@ -146,7 +147,6 @@ class _Walk:
     def records(self) -> Iterator[Record]:
         self._magic()
         while True:
-            step()
             self.need(9, "a record's head; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
             self.messages |= opcode in (CHUNK, MESSAGE)
@@ -240,7 +240,7 @@ class _Walk:
     def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
-                yield from self._chunk(chunk_content(content, self.limit)[0])
+                yield from self._chunk(chunk_content(content, self.limit, packed=self.packed)[0])
             elif opcode in PARSERS:
                 yield self._defined(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
@@ -324,7 +324,6 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
             assert isinstance(record, Schema | Channel)
             yield record
         pos += 9 + length
-        step()
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:

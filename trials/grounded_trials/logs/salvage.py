@@ -15,7 +15,6 @@ from typing import BinaryIO
 
 import numpy as np
 
-from grounded_trials.formats.budget import step
 from grounded_trials.formats.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -83,7 +82,6 @@ class Salvage:
         pos = self._first()
         dropped_chunk = False
         while pos is not None and pos < self.size - len(MAGIC):
-            step()
             end = plausible(self.stream, self.size, pos)
             if end is None:
                 yield from self._flush()
@@ -281,7 +279,6 @@ def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
     """Return the first offset from `start` on with a chain of records; None if there is none."""
     block, count = start, _BLOCKS[0]
     while block < size:
-        step()
         data = np.frombuffer(read_at(stream, block, count + 8), dtype=np.uint8)
         if len(data) < 9:
             return None

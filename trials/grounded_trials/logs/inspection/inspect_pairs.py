@@ -16,6 +16,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.places import integrals
+from grounded_trials.formats.budget import OverBudget
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
@@ -298,6 +299,8 @@ class Signals:
         specs = {p: SignalSpec(p, clock=_clock(p, self._clocks)) for p in more}  # type: ignore[arg-type]
         try:
             series = read_signals(self._files, specs) if specs else {}
+        except OverBudget:
+            raise
         except GroundedError:
             series = _one_by_one(self._files, specs)
         for path, one in series.items():
