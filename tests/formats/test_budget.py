@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bombs import BOMBS, explode, idl, log, ros
+from bombs import BOMBS, OTHERS, explode, idl, log, ros
 from facts import holding
 from grounded.errors import GroundedError, nearest
 from grounded.trial import Trial
-from grounded_trials.formats.budget import MEMORY, SECONDS, OverBudget, within
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.within import MEMORY, SECONDS, OverBudget, within
 from pace import slowness
 
 QUICK = ("JSON, nested lists",)
@@ -41,7 +41,7 @@ def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in BOMBS if name not in QUICK])
+@pytest.mark.parametrize("name", [name for name in BOMBS | OTHERS if name not in QUICK])
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
     """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9).
 

@@ -304,8 +304,7 @@ def test_tables_that_are_none(tmp_path, text, holds):
 
 
 def test_a_million_zeros_in_a_small_file_are_refused(tmp_path, monkeypatch):
-    """Compressed files are bounded by what they expand to, here to a hundredth of it."""
-    monkeypatch.setattr("grounded_trials.formats.tables.VALUES", 2_000_000)
+    monkeypatch.setenv("GROUNDED_FILE_MB", "10")
     path = tmp_path / "bomb.npz"
 
     with (
@@ -314,7 +313,7 @@ def test_a_million_zeros_in_a_small_file_are_refused(tmp_path, monkeypatch):
     ):
         for _ in range(17):
             f.write(bytes(2**20))
-    with pytest.raises(GroundedError, match="limit"):
+    with pytest.raises(GroundedError, match="GROUNDED_FILE_MB"):
         read_signals(path, {"x": SignalSpec("/npz.x")})
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import re
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -19,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, needs
-from grounded_trials.formats.budget import within
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 from grounded_trials.formats.messages import Floats
 
@@ -62,19 +60,6 @@ def npz_records(path: Path) -> Iterator[Record]:
             "of its run. Pass the log that the robot's program wrote"
         )
     yield from table_records(_npz_tables(arrays), "npz", path)
-
-
-def is_candidate(path: Path) -> bool:
-    """Return whether a file is a candidate that was exported as .npz, by the names in it."""
-    try:
-        return within(path, path.stat().st_size, _names, path) >= CANDIDATE
-    except (OSError, GroundedError, zipfile.BadZipFile):
-        return False
-
-
-def _names(path: Path) -> set[str]:
-    with zipfile.ZipFile(path) as archive:
-        return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
 def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:

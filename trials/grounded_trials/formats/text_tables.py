@@ -24,10 +24,10 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.budget import within
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import column_name, is_time, table_records, time_among
+from grounded_trials.within import within
 
 T = TypeVar("T")
 PREAMBLE = 100  # largest number of lines above the column names

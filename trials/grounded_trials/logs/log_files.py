@@ -11,15 +11,17 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
+from zipfile import BadZipFile, ZipFile
 
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded_trials.formats.budget import within
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.plain_file import open_file, read_file
+from grounded_trials.within import within
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -89,12 +91,10 @@ def _nearby(path: Path) -> str:
     """Return advice on a file that does not exist, to append to the message."""
     from difflib import get_close_matches
 
-    from grounded_trials.formats.tables import is_candidate
-
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: give a path relative to the current folder"
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
-    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not is_candidate(p)]
+    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not _is_candidate(p)]
     logs = sorted(there, key=lambda p: -_written(p))
     if logs:
         plain = _DIGITS.sub("0", path.stem.lower())
@@ -108,6 +108,20 @@ def _nearby(path: Path) -> str:
         newest = listed([p.name for p in logs[:NEWEST]])
         return f": the newest of the {len(logs)} logs in its folder are {newest}"
     return ": give the path of a log or of a bag's folder, relative to the current folder"
+
+
+def _is_candidate(path: Path) -> bool:
+    """Return whether a file is a candidate that was exported as .npz, by the names in it."""
+    from grounded_trials.formats.tables import CANDIDATE
+
+    with suppress(OSError, GroundedError, BadZipFile):
+        return within(path, path.stat().st_size, _names_in, path) >= CANDIDATE
+    return False
+
+
+def _names_in(path: Path) -> set[str]:
+    with ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
 def _written(path: Path) -> float:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import IO
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.budget import within
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -32,6 +31,7 @@ from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
+from grounded_trials.within import within
 from grounded_trials.wording import count
 
 MOST_LOSSES = 50  # number of losses listed

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded_trials.formats.budget import within
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -42,6 +41,7 @@ from grounded_trials.formats.protobuf import (
 )
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.plain_file import read_file
+from grounded_trials.within import within
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages per channel
@@ -240,7 +240,7 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
     counts: Counter[str] = Counter()
-    for record in read_records(source, name, limit=FILE_LIMIT, packed=False):
+    for record in read_records(source, name, packed=False):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
         elif isinstance(record, Attachment):

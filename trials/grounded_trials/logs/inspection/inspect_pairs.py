@@ -16,13 +16,13 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.places import integrals
-from grounded_trials.formats.budget import OverBudget
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import LENGTHS, Stated, factor_between, may_be
+from grounded_trials.within import OverBudget
 
 SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
