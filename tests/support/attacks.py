@@ -630,7 +630,7 @@ def policies(rng: random.Random, seconds: float) -> Tally:
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
         path = Path(folder, "c.npz")
         for k in during(seconds):
-            path.write_bytes(hostile[k]() if k < len(hostile) else mutated_policy(rng))
+            path.write_bytes(mutated_policy(rng) if k % 100 else hostile[k // 100 % len(hostile)]())
             with trying(tally, f"policy {k}"):
                 try:
                     run = onboard.load(path)

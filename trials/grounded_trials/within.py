@@ -42,7 +42,7 @@ SECONDS_PER_MB, MEMORY_PER_BYTE = 1.0, 8.0  # in addition, for each MB and byte 
 DISK = 4  # [memory] largest decompressed file
 PATIENCE = 20  # [CPU time] after which a child that does not end is stuck
 LOOK_S = 0.1  # [s] between two looks at a child's memory
-ENDS = {77: "memory", 78: "disk", -signal.SIGKILL: "memory", -signal.SIGPROF: "time"}
+ENDS = {77: "memory", 78: "disk", -9: "memory", -27: "time"}  # exit codes; SIGKILL, SIGPROF
 
 _inside = False  # whether this process is such a child
 

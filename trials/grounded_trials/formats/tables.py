@@ -166,9 +166,9 @@ def _definition(fields: list[str]) -> bytes:
     for field in fields:
         name = field.partition("[")[0]
         seen[name] = seen.get(name, 0) + 1
+    alone = set(fields)
     for name, count in seen.items():
-        alone = name in fields
-        lines.append(f"float64 {name}" if alone else f"float64[{count}] {name}")
+        lines.append(f"float64 {name}" if name in alone else f"float64[{count}] {name}")
     inner = "builtin_interfaces/Time stamp\nstring frame_id\n"
     parts = {"std_msgs/Header": inner, "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n"}
     text = "\n".join(lines) + "\n"
