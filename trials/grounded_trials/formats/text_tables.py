@@ -181,8 +181,8 @@ def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> Grounde
     """Return the error for a row with a wrong number of cells, saying what may be its cause."""
     names, has = len(head.names), len(cells)
     text = f"{path}, line {line} has {has} cells, but line {head.line} names {names}"
-    whole = all("." not in cell and _share([cell]) == 1 for cell in cells)
-    if head.mark == "," and names < has <= 2 * names and whole:
+    twice = head.mark == "," and names < has <= 2 * names
+    if twice and all("." not in cell and _share([cell]) == 1 for cell in cells):
         return GroundedError(
             f"{text} columns: the decimal sign seems to be a comma, as the separator is, so a row "
             "can be read in several ways. Export the table again with a point as decimal sign, or "
