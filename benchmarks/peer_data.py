@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import sys
-import time
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
 
@@ -45,9 +45,9 @@ def fastest(function: Callable[[], object], repeats: int) -> float:
     """Return the least CPU seconds of a few calls."""
     times = []
     for _ in range(repeats):
-        start = time.process_time()
+        start = sum(os.times()[:4])  # logs are read in a child process
         function()
-        times.append(time.process_time() - start)
+        times.append(sum(os.times()[:4]) - start)
     return min(times)
 
 

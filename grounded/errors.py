@@ -40,6 +40,16 @@ class GroundedError(Exception):
         super().__init__(message)
         self.then = then
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to copy it, whatever its class is made from (for another process)."""
+        return _copied, (type(self), self.args, vars(self))
+
+
+def _copied(kind: type[GroundedError], args: tuple[Any, ...], fields: dict[str, Any]) -> Any:
+    error = kind.__new__(kind, *args)
+    vars(error).update(fields)
+    return error
+
 
 def type_of(value: object) -> str:
     """Return the name of a value's type, for a message: "str", "Candidate"."""

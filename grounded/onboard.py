@@ -7,8 +7,8 @@
         send(runner.action(t, state))          # array (m,), inside the hard limits
 
 `grounded export ID --runner` copies this file beside the candidate. `action` never raises an
-exception inside the control loop. It ignores invalid states and times, and `runner.blind` counts
-the calls concerned:
+exception inside the control loop, whatever it is given. It ignores invalid states and times, and
+`runner.blind` counts the calls concerned:
 
   - The controller of the step nearest to t is used, so `action` may be called at the rate of the
     state estimate. If calls were missed, the input counts as held in between.
@@ -33,10 +33,21 @@ from zipfile import ZipFile
 import numpy as np
 
 EARLY = 0.1  # fraction of a step by which a timer may be early at the end of the run
-LIMIT = 2**28  # [bytes] largest decompressed size of an exported policy
+LIMIT = 2**28  # [bytes] largest size of an exported policy, as a file and decompressed
+PARTS = 100  # arrays in a file
+NAMES, WIDTH = 1000, 100_000  # states or inputs; entries of z, the past inputs included
 
 FORMAT = "grounded-policy-1"
 NUMBERS = ("feedforward", "low", "high", "past")
+FEEDBACK = ("gain", "reference")
+FIELDS = {  # NumPy's kinds of each array of a file, and the largest number of its values
+    **dict.fromkeys(("format", "task"), ("U", 1)),
+    "dt": ("fiu", 1),
+    **dict.fromkeys((*NUMBERS, *FEEDBACK), ("fiu", LIMIT // 8)),
+    **dict.fromkeys(("state_names", "input_names"), ("U", NAMES)),
+    "depths": ("iu", NAMES),
+    "angles": ("b", NAMES),
+}
 Names = Optional[Tuple[str, ...]]
 
 
@@ -86,12 +97,26 @@ class Runner:
             t: time since the start of the run [s].
             s: measured state (n,), in the policy's order and units.
         """
-        policy, step = self.policy, self._step(t)
+        try:
+            with np.errstate(all="ignore"):  # a program may have set it to raise
+                u = self._command(self._step(t), s)
+            if np.isfinite(u).all():
+                return u
+        except Exception:  # whatever an object that is passed as a state may do
+            pass
+        self.blind += 1
+        return self._safe()
+
+    def _safe(self) -> Any:
+        """Return the last input that was sent."""
+        return np.array(self._held if self._latest < 0 else self._sent[self._latest + self._deep])
+
+    def _command(self, step: int, s: Any) -> Any:
+        """Return the inputs (m,) at a step, which are remembered; the last ones at step -1."""
+        policy = self.policy
         if step < 0:  # the time is not a number
             self.blind += 1
-            return np.array(
-                self._held if self._latest < 0 else self._sent[self._latest + self._deep]
-            )
+            return self._safe()
         step = max(step, self._latest)
         if step >= self._H:
             return np.array(self._held)
@@ -106,8 +131,9 @@ class Runner:
             else:
                 u = u + correction
         u = np.minimum(np.maximum(u, policy.low), policy.high)
-        self._sent[base] = u
-        self._latest = step
+        if np.isfinite(u).all():
+            self._sent[base] = u
+            self._latest = step
         return u
 
     def _step(self, t: float) -> int:
@@ -118,7 +144,7 @@ class Runner:
         """
         try:
             where = float(t) / self.policy.dt + 0.5
-        except (TypeError, ValueError):
+        except Exception:
             return -1
         if where != where:
             return -1
@@ -129,11 +155,12 @@ class Runner:
     def _correction(self, step: int, base: int, s: Any) -> Any:
         """Return the feedback K_t (z - zbar), (m,); None if the state can't be used."""
         z = self._z
-        try:
-            state: Any = np.ma.filled(np.ma.asarray(s, dtype=float), np.nan)
-        except (TypeError, ValueError):
-            return None
-        if state.ndim > 1 or state.size != self._n:
+        try:  # an object's own methods may raise anything
+            state: Any = np.ma.asarray(s)
+            if state.dtype.kind not in "fiubO" or state.ndim > 1 or state.size != self._n:
+                return None
+            state = np.ma.filled(state.astype(float), np.nan)
+        except Exception:
             return None
         z[: self._n] = state
         z[self._n :] = self._sent[base - self._queue_lag, self._queue_input]
@@ -141,7 +168,7 @@ class Runner:
         if not np.isfinite(z).all():
             return None
         for i in self._angles:
-            z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi))
+            z[i] -= 2 * np.pi * np.rint(z[i] / (2 * np.pi))
         correction = self.policy.gain[step] @ z
         return correction if np.isfinite(correction).all() else None
 
@@ -172,21 +199,21 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
     if str(data.get("format", "")) != FORMAT:
         raise ValueError(f"{path} is not a candidate exported by `grounded export --format npz`")
     try:
-        found: dict[str, Any] = {name: np.asarray(data[name], float) for name in NUMBERS}
+        found: dict[str, Any] = {name: np.array(data[name], float) for name in NUMBERS}
+        found.update({name: np.array(data[name], float) for name in FEEDBACK if name in data})
         found["dt"] = float(data["dt"])
-        found["state_names"] = tuple(map(str, data["state_names"]))
-        found["input_names"] = tuple(map(str, data["input_names"]))
-        found["depths"] = tuple(map(int, data["depths"]))
+        for name, kind in (("state_names", str), ("input_names", str), ("depths", int)):
+            found[name] = tuple(map(kind, data[name]))
         found["angles"] = tuple(map(bool, data["angles"]))
-        found["gain"], found["reference"] = data.get("gain"), data.get("reference")
     except KeyError as error:
         raise ValueError(f"{path} lacks {error}; export it again") from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is damaged: {error}; export it again") from None
-    check_robot(path, SimpleNamespace(**found), states, inputs)
+    policy = SimpleNamespace(**{**dict.fromkeys(FEEDBACK), **found})
+    check_robot(path, policy, states, inputs)
     check_task(path, str(data.get("task", "")), task)
-    _check(path, found)
-    return found
+    check_limits(path, policy)
+    return vars(policy)
 
 
 def check_robot(path: Any, policy: Any, states: Names, inputs: Names) -> None:
@@ -205,45 +232,98 @@ def check_task(path: Any, made_for: str, task: Optional[str]) -> None:
         raise ValueError(f"{path} is for task {made_for}; this robot is set up for {task}")
 
 
-def _check(path: Any, found: dict[str, Any]) -> None:
-    """Raise ValueError unless sizes, limits and dt are consistent and the arrays are finite."""
-    ubar, gain, reference = found["feedforward"], found["gain"], found["reference"]
-    H, m = ubar.shape if ubar.ndim == 2 else (0, 0)
-    n, nz = len(found["state_names"]), len(found["state_names"]) + sum(found["depths"])
-    fits = H > 0 and all(found[name].shape == (m,) for name in NUMBERS[1:])
-    fits = fits and len(found["input_names"]) == m == len(found["depths"])
-    fits = fits and len(found["angles"]) == n and found["dt"] > 0
-    fits = fits and min(found["depths"], default=0) >= 1 and (gain is None) == (reference is None)
-    if gain is not None and reference is not None:
-        fits = fits and gain.shape == (H, m, nz) and reference.shape == (H, nz)
-    if not fits:
-        raise ValueError(f"{path} is damaged: its fields are inconsistent; export it again")
-    parts = [found[name] for name in ("feedforward", "past", "gain", "reference")]
-    finite = all(np.isfinite(part).all() for part in parts if part is not None)
-    if not (finite and (found["low"] <= found["high"]).all()):  # NaN is not below anything
-        raise ValueError(
-            f"{path} holds numbers that are not finite, or a lower limit above the upper one; "
-            "export it again"
+def check_limits(path: Any, policy: Any) -> None:
+    """Raise ValueError unless the policy may run on a robot: no `fault`, and finite limits."""
+    wrong = fault(policy)
+    if not wrong and not np.isfinite([policy.low, policy.high]).all():
+        wrong = "an input has no limit, so a robot may be sent anything: state it in [limits]"
+    if wrong:
+        raise ValueError(f"{path} must not be run: {wrong}; export it again")
+
+
+def misfit(policy: Any) -> str:
+    """Return which fields of a policy don't fit together; "" if all do."""
+    shape = np.shape(policy.feedforward)
+    if len(shape) != 2 or 0 in shape:
+        return f"its feed-forward must have shape (H, m), found {shape}"
+    (H, m), n = shape, len(policy.state_names)
+    sizes = [len(policy.input_names), len(policy.depths), len(policy.angles)]
+    limits = [np.shape(getattr(policy, name)) for name in NUMBERS[1:]]
+    if sizes != [m, m, n] or limits != [(m,)] * 3:
+        return (
+            f"it has {n} states and {m} inputs, but its input names, depths and angles have sizes "
+            f"{sizes}, its limits and held input the shapes {limits}"
         )
+    nz = n + sum(policy.depths)
+    if not (0 < policy.dt < np.inf and min(policy.depths) >= 1 and nz <= WIDTH):
+        return (
+            f"its dt is {policy.dt} and its depths are {policy.depths[:9]}; expected a positive "
+            f"dt, depths of at least 1, and with the states at most {WIDTH}"
+        )
+    if (policy.gain is None) != (policy.reference is None):
+        return "it has one of gain and reference; feedback needs both"
+    if policy.gain is not None:
+        found = [np.shape(getattr(policy, name)) for name in FEEDBACK]
+        if found != [(H, m, nz), (H, nz)]:
+            return f"gain and reference have shapes {found}, expected {[(H, m, nz), (H, nz)]}"
+    return ""
+
+
+def fault(policy: Any) -> str:
+    """Return why a policy can't be run: a `misfit`, or a number that is not one; "" if it can."""
+    if wrong := misfit(policy):
+        return wrong
+    for name in ("feedforward", "past", *FEEDBACK):
+        values = getattr(policy, name)
+        if values is not None and not np.isfinite(values).all():
+            k = int(np.argwhere(~np.isfinite(values))[0][0])
+            return f"'{name}' is not a finite number at step {k} ({k * policy.dt:.3f} s)"
+    low, high = policy.low, policy.high
+    if not ((low <= high) & (low < np.inf) & (high > -np.inf)).all():  # NaN is below nothing
+        return f"its limits {low[:9]} to {high[:9]} are not a lower and an upper one"
+    return ""
 
 
 def _archive(path: Any) -> dict[str, Any]:
+    """Return the arrays of a file by name, with their kinds and sizes checked."""
     try:
         if not Path(path).is_file() and Path(path).exists():
             raise ValueError(f"{path} is a folder, a pipe or a device, not a file")
+        if Path(path).stat().st_size > LIMIT:
+            raise ValueError(f"{path} has more than {LIMIT} bytes: it is not an exported candidate")
         content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
     try:
-        size = sum(part.file_size for part in ZipFile(BytesIO(content)).infolist())
-        if size > LIMIT:
-            raise ValueError(f"its decompressed size is {size} bytes, the limit is {LIMIT}")
-        with np.load(BytesIO(content), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+        count = content.count(b"PK\1\2")  # an entry of the table of contents begins so
+        if count > PARTS:
+            raise ValueError(f"it has {count} parts, the limit is {PARTS}")
+        with ZipFile(BytesIO(content)) as archive:
+            parts = {part.filename: part for part in archive.infolist()}
+            mine = {name: parts[f"{name}.npy"] for name in FIELDS if f"{name}.npy" in parts}
+            size = sum(part.file_size for part in mine.values())
+            if size > LIMIT or not {part.compress_type for part in mine.values()} <= {0, 8}:
+                raise ValueError(f"its decompressed size is {size} bytes, the limit is {LIMIT}")
+            return {name: _array(archive, part, *FIELDS[name]) for name, part in mine.items()}
     except Exception as error:  # numpy, zipfile and zlib each have errors of their own
         raise ValueError(
             f"{path} is damaged, or not an exported candidate (.npz): {error}; export it again"
         ) from None
+
+
+def _array(archive: ZipFile, part: Any, kinds: str, most: int) -> Any:
+    """Return an array of these kinds, with at most `most` values; no more memory is taken."""
+    with archive.open(part) as stream:
+        if np.lib.format.read_magic(stream) != (1, 0):
+            raise ValueError(f"{part.filename} has another version than 1.0 of NumPy's format")
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        count = 1
+        for side in shape:
+            count *= side
+        if count > most or (count and dtype.kind not in kinds):
+            raise ValueError(f"{part.filename} has {count} values of type {dtype}")
+        data = stream.read(part.file_size)  # to its end, so that the checksum is compared
+    return np.ndarray(shape, dtype, data, order="F" if fortran else "C")
 
 
 if __name__ == "__main__":  # check a file and print its contents

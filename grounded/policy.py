@@ -14,15 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
-
-if TYPE_CHECKING:
-    from grounded.onboard import Runner
+from grounded.onboard import FORMAT, NUMBERS, Runner, misfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,28 +64,8 @@ class Policy:
         for name in ("feedforward", "low", "high", "past", "gain", "reference"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name)))
-        if self.feedforward.ndim != 2 or len(self.feedforward) == 0:
-            raise GroundedError(
-                f"a feed-forward must have shape (H, m), found {self.feedforward.shape}"
-            )
-        H, m = self.feedforward.shape
-        n, nz = len(self.state_names), len(self.state_names) + sum(self.depths)
-        sizes = (len(self.input_names), *self.low.shape, *self.high.shape, *self.past.shape)
-        if sizes != (m,) * 4 or len(self.depths) != m or len(self.angles) != n:
-            raise GroundedError(
-                f"a policy of {n} states and {m} inputs: its names, limits, held input, depths and "
-                "angles don't have these sizes"
-            )
-        if not (np.isfinite(self.dt) and self.dt > 0 and min(self.depths) >= 1):
-            raise GroundedError("a policy's dt must be positive and its depths at least 1")
-        if (self.gain is None) != (self.reference is None):
-            raise GroundedError("a feedback policy needs both a gain and a reference")
-        if self.gain is not None and self.reference is not None:
-            found = (self.gain.shape, self.reference.shape)
-            if found != ((H, m, nz), (H, nz)):
-                raise GroundedError(
-                    f"gain and reference must have shapes {((H, m, nz), (H, nz))}, got {found}"
-                )
+        if wrong := misfit(self):
+            raise GroundedError(f"a policy does not fit together: {wrong}")
 
     def __repr__(self) -> str:
         names = f"states {', '.join(self.state_names)}; inputs {', '.join(self.input_names)}"
@@ -251,8 +229,6 @@ def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
         policy: the policy.
         about: further strings to store, such as `task`, which a reader may check.
     """
-    from grounded.onboard import FORMAT, NUMBERS
-
     arrays: dict[str, Any] = {name: getattr(policy, name) for name in NUMBERS}
     arrays |= {
         "format": FORMAT,
@@ -320,6 +296,7 @@ def _proposed(
     try:
         onboard.check_robot(path, policy, states, inputs)
         onboard.check_task(path, made_for, task)
+        onboard.check_limits(path, policy)
     except ValueError as error:
         raise GroundedError(str(error)) from None
     return policy

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import io
+import os
+import re
+import signal
 import struct
+import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bombs import BOMBS, explode, idl, log, ros
+from bombs import BOMBS, OTHERS, explode, idl, log, ros
 from facts import holding
 from grounded.errors import GroundedError, nearest
 from grounded.trial import Trial
-from grounded_trials.formats.budget import MEMORY, SECONDS, OverBudget, budget, keep, room, step
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.within import MEMORY, SECONDS, OverBudget, within
 from pace import slowness
 
 QUICK = ("JSON, nested lists",)
@@ -35,7 +41,7 @@ def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in BOMBS if name not in QUICK])
+@pytest.mark.parametrize("name", [name for name in BOMBS | OTHERS if name not in QUICK])
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
     """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9).
 
@@ -68,26 +74,130 @@ def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) 
     assert time.process_time() - began < slowness() and len(str(refused.value)) < 2000
 
 
-def test_a_budget_counts_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    step(), keep(10**12)  # outside a budget nothing is counted
-    monkeypatch.setenv(SECONDS, "0.01")
-    monkeypatch.setenv(MEMORY, "1")
-    with budget("a log", 0):
-        keep(600_000)
-        room(300_000)
-        with pytest.raises(OverBudget, match=r"a log.*1 MB of memory.*GROUNDED_FILE_MB"):
-            room(500_000)
-        keep(300_000)
-        with pytest.raises(OverBudget, match="memory"):
-            keep(300_000)
-    with budget("a log", 0), pytest.raises(OverBudget, match=r"0\.0 s of CPU.*GROUNDED_FILE_S"):
-        while True:
-            step()
-    with pytest.raises(OverBudget, match=holding("a log", "memory")), budget("a log", 0):
-        raise MemoryError
-    monkeypatch.setenv(SECONDS, "much")
-    with pytest.raises(GroundedError, match="'much'"), budget("a log", 0):
+def endless() -> None:
+    while True:
         pass
+
+
+def hungry() -> list[bytes]:
+    return [bytes(10**8) for _ in range(100)]
+
+
+def in_c() -> bool:
+    return re.search("(a*)*b", "a" * 40) is None  # never looks at a signal's handler
+
+
+def full() -> None:
+    with tempfile.TemporaryFile() as out:
+        while True:
+            out.write(bytes(10**7))
+
+
+def hidden() -> None:
+    try:
+        hungry()
+    except MemoryError:
+        raise ValueError("a decoder hides what it met") from None
+
+
+def crash() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.fixture(params=["fork", "spawn"])
+def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Start children as on Linux, and as elsewhere."""
+    if request.param == "spawn":
+        monkeypatch.setattr(sys, "platform", "darwin")
+    return str(request.param)
+
+
+@pytest.mark.parametrize(
+    ("function", "setting"),
+    [(endless, SECONDS), (in_c, SECONDS), (hungry, MEMORY), (hidden, MEMORY), (full, MEMORY)],
+)
+def test_a_reader_ends_at_each_limit_which_is_named(
+    function: Callable[[], object], setting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(SECONDS, "0.5")
+    monkeypatch.setenv(MEMORY, "50")
+    room = set(Path(tempfile.gettempdir()).glob("grounded-*"))
+    with pytest.raises(OverBudget, match=holding("a.log", setting)):
+        within("a.log", 0, function)
+    assert set(Path(tempfile.gettempdir()).glob("grounded-*")) <= room
+
+
+def test_memory_and_time_are_limited_where_a_child_is_no_copy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setenv(SECONDS, "2")
+    for function, setting in ((endless, SECONDS), (slowly_hungry, MEMORY)):
+        with pytest.raises(OverBudget, match=holding("a.log", setting)):
+            within("a.log", 0, function)
+
+
+def slowly_hungry() -> None:
+    held = []
+    while True:
+        held.append(np.ones(10**6))
+        time.sleep(0.01)
+
+
+def test_results_and_errors_come_back(either: str) -> None:
+    assert within("a.log", 10**8, echo, np.arange(5), b=[1]).tolist() == [1, 2, 3, 4, 5]
+    with pytest.raises(DamagedFile, match="a hole") as damaged:
+        within("a.log", 0, broken)
+    assert damaged.value.offset == 7 and damaged.value.then is not None
+    with pytest.raises(ZeroDivisionError):
+        within("a.log", 0, divided)
+
+
+def echo(a: np.ndarray, b: list[int]) -> np.ndarray:
+    return a + b[0]
+
+
+def broken() -> None:
+    raise DamagedFile("a.log", 7, "a hole")
+
+
+def divided() -> float:
+    return 1 / 0
+
+
+def test_a_crash_of_a_decoder_is_an_error_that_names_the_file() -> None:
+    with pytest.raises(OverBudget, match=holding("a.log")):
+        within("a.log", 0, crash)
+
+
+def test_ctrl_c_ends_the_child_as_well(either: str, tmp_path: Path) -> None:
+    note = tmp_path / "pid"
+
+    def press(*_: object) -> None:
+        if note.exists() and note.read_text():
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, press)
+    signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            within("a.log", 10**8, note_and_wait, note)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(note.read_text()), 0)
+
+
+def note_and_wait(path: Path) -> None:
+    path.write_text(str(os.getpid()))
+    endless()
+
+
+def test_a_setting_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SECONDS, "much")
+    with pytest.raises(GroundedError, match="'much'"):
+        within("a.log", 0, divided)
 
 
 def two_channels() -> bytes:

@@ -300,13 +300,6 @@ HOSTILE = {
     "constants by constants": "const long A0=1;"
     + "".join(f"const long A{i}=A{i - 1};" for i in range(1, 30_000))
     + "struct M {double a[A29999];};",
-    "bases with many fields": "struct B {"
-    + "double a;" * 10_000
-    + "};"
-    + "".join(f"struct S{i}:B{{}};" for i in range(10_000))
-    + "struct M {"
-    + "".join(f"S{i} a;" for i in range(10_000))
-    + "};",
 }
 
 

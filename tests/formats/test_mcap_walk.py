@@ -182,7 +182,7 @@ def test_a_record_that_claims_too_much_takes_no_memory() -> None:
         chunk(b"", "zstd", b"x" * 100, size=2**40),
         chunk(b"", "lz4", b"x" * 100, size=2**40),
     ):
-        with pytest.raises(DamagedFile, match=r"limit|damaged"):
+        with pytest.raises(DamagedFile, match=r"ends inside|damaged"):
             plain(MAGIC + header + hostile)
 
 
@@ -192,11 +192,11 @@ def test_bombs_end_at_their_stated_size() -> None:
 
     bomb = bytes(50 * 2**20)
     for name, packed in (("zstd", zstandard.compress(bomb)), ("lz4", lz4.frame.compress(bomb))):
-        with pytest.raises(BadRecord, match=holding("101 bytes", 100)):
-            decompress(name, packed, 100, 2**20)
-        assert decompress(name, packed, len(bomb), 2**30) == bomb
-    with pytest.raises(BadRecord, match=holding("brotli")):
-        decompress("brotli", b"", 0, 10)
+        assert decompress(name, packed, 100) == (bytes(101), "")
+        assert decompress(name, packed, len(bomb)) == (bomb, "")
+        found, wrong = decompress(name, packed[:-9], 2**40)
+        assert len(found) <= len(bomb) and (wrong or len(found) < len(bomb) or name == "lz4")
+    assert "brotli" in decompress("brotli", b"", 0)[1]
 
 
 def test_a_message_shorter_than_its_header() -> None:

@@ -3,12 +3,14 @@
 import ast
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from fuzzed_runner import HOSTILE, fuzz
 from grounded import onboard
 from grounded.onboard import Runner
 from grounded.policy import Policy, to_arrays
@@ -135,10 +137,15 @@ def test_inputs_of_missed_calls_count_as_held():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt": 0.0}, "inconsistent"),
-        ({"past": np.array([np.nan])}, "not finite"),
-        ({"low": np.array([2.0])}, "lower limit above"),
-        ({"gain": np.zeros((H, 1, 2))}, "inconsistent"),
+        ({"dt": 0.0}, "dt is 0.0"),
+        ({"past": np.array([np.nan])}, "'past'"),
+        ({"low": np.array([2.0])}, "limits"),
+        ({"gain": np.zeros((H, 1, 2))}, "gain"),
+        ({"high": np.array([np.inf])}, "limits"),
+        ({"low": np.array([np.inf]), "high": np.array([np.inf])}, "limits"),
+        ({"feedforward": np.ones((H, 1)) * 1j}, "feedforward.*complex"),
+        ({"depths": np.array([10**9])}, "depths"),
+        ({"state_names": np.array(["x"] * 2000)}, "state_names.*2000"),
         ({"format": "other"}, "not a candidate"),
     ],
     ids=str,
@@ -148,6 +155,34 @@ def test_a_file_that_is_none_is_refused(change, message, tmp_path):
     np.savez(path, **to_arrays(policy()) | change)
     with pytest.raises(ValueError, match=message):
         onboard.load(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(HOSTILE))
+def test_a_small_file_that_asks_for_gigabytes_is_refused_before_they_are_taken(name, tmp_path):
+    path = tmp_path / "bad.npz"
+    path.write_bytes(HOSTILE[name]())
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"bad\.npz"):
+            onboard.load(path)
+        assert tracemalloc.get_traced_memory()[1] < 2e8
+    finally:
+        tracemalloc.stop()
+
+
+def test_whatever_a_robot_passes_nothing_is_raised_and_all_is_inside_the_limits(tmp_path):
+    found = fuzz(Path(onboard.__file__), tmp_path, calls=3000, seed=5)
+    assert found.calls >= 3000 and found.used > 300
+    assert not found.raised and not found.outside
+
+
+def test_what_is_held_when_a_call_can_not_be_used_is_the_last_input_sent():
+    runner = Runner(policy(gain=None, reference=None))
+    sent = runner.action(0.2, [0, 0])
+    for t in (10**400, np.array([0.1, 0.2]), np.ma.masked, "soon"):
+        assert runner.action(t, [0, 0]) == pytest.approx(sent)
+    assert runner.blind == 4
 
 
 def test_what_a_file_holds_is_shown(exported):

@@ -27,8 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bombs import BOMBS, explode
+from bombs import BOMBS, OTHERS, explode
 from cli import COMMAND, grounded
+from fuzzed_runner import HOSTILE, fuzz
+from fuzzed_runner import mutated as mutated_policy
+from grounded import onboard
 from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.logs.inspection.inspect_log import inspect_log
@@ -594,8 +597,16 @@ def flips(rng: random.Random, seconds: float) -> Tally:
 
 def bombs(rng: random.Random, seconds: float) -> Tally:
     """Read, inspect and recover every small file that asks for much memory or time."""
+    return _exploded(rng, seconds, list(BOMBS))
+
+
+def other_bombs(rng: random.Random, seconds: float) -> Tally:
+    """Do the same with other formats than MCAP."""
+    return _exploded(rng, seconds, list(OTHERS))
+
+
+def _exploded(rng: random.Random, seconds: float, names: list[str]) -> Tally:
     tally = Tally()
-    names = list(BOMBS)
     rng.shuffle(names)
     end = time.monotonic() + seconds
     for name in names:
@@ -613,6 +624,41 @@ def bombs(rng: random.Random, seconds: float) -> Tally:
     return tally
 
 
+def policies(rng: random.Random, seconds: float) -> Tally:
+    """Load mutated exported policies, and run those that are not refused."""
+    tally, hostile = Tally(), list(HOSTILE.values())
+    with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
+        path = Path(folder, "c.npz")
+        for k in during(seconds):
+            path.write_bytes(mutated_policy(rng) if k % 100 else hostile[k // 100 % len(hostile)]())
+            with trying(tally, f"policy {k}"):
+                try:
+                    run = onboard.load(path)
+                except ValueError:
+                    tally.note["refused"] += 1
+                    continue
+                for t in (0.0, 0.05, float("nan"), 9.0):
+                    u = run.action(t, np.ones(len(run.policy.state_names)))
+                    if not ((run.policy.low <= u) & (u <= run.policy.high)).all():
+                        tally.add("silent", f"policy {k}: {u}")
+    return tally
+
+
+def calls(rng: random.Random, seconds: float) -> Tally:
+    """Call the exported runner with random times and states, errors and warnings raised."""
+    tally = Tally()
+    with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
+        for k in during(seconds):
+            with trying(tally, f"calls {k}"):
+                found = fuzz(Path(onboard.__file__), Path(folder), 2000, rng.randrange(2**31))
+                tally.tries += found.calls - 1
+                for name, times in found.raised.items():
+                    tally.add("traceback", f"{name}, {times} times")
+                for what in found.outside:
+                    tally.add("silent", what)
+    return tally
+
+
 ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
     "mutants": ("MCAP mutants with sound checksums: read, inspect, recover", mutants),
     "configurations": ("grounded.toml, model.py, target.csv mutated", configurations),
@@ -620,7 +666,10 @@ ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
     "short writes": ("each writing command on a disk that takes no more", short_writes),
     "crowds": ("six commands at once in one workspace", crowds),
     "flips": ("one bit of any file of a workspace", flips),
-    "bombs": ("small files that ask for gigabytes or hours", bombs),
+    "bombs": ("small MCAP files that ask for gigabytes or hours", bombs),
+    "other bombs": ("the same as bags, tables, archives and PX4 logs", other_bombs),
+    "policies": ("exported policies mutated: load, run", policies),
+    "calls": ("random calls of the exported runner", calls),
 }
 
 

@@ -1,4 +1,4 @@
-"""Small files whose reading would take gigabytes or hours, one of each kind; see `BOMBS`.
+"""Small files whose reading would take gigabytes or hours, one of each kind; see `BOMBS`, `OTHERS`.
 
 `bomb(name, folder)` writes one and returns it with the path of the number to read.
 """
@@ -21,10 +21,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from grounded.trial import Trial
-from grounded_trials.formats.budget import SECONDS
 from grounded_trials.formats.mcap_records import CHUNK
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.store.trial_file import trial_bytes
+from grounded_trials.within import SECONDS
 from pace import slowness
 
 DEEP = 12  # modules inside modules
@@ -224,6 +224,149 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
     "gaps between records": (_gaps, "/t.x"),
     "a trial of 30,000 steps, a chunk each": (lambda: _trial(30_000, 1.0), ""),
 }
+# --- other formats ------------------------------------------------------------------------------
+
+
+def _bag(compression: str, size: int) -> bytes:
+    """Return a ROS 1 bag with one chunk of zeros."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.bag")
+        bag = Writer(path)
+        bag.set_compression(Writer.CompressionFormat[compression])
+        bag.chunk_threshold = 2**31
+        with bag:
+            kind = "std_msgs/msg/UInt8MultiArray"
+            topic = bag.add_connection("/t", kind, typestore=store)
+            for i in range(size // 10**7):
+                bag.write(topic, i + 1, struct.pack("<III", 0, 0, 10**7) + bytes(10**7))
+        return path.read_bytes()
+
+
+def _packed_table(size: int) -> bytes:
+    import zstandard
+
+    packer = zstandard.ZstdCompressor().compressobj()
+    rows = b"0,0\n" * 10**6
+    parts = [packer.compress(b"t,x\n"), *(packer.compress(rows) for _ in range(size // len(rows)))]
+    return b"".join([*parts, packer.flush()])
+
+
+def _ulog() -> bytes:
+    """Return a PX4 log whose types contain each other."""
+    head = b"ULog\x01\x12\x35\x01" + bytes(8)
+    texts = [f"t{i}:t{i + 1}[99] a;t{i + 1}[99] b;".encode() for i in range(9)]
+    texts = [b"t:uint64_t timestamp;t0[99] a;", *texts, b"t9:double x;"]
+    parts = [struct.pack("<Hc", len(text), b"F") + text for text in texts]
+    added, data = b"\0\0\0t", b"\0\0" + bytes(100)
+    parts += [struct.pack("<Hc", len(added), b"A") + added]
+    parts += [struct.pack("<Hc", len(data), b"D") + data] * 9
+    return head + b"".join(parts)
+
+
+def _sqlite(*lines: str) -> bytes:
+    """Return a ROS 2 bag made by these lines of SQL."""
+    import sqlite3
+    from contextlib import closing
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.db3")
+        with closing(sqlite3.connect(path)) as bag:
+            bag.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+            bag.execute("INSERT INTO topics VALUES (1, '/t', 'std_msgs/msg/Float64', 'cdr')")
+            for line in lines:
+                bag.execute(line)
+            bag.commit()
+        return path.read_bytes()
+
+
+ENDLESS = (
+    "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) "
+    "SELECT x AS id, 1 AS topic_id, x AS timestamp, x'0001000000000000' AS data FROM c"
+)
+TABLE = (  # whose rows are those of the view
+    "CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data, content=endless, "
+    "content_rowid=id)"
+)
+
+
+def _archive(arrays: Mapping[str, bytes]) -> bytes:
+    import zipfile
+
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in arrays.items():
+            archive.writestr(name + ".npy", data)
+    return out.getvalue()
+
+
+def _npy(array: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+def _long_headers() -> bytes:
+    fields = ", ".join(f"('a{i}', '<f8')" for i in range(600))
+    head = f"{{'descr': [{fields}], 'fortran_order': False, 'shape': (1,)}}".encode() + b"\n"
+    one = b"\x93NUMPY\x01\0" + struct.pack("<H", len(head)) + head + bytes(8 * 600)
+    return _archive({f"a{i}": one for i in range(3000)})
+
+
+# name -> (the file's name, its bytes, the path of the number to read in it)
+OTHERS: dict[str, tuple[str, Callable[[], bytes], str]] = {
+    "ROS 1, bz2": ("bomb.bag", lambda: _bag("BZ2", 600_000_000), "/t.data[0]"),
+    "ROS 1, lz4": ("bomb.bag", lambda: _bag("LZ4", 1_500_000_000), "/t.data[0]"),
+    "a table, zstd": ("bomb.csv.zst", lambda: _packed_table(3 * 10**9), "/csv.x"),
+    "PX4, types of types": ("bomb.ulg", _ulog, "/t.timestamp"),
+    "SQLite, generated columns": (
+        "bomb.db3",
+        lambda: _sqlite(
+            "CREATE TABLE messages (id, topic_id, timestamp, data AS (zeroblob(900000000)))",
+            *["INSERT INTO messages VALUES (1, 1, 1)"] * 50,
+        ),
+        "/t.data",
+    ),
+    "SQLite, an endless view": (
+        "bomb.db3",
+        lambda: _sqlite(f"CREATE VIEW endless AS {ENDLESS}", TABLE),
+        "/t.data",
+    ),
+    "SQLite, an endless view without a row": (
+        "bomb.db3",
+        lambda: _sqlite(
+            f"CREATE VIEW endless AS SELECT * FROM ({ENDLESS}) WHERE timestamp < 0", TABLE
+        ),
+        "/t.data",
+    ),
+    "NumPy, 30,000 arrays": (
+        "bomb.npz",
+        lambda: _archive(
+            {"t": _npy(np.arange(9.0))} | {f"a{i}": _npy(np.zeros(9)) for i in range(30_000)}
+        ),
+        "/npz.a5",
+    ),
+    "NumPy, long headers": ("bomb.npz", _long_headers, "/npz.a5"),
+    "NumPy, zeros": (
+        "bomb.npz",
+        lambda: _archive({"t": _npy(np.zeros(10**8, np.int8)), "x": _npy(np.zeros(10**8, "i1"))}),
+        "/npz.x",
+    ),
+    "metadata.yaml, lines without end": (
+        "metadata.yaml",
+        lambda: b"files:\n" + b"\n" * 8_000_000 + b"- " + b"a" * 8_000_000,
+        "/t.x",
+    ),
+    "a table, brackets": (
+        "bomb.csv",
+        lambda: b"(" * 60_000 + b",t\n" + b"1,2\n" * 30,
+        "/csv.t",
+    ),
+    "a table, one line": ("bomb.csv", lambda: b"t,x\n" + b"1," * 1_000_000, "/csv.x"),
+}
 LONG: dict[str, tuple[Callable[[], bytes], str]] = {  # a minute each: with the study alone
     "2,000,000 tiny messages": (lambda: _tiny_messages(2_000_000), "/t.x"),
     "300,000 chunks": (lambda: _chunks(300_000), "/t.x"),
@@ -231,12 +374,14 @@ LONG: dict[str, tuple[Callable[[], bytes], str]] = {  # a minute each: with the 
 }
 
 
+KINDS = {name: ("bomb.mcap", *one) for name, one in (BOMBS | LONG).items()} | OTHERS
+
+
 def bomb(name: str, folder: Path) -> tuple[Path, str]:
     """Write a bomb; return the file and the path to read in it."""
-    build, text = (BOMBS | LONG)[name]
-    path = folder / "bomb.mcap"
-    path.write_bytes(build())
-    return path, text
+    where, build, text = KINDS[name]
+    (folder / where).write_bytes(build())
+    return (folder if where == "metadata.yaml" else folder / where), text
 
 
 @dataclass(frozen=True)
@@ -269,7 +414,9 @@ _START = """
 import pathlib, re, resource, sys
 def told(_, peak=sys.argv.pop(1)):
     status = pathlib.Path("/proc/self/status").read_text()  # not of the process that forked
-    pathlib.Path(peak).write_text(re.search(r"VmHWM:\\s+(\\d+)", status)[1])
+    mine = int(re.search(r"VmHWM:\\s+(\\d+)", status)[1])
+    child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # the largest one
+    pathlib.Path(peak).write_text(str(max(mine, child)))
 import atexit
 atexit.register(told, 0)
 """
@@ -318,11 +465,11 @@ def explode(name: str, folder: Path, budget_s: float = 3.0) -> dict[str, Cost]:
     )
     made = measured([str(folder)], make, 300)
     assert made.exit == 0, made.text
-    path = str(folder / "bomb.mcap")
-    size = Path(path).stat().st_size / 1e6
+    file = folder / KINDS[name][0]
+    path, size = str(folder if file.name == "metadata.yaml" else file), file.stat().st_size / 1e6
     saved, env = folder / "saved.mcap", {SECONDS: str(budget_s)}
     costs = {
-        "read": measured([path, (BOMBS | LONG)[name][1]], _READ, env=env),
+        "read": measured([path, KINDS[name][2]], _READ, env=env),
         "inspect": measured(["inspect", path], env=env),
         "recover": measured(["recover", path, "-o", str(saved)], env=env),
     }
@@ -332,7 +479,7 @@ def explode(name: str, folder: Path, budget_s: float = 3.0) -> dict[str, Cost]:
 
 def main() -> None:
     """Print a line for each bomb: python tests/support/bombs.py [NAME ...]"""
-    for name in BOMBS | LONG:
+    for name in KINDS:
         if sys.argv[1:] and not any(re.search(word, name) for word in sys.argv[1:]):
             continue
         with tempfile.TemporaryDirectory() as folder:

@@ -29,6 +29,7 @@ from grounded_trials.logs.recover import recover_log
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Store
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.within import within
 
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing is free
 
@@ -97,7 +98,14 @@ def read_damaged(flips: bool, stride: int = 1) -> Outcome:
 
 
 def recover_damaged(flips: bool, stride: int = 1) -> Outcome:
-    """Check that `recover` saves only right numbers and never calls a loss complete."""
+    """Check that `recover` saves only right numbers and never calls a loss complete.
+
+    All files are read in one child process.
+    """
+    return within("all of them", 10**10, _recover_damaged, flips, stride)
+
+
+def _recover_damaged(flips: bool, stride: int) -> Outcome:
     trial = a_trial(12)
     source = trial_bytes(trial, {}, b"a policy")
     failures, saved = [], 0

@@ -23,7 +23,6 @@ from grounded_trials.formats.mcap_records import Channel, End, Header, Messages,
 
 SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0\n"  # how the files begin
 BATCH, ROOM = 20_000, 64 * 2**20  # messages, bytes
-MESSAGE_LIMIT = 256 * 2**20  # bytes
 
 Piece = tuple[int, int, bytes]  # channel, time [ns], message
 
@@ -61,20 +60,14 @@ def sqlite_records(path: Path) -> Iterator[Record]:
     """Yield the records of a ROS 2 `.db3` file.
 
     Raises:
-        GroundedError: if it is damaged, or not a bag.
+        GroundedError: if it is not a bag.
     """
     import sqlite3
 
     waiting = path.with_name(path.name + "-wal").exists()  # left by a recorder that was killed
     name = f"{path.absolute().as_uri()}?mode=ro{'' if waiting else '&immutable=1'}"
-    try:
-        with closing(sqlite3.connect(name, uri=True)) as bag:
-            yield from _tables(bag, path)
-    except (sqlite3.Error, UnicodeDecodeError, OverflowError, TypeError) as error:
-        raise GroundedError(
-            f"{path} can't be read as a ROS 2 bag: {error}; if it is damaged, "
-            f"`sqlite3 {path.name} .recover` saves what can be saved"
-        ) from None
+    with closing(sqlite3.connect(name, uri=True)) as bag:
+        yield from _tables(bag, path)
 
 
 def _tables(bag: Any, path: Path) -> Iterator[Record]:
@@ -107,12 +100,10 @@ def _definitions(bag: Any) -> dict[str, tuple[str, str]]:
 
 
 def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]:
-    query = "SELECT topic_id, timestamp, length(data), data FROM messages"
-    for topic, stamp, size, data in bag.execute(query):
+    query = "SELECT topic_id, timestamp, data FROM messages"
+    for topic, stamp, data in bag.execute(query):
         if topic not in channels:
             raise GroundedError(f"{path}: a message belongs to topic {topic}, which is not listed")
-        if size > MESSAGE_LIMIT:
-            raise GroundedError(f"{path}: a message has {size} bytes, the limit is {MESSAGE_LIMIT}")
         yield channels[topic], stamp, data
 
 
@@ -131,40 +122,22 @@ def standard_types() -> Any:
 
 
 def ros1_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a ROS 1 `.bag` file.
+    """Yield the records of a ROS 1 `.bag` file."""
+    from rosbags.rosbag1 import Reader
 
-    Raises:
-        GroundedError: if it is damaged, or was not closed.
-    """
-    from rosbags.rosbag1 import Reader, ReaderError
-
-    try:
-        with Reader(path) as bag:
-            yield Header("ros1", "rosbag")
-            numbers: dict[int, int] = {}
-            for i, one in enumerate(bag.connections):
-                numbers[one.id] = i
-                yield Schema(i + 1, one.msgtype, "ros1msg", one.msgdef.data.encode())
-                yield Channel(i, one.topic, "ros1", i + 1, {})
-            yield from batches((numbers[c.id], t, bytes(data)) for c, t, data in bag.messages())
-            yield End(data_crc=False)
-    except (ReaderError, AssertionError, KeyError, ValueError, OSError, MemoryError) as error:
-        raise GroundedError(
-            f"{path} can't be read as a ROS 1 bag: {error or type(error).__name__}; "
-            "if it was not closed, `rosbag reindex` repairs it"
-        ) from None
+    with Reader(path) as bag:
+        yield Header("ros1", "rosbag")
+        numbers: dict[int, int] = {}
+        for i, one in enumerate(bag.connections):
+            numbers[one.id] = i
+            yield Schema(i + 1, one.msgtype, "ros1msg", one.msgdef.data.encode())
+            yield Channel(i, one.topic, "ros1", i + 1, {})
+        yield from batches((numbers[c.id], t, bytes(data)) for c, t, data in bag.messages())
+        yield End(data_crc=False)
 
 
-def expanded(batch: Messages, limit: int = ROOM) -> Messages:
-    """Decompress a batch with individually compressed messages (rosbag2's zstd mode "message").
-
-    Args:
-        batch: of messages, compressed or not.
-        limit: largest size of a decompressed message [bytes].
-
-    Raises:
-        GroundedError: if a message expands to more than `limit` bytes.
-    """
+def expanded(batch: Messages) -> Messages:
+    """Decompress the messages of a batch one by one (rosbag2's zstd mode "message")."""
     import zstandard
 
     decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
@@ -174,8 +147,6 @@ def expanded(batch: Messages, limit: int = ROOM) -> Messages:
         data = batch.buffer[start:end]
         if data.startswith(b"\x28\xb5\x2f\xfd"):
             with decoder.stream_reader(data) as reader:
-                data = reader.read(limit + 1)
-            if len(data) > limit:
-                raise GroundedError(f"a compressed message expands to more than {limit} bytes")
+                data = reader.read()
         pieces.append((channel, time, data))
     return _batch(pieces)

@@ -15,7 +15,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded_trials.formats.budget import step
 from grounded_trials.formats.mcap_records import windows
 from grounded_trials.formats.messages import (
     Array,
@@ -34,7 +33,6 @@ from grounded_trials.formats.messages import (
     texts_equal,
 )
 
-ITEM_LIMIT = 100_000  # items of a list with items of different sizes, skipped one by one
 ZSTD = b"\x28\xb5\x2f\xfd"  # start of a message that rosbag2 compressed individually
 SIZE_LIMIT = 2**40  # [bytes] size of a type, so that positions don't overflow
 
@@ -135,7 +133,6 @@ class _CdrNode(Node):
         node = replace(self, type=part)
         if isinstance(part, Struct):
             for inner in _parts(part.fields, self.coding):
-                step()
                 node = node._at(node._after(inner))
             return node.pos
         assert isinstance(part, Text | Array)
@@ -163,8 +160,6 @@ class _CdrNode(Node):
     def _positions(self, item: Type, row: Ints, index: Ints) -> Ints:
         """Return the position of item index[j] of the list at the cursor of row[j]."""
         last = int(index.max(initial=0))
-        if last > ITEM_LIMIT:
-            raise BadMessage(self.rows[0], f"it has a list of more than {ITEM_LIMIT} {item} items")
         found, pos, node = self.pos[row], self.pos.copy(), replace(self, type=item)
         order = np.argsort(index, kind="stable")
         ends = np.searchsorted(index[order], np.arange(last + 1), "right")
@@ -173,7 +168,6 @@ class _CdrNode(Node):
         longest_first = np.argsort(-furthest, kind="stable")
         lives = np.searchsorted(-furthest[longest_first], -np.arange(last), "left")
         for i in range(last):
-            step()
             live = longest_first[: lives[i]]
             pos[live] = node.pick(live)._at(pos[live])._after(item)
             here = order[ends[i] : ends[i + 1]]
@@ -233,7 +227,6 @@ def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ..
     """Group fields into the fewest steps: adjacent fields of fixed size share one table."""
     parts: list[Type | _Table] = []
     for field in fields:
-        step()
         sizes = _sizes(field.type, coding)
         if sizes is None:
             parts.append(field.type)

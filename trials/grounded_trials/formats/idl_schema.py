@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from grounded_trials.formats.budget import step
 from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
 from grounded_trials.formats.schemas import COUNT_LIMIT, DEPTH_LIMIT, NUMBERS
 
@@ -41,7 +40,6 @@ _NUMBERS = {name: number for name, number in NUMBERS.items() if "int" in name} |
 _REFUSED = ("union", "map", "bitset", "bitmask", "any", "interface", "valuetype")
 MODULE_LIMIT = 16  # modules inside modules
 NAME_LIMIT = 256  # characters of a module's name
-FIELD_LIMIT = 200_000  # of all structs together
 
 
 def parse_idl(text: str, name: str) -> Struct:
@@ -75,7 +73,6 @@ class _Parser:
         self.built: dict[str, Struct] = {}
         self.aliases: dict[str, Type] = {}  # resolved typedefs
         self.counts: dict[str, int] = {}  # resolved constants
-        self.fields = 0
 
     def read(self, name: str) -> Struct:
         while self.pos < len(self.tokens):
@@ -85,8 +82,6 @@ class _Parser:
         return self.struct(name, 0)
 
     def take(self) -> str:
-        if self.pos % 1000 == 0:
-            step()
         token = self.tokens[self.pos]
         self.pos += 1
         return token
@@ -178,9 +173,6 @@ class _Parser:
                 fields += self.struct(base, depth + 1).fields
             for written in opened.parts:
                 fields += self.member(written, opened.scope, depth)
-            self.fields += len(fields)
-            if self.fields > FIELD_LIMIT:
-                raise BadSchema(f"its IDL definition has more than {FIELD_LIMIT} fields")
             # ROS gives a struct without members a dummy member of one byte.
             fields = [f for f in fields if f.name != "structure_needs_at_least_one_member"]
             self.built[name] = Struct(name.replace("::", "/"), tuple(fields))
@@ -262,7 +254,6 @@ class _Parser:
     def find(self, name: str, scope: tuple[str, ...]) -> str:
         """Return the full name of a definition, resolved from the innermost scope outwards."""
         if (name, scope) not in self.found:
-            step()
             for i in range(len(scope), -1, -1):
                 full = "::".join((*scope[:i], name.removeprefix("::")))
                 if full in self.defined:

@@ -16,12 +16,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded_trials.formats.budget import room
-
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
 _CHUNK = struct.Struct("<16xQII")  # times; size when decompressed, its CRC, length of a name
+PIECE = 2**17  # [bytes] decompressed at once; what comes before an error is kept
 _U64 = struct.Struct("<Q")
 
 
@@ -202,15 +201,15 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 }
 
 
-def chunk_content(content: bytes | memoryview, limit: int) -> tuple[bytes, bool]:
+def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[bytes, bool]:
     """Return the decompressed records of a chunk, and whether it has a checksum.
 
     Args:
         content: of the chunk record.
-        limit: largest size when decompressed [bytes].
+        packed: whether it may be compressed.
 
     Raises:
-        BadRecord: for a wrong checksum, and see `decompress`.
+        BadRecord: for a wrong checksum or size, another compression, or damaged content.
     """
     try:
         size, crc, length = _CHUNK.unpack_from(content)
@@ -220,82 +219,59 @@ def chunk_content(content: bytes | memoryview, limit: int) -> tuple[bytes, bool]
         raise BadRecord("it is too short for its contents") from None
     if start + stored > len(content):
         raise BadRecord("it is too short for its contents")
-    packed = bytes(content[start : start + stored])
-    data = decompress(name.decode("utf-8", "replace"), packed, size, limit)
+    if name and not packed:
+        raise BadRecord("it is compressed, which grounded's own files never are")
+    inside = bytes(content[start : start + stored])
+    data, wrong = decompress(name.decode("utf-8", "replace"), inside, size)
+    if wrong:
+        raise BadRecord(f"it can't be decompressed ({wrong})")
+    if len(data) != size:
+        raise BadRecord(f"it holds {len(data)} bytes, but states {size}")
     if crc and zlib.crc32(data) != crc:
         raise BadRecord("its checksum does not match its content")
     return data, bool(crc)
 
 
-def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
-    """Decompress the content of a chunk.
+def decompress(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
+    """Return a chunk's content up to an error or to size + 1 bytes, and the error, "" for none.
 
     Args:
         compression: "", "lz4" or "zstd".
         data: the compressed bytes.
         size: the decompressed size that the chunk states [bytes].
-        limit: the largest accepted size [bytes].
-
-    Raises:
-        BadRecord: for another compression, a size beyond the limit, or content of another size.
     """
-    if size > limit:
-        raise BadRecord(f"it claims {size} bytes when decompressed, the limit is {limit}")
-    if compression not in ("", "zstd", "lz4"):
-        raise BadRecord(f"its compression '{compression[:40]}' is unknown; expected zstd or lz4")
-    if compression == "":
-        content, error = data, None
-    else:
-        room(2 * size)
-        content, error = _expand(compression, data, size + 1, whole=True)
-    if error is not None:
-        raise BadRecord(f"it can't be decompressed ({error})")
-    if len(content) != size:
-        raise BadRecord(f"it holds {len(content)} bytes, but states {size}")
-    return content
-
-
-def decompress_part(compression: str, data: bytes, limit: int) -> bytes:
-    """Decompress as much as possible of a chunk without its end, at most `limit` bytes."""
-    return _expand(compression, data, limit, whole=False)[0][:limit]
-
-
-def _expand(
-    compression: str, data: bytes, limit: int, *, whole: bool
-) -> tuple[bytes, Exception | None]:
-    """Decompress up to about `limit` bytes, or to an error; return the content and the error.
-
-    Unless `whole`, decompress piece by piece, so that the content before an error is kept.
-    """
+    if not compression:
+        return data, ""
+    known = {"zstd": _zstd, "lz4": _lz4}
+    if compression not in known:
+        return b"", f"its compression '{compression[:40]}' is unknown; expected zstd or lz4"
     parts: list[bytes] = []
-    size, pieces = 0, {"zstd": _zstd, "lz4": _lz4}.get(compression)
+    have, wrong = 0, ""
     try:
-        for part in pieces(data, limit, whole) if pieces else (data,) * (compression == ""):
+        for part in known[compression](data):
             parts.append(part)
-            size += len(part)
-            room(2 * size)
-            if size >= limit:
+            have += len(part)
+            if have > size:
                 break
-    except (RuntimeError, EOFError, ValueError, MemoryError) as error:
-        return b"".join(parts), error
-    return b"".join(parts), None
+    except MemoryError:
+        raise
+    except Exception as error:  # each library has its own
+        wrong = str(error)
+    return b"".join(parts)[: size + 1], wrong
 
 
-def _zstd(data: bytes, limit: int, whole: bool) -> Iterator[bytes]:
+def _zstd(data: bytes) -> Iterator[bytes]:
     import zstandard
 
-    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-    try:
-        with decoder.stream_reader(data) as reader:
-            while part := reader.read(limit if whole else 2**17):
-                yield part
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None
+    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as reader:
+        while part := reader.read(PIECE):
+            yield part
 
 
-def _lz4(data: bytes, limit: int, whole: bool) -> Iterator[bytes]:
+def _lz4(data: bytes) -> Iterator[bytes]:
     from lz4.frame import LZ4FrameDecompressor
 
-    decoder, step = LZ4FrameDecompressor(), max(1, len(data)) if whole else 2**12
-    for start in range(0, len(data), step):
-        yield decoder.decompress(data[start : start + step], max_length=limit)
+    decoder, part = LZ4FrameDecompressor(), data
+    while not decoder.eof and (part or decoder.needs_input is False):
+        yield decoder.decompress(part, max_length=PIECE)
+        part = b""

@@ -5,8 +5,7 @@ section (header, schemas, channels, messages, chunks of them, attachments, metad
 DataEnd record that may hold the CRC of everything before it. The summary that follows ends with the
 footer, which may hold the summary's CRC. The contents of the summary are not used here.
 
-A record or chunk larger than a limit is refused before memory is allocated for it. Also refused are
-ids shared by two schemas or channels, and messages logged after 2262 (2^63 ns).
+Refused are ids shared by two schemas or channels, and messages logged after 2262 (2^63 ns).
 
 The mcap package is not used for reading: its stream reader takes 5 us per record, returns short
 records at the end of a truncated file, and checks neither summary nor attachments; importing it
@@ -24,7 +23,6 @@ from typing import BinaryIO
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -46,7 +44,6 @@ from grounded_trials.formats.mcap_records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_LIMIT = 512 * 2**20  # [bytes] size of a record, and of a decompressed chunk
 BLOCK = 4 * 2**20  # [bytes] read at a time
 SMALL = 2**16  # [bytes] chunks smaller than this are joined ...
 TOGETHER = 2**20  # [bytes] ... up to this size
@@ -70,30 +67,30 @@ class DamagedFile(GroundedError):
         super().__init__(f"{name}: {found} (at byte {offset}); {advice}", then)
 
 
-def read_records(
-    source: BinaryIO | bytes, name: str, *, limit: int = RECORD_LIMIT
-) -> Iterator[Record]:
+def read_records(source: BinaryIO | bytes, name: str, *, packed: bool = True) -> Iterator[Record]:
     """Yield the records of an MCAP stream in order, ending with `End`.
 
     Args:
         source: a seekable binary file, read from its beginning, or the bytes of one.
         name: of the file, for messages.
-        limit: largest record, and largest chunk when decompressed [bytes].
+        packed: whether chunks may be compressed; if not, reading takes time and memory in
+            proportion to the size of the file.
 
     Raises:
         DamagedFile: if it is not a complete, undamaged MCAP file.
     """
-    yield from _Walk(source, name, limit).records()
+    yield from _Walk(source, name, packed).records()
 
 
 class _Walk:
     """One pass over a file; `buffer[pos:]` has been read, but not used yet."""
 
-    def __init__(self, source: BinaryIO | bytes, name: str, limit: int) -> None:
+    def __init__(self, source: BinaryIO | bytes, name: str, packed: bool) -> None:
+        self.packed = packed
         self.buffer, self.pos, self.base = b"", 0, 0
         if isinstance(source, bytes):
             self.buffer, source = source, io.BytesIO()
-        self.stream, self.name, self.limit = source, name, limit
+        self.stream, self.name = source, name
         self.size = len(self.buffer) or source.seek(0, 2)
         source.seek(0)
         self.crc, self.crc_pos = 0, 0  # of the bytes up to buffer[crc_pos]
@@ -134,7 +131,6 @@ class _Walk:
         self.base += self.pos
         parts = [self.buffer[self.pos :]]
         have = len(parts[0])
-        room(2 * count)
         while have < count:
             block = self.stream.read(max(BLOCK, count - have))
             if not block:
@@ -146,11 +142,10 @@ class _Walk:
     def records(self) -> Iterator[Record]:
         self._magic()
         while True:
-            step()
             self.need(9, "a record's head; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
             self.messages |= opcode in (CHUNK, MESSAGE)
-            self.need(9 + self._allowed(length), _NAMES.get(opcode, f"a record of type {opcode}"))
+            self.need(9 + length, _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:
                 if opcode != CHUNK:
                     yield from self._together()
@@ -186,11 +181,6 @@ class _Walk:
             raise DamagedFile(self.name, 0, found, advice)
         self.need(8, "its first 8 bytes")
         self.pos += 8
-
-    def _allowed(self, length: int) -> int:
-        if length > self.limit:
-            raise self.damaged(f"a record claims {length} bytes, the limit is {self.limit}")
-        return int(length)
 
     def _run_of_messages(self) -> Messages:
         """Return all consecutive message records in the buffer."""
@@ -240,7 +230,7 @@ class _Walk:
     def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
-                yield from self._chunk(chunk_content(content, self.limit)[0])
+                yield from self._chunk(chunk_content(content, packed=self.packed)[0])
             elif opcode in PARSERS:
                 yield self._defined(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
@@ -324,7 +314,6 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
             assert isinstance(record, Schema | Channel)
             yield record
         pos += 9 + length
-        step()
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:

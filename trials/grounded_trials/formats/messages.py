@@ -18,8 +18,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded_trials.formats.budget import room, step
-
 
 @dataclass(frozen=True)
 class Number:
@@ -98,10 +96,6 @@ class Dynamic:
 
 
 Type = Number | Text | Array | Struct | Dynamic
-
-ROW_LIMIT, ROW_BYTES = 10_000_000, 64  # values that a path may find in a batch; memory for each
-# [bytes] largest memory for parsed JSON: for each object, each other value, each byte of text
-OBJECT, VALUE, LETTER = 250, 90, 2
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -182,9 +176,6 @@ def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
         first = counts + start
         last = np.where(first < 0, first - 1, first)
     lengths = np.maximum(last - first + 1, 0)
-    if (total := int(lengths.sum())) > ROW_LIMIT:
-        raise BadPath(f"it finds {total} values at once; select single items")
-    room(ROW_BYTES * total)
     rows = np.repeat(np.arange(len(counts)), lengths)
     offset = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return rows, first[rows] + offset
@@ -211,14 +202,10 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
     Raises:
         BadMessage: for a message that is not JSON.
     """
-    objects, taken = [], 0
+    objects = []
     for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
-        text = buffer[a:b]
-        taken += OBJECT * text.count(b"{") + VALUE * (text.count(b",") + text.count(b"["))
-        taken += LETTER * len(text)
-        room(taken)
         try:
-            objects.append(json.loads(text))
+            objects.append(json.loads(buffer[a:b]))
         except (ValueError, RecursionError) as error:
             raise BadMessage(i, f"it is not JSON: {error}") from None
     return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
@@ -239,7 +226,6 @@ class _JsonNode(Node):
         return next((tuple(o) for o in self.objects if isinstance(o, dict)), ())
 
     def field(self, name: str) -> _JsonNode:
-        step()
         index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
         inner = _as_array([self.objects[i][name] for i in index])
         return replace(self, rows=self.rows[np.array(index, dtype=np.int64)], objects=inner)

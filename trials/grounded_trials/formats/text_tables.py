@@ -14,12 +14,12 @@ import csv
 import re
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
@@ -27,7 +27,9 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import column_name, is_time, table_records, time_among
+from grounded_trials.within import within
 
+T = TypeVar("T")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # characters read of a line
 BEFORE = 20  # rows before the last one that show how many digits its last cell should have
@@ -78,8 +80,16 @@ def csv_records(path: Path) -> Iterator[Record]:
 
 def column_units(path: Path) -> dict[str, str]:
     """Return the units in a text table's column names, `x [m]` or `x (m)`, by message path."""
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        return {}
+    return _of_text(path, _column_units) or {}
+
+
+def _of_text(path: Path, function: Callable[[Path], T]) -> T | None:
+    """Return function(path) of a text table; None of another file."""
+    text = path.suffix.lower() in (".csv", ".tsv", ".txt")
+    return within(path, path.stat().st_size, function, path) if text else None
+
+
+def _column_units(path: Path) -> dict[str, str]:
     with _opened(path) as stream:
         head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
     said = {
@@ -94,8 +104,10 @@ def states_time_unit(path: Path) -> bool:
 
     Its column of times says that they are in seconds (`time_s`, `time [s]`), or holds times of day.
     """
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        return False
+    return bool(_of_text(path, _states_time_unit))
+
+
+def _states_time_unit(path: Path) -> bool:
     with _opened(path) as stream:
         lines = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
     head = _head(lines, path)
@@ -110,8 +122,10 @@ def table_remarks(path: Path) -> list[str]:
     The last row may be incomplete; it is left out. The last column may be empty in every row, so
     that one name may be too many.
     """
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
-        return []
+    return _of_text(path, _table_remarks) or []
+
+
+def _table_remarks(path: Path) -> list[str]:
     with _opened(path) as stream:
         head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
         cut, empty = _cut_in(stream, head), _empty_last(stream, head)
@@ -167,8 +181,8 @@ def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> Grounde
     """Return the error for a row with a wrong number of cells, saying what may be its cause."""
     names, has = len(head.names), len(cells)
     text = f"{path}, line {line} has {has} cells, but line {head.line} names {names}"
-    whole = all("." not in cell and _share([cell]) == 1 for cell in cells)
-    if head.mark == "," and names < has <= 2 * names and whole:
+    twice = head.mark == "," and names < has <= 2 * names
+    if twice and all("." not in cell and _share([cell]) == 1 for cell in cells):
         return GroundedError(
             f"{text} columns: the decimal sign seems to be a comma, as the separator is, so a row "
             "can be read in several ways. Export the table again with a point as decimal sign, or "

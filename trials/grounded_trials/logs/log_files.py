@@ -9,29 +9,35 @@ it.
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
+from zipfile import BadZipFile, ZipFile
 
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded_trials.formats.budget import budget
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.plain_file import open_file, read_file
+from grounded_trials.within import within
 
+P = ParamSpec("P")
+T = TypeVar("T")
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
 KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
 NEWEST = 3  # most logs named in place of one that does not exist
-EXPANDED = 4 * 2**30  # [bytes] largest size of a decompressed file
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _LISTED = re.compile(
-    r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
+    r"^[ \t]*-[ \t]+(?:path:[ \t]*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?[ \t\r]*$",
+    re.MULTILINE,
 )
+_REMEDIES = {
+    "ROS 2 bag": "; if it is damaged, `sqlite3 FILE .recover` saves what can be saved",
+    "ROS 1 bag": "; if it was not closed, `rosbag reindex` repairs it",
+}
 _NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
 _DIGITS = re.compile(r"(\d+)")
 
@@ -85,12 +91,10 @@ def _nearby(path: Path) -> str:
     """Return advice on a file that does not exist, to append to the message."""
     from difflib import get_close_matches
 
-    from grounded_trials.formats.tables import is_candidate
-
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: give a path relative to the current folder"
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
-    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not is_candidate(p)]
+    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not _is_candidate(p)]
     logs = sorted(there, key=lambda p: -_written(p))
     if logs:
         plain = _DIGITS.sub("0", path.stem.lower())
@@ -104,6 +108,20 @@ def _nearby(path: Path) -> str:
         newest = listed([p.name for p in logs[:NEWEST]])
         return f": the newest of the {len(logs)} logs in its folder are {newest}"
     return ": give the path of a log or of a bag's folder, relative to the current folder"
+
+
+def _is_candidate(path: Path) -> bool:
+    """Return whether a file is a candidate that was exported as .npz, by the names in it."""
+    from grounded_trials.formats.tables import CANDIDATE
+
+    with suppress(OSError, GroundedError, BadZipFile):
+        return within(path, path.stat().st_size, _names_in, path) >= CANDIDATE
+    return False
+
+
+def _names_in(path: Path) -> set[str]:
+    with ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
 def _written(path: Path) -> float:
@@ -157,7 +175,7 @@ def empty(path: Path) -> GroundedError:
 
 
 def log_records(path: Path) -> Iterator[Record]:
-    """Yield the records of one file of any supported format.
+    """Yield the records of one file of any supported format; only in `read_apart`.
 
     Raises:
         GroundedError: if it can't be read, is damaged, or is not a log.
@@ -169,7 +187,7 @@ def log_records(path: Path) -> Iterator[Record]:
         if not head.startswith(_ZSTD):
             yield from _by_format(path, head, stream)
             return
-        with tempfile.TemporaryDirectory(prefix="grounded-") as room:
+        with tempfile.TemporaryDirectory() as room:
             inner = Path(room) / path.stem
             _expand(path, stream, inner)
             with inner.open("rb") as expanded:
@@ -177,24 +195,33 @@ def log_records(path: Path) -> Iterator[Record]:
 
 
 def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
-    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
-        yield from map(_plain, read_records(stream, str(path)))
-        return
     from grounded_trials.formats import bags, tables, text_tables
 
-    begins = {
-        bags.SQLITE: bags.sqlite_records,
-        bags.ROS1: bags.ros1_records,
-        tables.ULOG: tables.ulog_records,
-        tables.ZIP: tables.npz_records,
+    begins: dict[bytes, tuple[str, Callable[[Path], Iterator[Record]]]] = {
+        bags.SQLITE: ("ROS 2 bag", bags.sqlite_records),
+        bags.ROS1: ("ROS 1 bag", bags.ros1_records),
+        tables.ULOG: ("PX4 log", tables.ulog_records),
+        tables.ZIP: ("NumPy archive", tables.npz_records),
     }
-    reader = next((read for magic, read in begins.items() if head.startswith(magic)), None)
-    if reader is None and path.suffix not in (".csv", ".tsv", ".txt"):
+    found = next((one for magic, one in begins.items() if head.startswith(magic)), None)
+    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
+        found = "MCAP log", lambda path: read_records(stream, str(path))
+    elif found is None and path.suffix in (".csv", ".tsv", ".txt"):
+        found = "table", text_tables.csv_records
+    if found is None:
         raise GroundedError(
             f"{path} is not a log: it begins with {head[:8]!r}; expected MCAP, ROS 2 .db3, ROS 1 "
             ".bag, .csv, .npz or PX4 .ulg"
         )
-    yield from map(_plain, (reader or text_tables.csv_records)(path))
+    kind, read = found
+    try:
+        yield from map(_plain, read(path))
+    except GroundedError:
+        raise
+    except Exception as error:  # a decoder raises whatever a damaged file leads to
+        why = f"{type(error).__name__}: {error}"
+        remedy = _REMEDIES.get(kind, "")
+        raise GroundedError(f"{path} can't be read as a {kind}: {why[:500]}{remedy}") from error
 
 
 def _plain(record: Record) -> Record:
@@ -215,30 +242,28 @@ def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
     import zstandard
 
     stream.seek(0)
-    free = shutil.disk_usage(target.parent).free
-    limit, size = min(EXPANDED, free // 2), 0
+    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
     try:
-        decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-        with decoder.stream_reader(stream) as reader, target.open("wb") as out:
-            while piece := reader.read(2**20):
-                size += len(piece)
-                if size > limit:
-                    raise GroundedError(f"{path} expands to more than {limit} bytes")
-                out.write(piece)
+        with target.open("wb") as out:
+            decoder.copy_stream(stream, out)
     except (zstandard.ZstdError, OSError) as error:
-        raise GroundedError(f"{path} can't be decompressed: {error}") from None
+        raise GroundedError(f"{path} can't be decompressed: {error}") from error
 
 
-@contextmanager
-def reading(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[Path, ...]]:
-    """Provide the files of a log, with a budget of time and memory for decoding them.
+def read_apart(
+    paths: str | Path | Sequence[str | Path],
+    function: Callable[Concatenate[tuple[Path, ...], P], T],
+    *args: P.args,
+    **kwargs: P.kwargs,
+) -> T:
+    """Return function(files, ...) for the files of a log, computed in a child process.
 
     Raises:
-        GroundedError: as `log_files`, and if the budget is exceeded.
+        GroundedError: as `log_files` and `within`.
     """
     files = log_files(paths)
-    with budget(str(files[0]), files):
-        yield files
+    size = sum(file.stat().st_size for file in files)
+    return within(files[0], size, function, files, *args, **kwargs)
 
 
 def kind_of(path: Path) -> str:
@@ -247,12 +272,24 @@ def kind_of(path: Path) -> str:
     Damage is ignored here; it is reported when the file is read.
     """
     try:
-        with reading(path):
-            for record in log_records(path):
-                if isinstance(record, Metadata) and record.name == "grounded":
-                    return record.data.get("format", "")
-                if isinstance(record, Messages):
-                    return ""
+        with open_log(path) as stream:
+            head = stream.read(len(MAGIC))
+        if head.startswith(_ZSTD):
+            return read_apart(path, _stated_packed)
+        with open_log(path) as stream:
+            return _stated(read_records(stream, str(path), packed=False)) if head == MAGIC else ""
     except GroundedError:
         return ""
+
+
+def _stated_packed(files: tuple[Path, ...]) -> str:
+    return _stated(log_records(files[0]))
+
+
+def _stated(records: Iterator[Record]) -> str:
+    for record in records:
+        if isinstance(record, Metadata) and record.name == "grounded":
+            return record.data.get("format", "")
+        if isinstance(record, Messages):
+            return ""
     return ""

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import IO
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.budget import OverBudget, budget, keep
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -32,6 +31,7 @@ from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
+from grounded_trials.within import within
 from grounded_trials.wording import count
 
 MOST_LOSSES = 50  # number of losses listed
@@ -78,10 +78,19 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
         raise GroundedError(f"{target} does not end in .mcap, the format that is written: add it")
     if not target.parent.is_dir():
         raise GroundedError(f"{target} can't be written: its folder does not exist; create it")
-    with open_log(source) as stream, budget(str(source), [source]):
-        if not stream.read(1):
-            raise empty(source)
-        stream.seek(0)
+    with open_log(source) as stream:
+        size = stream.seek(0, 2)
+    if not size:
+        raise empty(source)
+    try:
+        return within(source, size, _recover, source, target)
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
+
+
+def _recover(source: Path, target: Path) -> Recovery:
+    with open_log(source) as stream:
         salvage = Salvage(stream, str(source))
         try:
             with target.open("xb") as out:
@@ -90,13 +99,9 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
                     copy.add(record)
                 copy.finish()
             sync_folder(target.parent)
-        except (OSError, OverBudget) as error:
-            target.unlink(missing_ok=True)
-            if isinstance(error, OverBudget):
-                raise
-            raise GroundedError(f"{target} can't be written: {error.strerror}") from None
+        except OSError as error:
+            raise GroundedError(f"{target} can't be written: {error.strerror}") from error
     if not copy.anything:
-        target.unlink()
         why = salvage.losses[0] if salvage.losses else "it is a log without messages"
         raise GroundedError(
             f"{source}: nothing can be saved: {why}; expected an MCAP log, intact or damaged; look "
@@ -159,7 +164,6 @@ class _Copy:
         self.channels: dict[int, Channel] = {}
         self.numbers: dict[int, int] = {}
         self.waiting: list[Messages] = []
-        self.last = b""  # the buffer of the last of them
         self.counts: Counter[str] = Counter()
         self.homeless = 0
         self.anything = False
@@ -206,8 +210,6 @@ class _Copy:
                 if final:
                     self.homeless += len(own)
                 else:
-                    keep(len(own.buffer) if own.buffer is not self.last else 40 * len(own))
-                    self.last = own.buffer
                     self.waiting.append(own)
                 continue
             if identity not in self.numbers:

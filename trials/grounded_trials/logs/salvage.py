@@ -15,7 +15,6 @@ from typing import BinaryIO
 
 import numpy as np
 
-from grounded_trials.formats.budget import step
 from grounded_trials.formats.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -34,11 +33,10 @@ from grounded_trials.formats.mcap_records import (
     Schema,
     batch,
     chunk_content,
-    decompress_part,
+    decompress,
 )
 from grounded_trials.formats.mcap_walk import (
     MAGIC,
-    RECORD_LIMIT,
     again,
     chunk_records,
     message_positions,
@@ -83,7 +81,6 @@ class Salvage:
         pos = self._first()
         dropped_chunk = False
         while pos is not None and pos < self.size - len(MAGIC):
-            step()
             end = plausible(self.stream, self.size, pos)
             if end is None:
                 yield from self._flush()
@@ -149,7 +146,7 @@ class Salvage:
                 self.dropped.append(_SPAN.unpack_from(content))
 
     def _chunk(self, content: bytes) -> Iterator[Record]:
-        data, checked = chunk_content(content, RECORD_LIMIT)
+        data, checked = chunk_content(content)
         for record in list(chunk_records(data)):
             if isinstance(record, Messages) and not checked:
                 self._outside += len(record)
@@ -217,7 +214,7 @@ class Salvage:
 
     def _cut(self, pos: int) -> Iterator[Record]:
         """Yield the intact parts of the record at `pos`, in which the file ends."""
-        rest = read_at(self.stream, pos, min(self.size - pos, RECORD_LIMIT))
+        rest = read_at(self.stream, pos, self.size - pos)
         saved = 0
         if len(rest) > 49 and rest[0] == CHUNK:
             for record in self._cut_chunk(rest[9:]):
@@ -229,11 +226,13 @@ class Salvage:
     def _cut_chunk(self, content: bytes) -> Iterator[Record]:
         try:
             fields = Fields(content)
-            fields.skip(28)
+            fields.skip(16)
+            size = fields.uint(64)
+            fields.skip(4)
             compression = fields.text()
         except BadRecord:
             return
-        data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
+        data = decompress(compression, content[fields.pos + 8 :], size)[0]
         try:
             for record in list(chunk_records(data, cut=True)):
                 yield from self._sound(record)
@@ -258,7 +257,7 @@ def plausible(stream: BinaryIO, size: int, offset: int) -> int | None:
         return None
     opcode, length = _HEAD.unpack(head)
     end = offset + 9 + int(length)
-    if opcode == 0 or opcode > DATA_END or length > RECORD_LIMIT or end > size:
+    if opcode == 0 or opcode > DATA_END or end > size:
         return None
     if opcode == MESSAGE and length < MESSAGE_HEADER:
         return None
@@ -281,7 +280,6 @@ def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
     """Return the first offset from `start` on with a chain of records; None if there is none."""
     block, count = start, _BLOCKS[0]
     while block < size:
-        step()
         data = np.frombuffer(read_at(stream, block, count + 8), dtype=np.uint8)
         if len(data) < 9:
             return None

@@ -18,7 +18,6 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import listed
-from grounded_trials.formats.budget import keep
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.message_path import MessagePath, parse_path
@@ -37,11 +36,10 @@ from grounded_trials.formats.messages import (
 from grounded_trials.formats.path_walk import Bound, NoField, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import struct_of
-from grounded_trials.logs.log_files import log_records, reading
+from grounded_trials.logs.log_files import log_records, read_apart
 
 Clock = Literal["header", "log", "publish"]
 FEW = 8  # topics of a log that are all named where one is missing
-SAMPLE_BYTES = 48  # memory for a sample until it is on the grid
 JSON_PIECE = 2**20  # [bytes] of JSON parsed at once, at least one message
 
 
@@ -97,21 +95,24 @@ def read_signals(
         GroundedError: for a damaged file, a missing topic or field, a message with more than one
             value for a signal, or a clock that a topic does not have.
     """
+    return read_apart(paths, _read_signals, specs)
+
+
+def _read_signals(files: tuple[Path, ...], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
     collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
-    with reading(paths) as files:
-        for path in files:
-            log = _Log(str(path), list(collectors.values()))
-            for record in log_records(path):
-                if isinstance(record, Schema):
-                    log.schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    log.channel(record)
-                elif isinstance(record, Messages):
-                    log.messages(record)
-            for collector in collectors.values():
-                collector.topics |= set(log.topics)
-        _refuse_missing(collectors, str(files[0]))
-        return {name: collector.series() for name, collector in collectors.items()}
+    for path in files:
+        log = _Log(str(path), list(collectors.values()))
+        for record in log_records(path):
+            if isinstance(record, Schema):
+                log.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                log.channel(record)
+            elif isinstance(record, Messages):
+                log.messages(record)
+        for collector in collectors.values():
+            collector.topics |= set(log.topics)
+    _refuse_missing(collectors, str(files[0]))
+    return {name: collector.series() for name, collector in collectors.items()}
 
 
 def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
@@ -286,7 +287,6 @@ class _Collector:
                 f"the message logged at {batch.log_times[at] * 1e-9:.3f} s has several values for "
                 'it; name one item, or add a filter such as {name=="arm"}'
             )
-        keep(SAMPLE_BYTES * len(found.rows))
         self.parts.append((self._times(batch, found), found.values, batch.log_times[found.rows]))
 
     def _times(self, batch: Messages, found: Values) -> Ints:

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
+from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
 from grounded_trials.store.own_files import (
     CANDIDATE,
@@ -26,8 +27,6 @@ from grounded_trials.store.own_files import (
     stated,
     with_units,
 )
-
-DEPTH_LIMIT = 10_000  # largest number of past values of one input
 
 
 def encoded_candidate(
@@ -58,7 +57,7 @@ def encoded_candidate(
     from grounded_trials.formats.mcap_whole import Column, whole_file
     from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
 
-    _refuse_unfinite(policy)
+    _refuse_faulty(policy)
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
     states, inputs = np.asarray(predicted_states, float), np.asarray(predicted_inputs, float)
     for array, shape in ((states, (H + 1, n)), (inputs, (H, m))):
@@ -124,7 +123,7 @@ def read_candidate(
         gain=gain.reshape(-1, m, nz) if gain.size else None,
         reference=reference if reference.size else None,
     )
-    _refuse_unfinite(policy, own.name)
+    _refuse_faulty(policy, own.name)
     x, u = own.doubles("/predicted_state", states), own.doubles("/predicted_input", inputs)
     if (len(x), H, len(u)) != (steps + 1, steps, steps):
         raise GroundedError(
@@ -184,8 +183,8 @@ def _refuse_rewritten(own: OwnFile, arrays: Iterable[Array]) -> None:
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
-    if not all(d.is_integer() and 0 <= d <= DEPTH_LIMIT for d in depths.tolist()):
-        raise own.bad("policy.depths", f"must be integers from 0 to {DEPTH_LIMIT}")
+    if not all(d.is_integer() and 0 <= d <= WIDTH for d in depths.tolist()):
+        raise own.bad("policy.depths", f"must be integers from 0 to {WIDTH}")
     return tuple(int(d) for d in depths)
 
 
@@ -200,14 +199,6 @@ def _policy_table(policy: Policy) -> dict[str, Any]:
     }
 
 
-def _refuse_unfinite(policy: Policy, name: str = "candidate") -> None:
-    for part in ("feedforward", "gain", "reference", "past"):
-        values = getattr(policy, part)
-        if values is not None and not np.isfinite(values).all():
-            k = int(np.argwhere(~np.isfinite(values))[0][0])
-            raise GroundedError(
-                f"{name}: {part} is not a finite number at step {k} ({k * policy.dt:.3f} s); "
-                "such a policy is not safe to run and is not written"
-            )
-    if np.isnan(policy.low).any() or np.isnan(policy.high).any():
-        raise GroundedError(f"{name}: a limit of an input is not a number")
+def _refuse_faulty(policy: Policy, name: str = "candidate") -> None:
+    if wrong := fault(policy):
+        raise GroundedError(f"{name}: {wrong}; such a policy is not safe to run and is not written")

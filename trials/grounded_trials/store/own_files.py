@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded_trials.formats.budget import budget, keep
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -42,10 +41,10 @@ from grounded_trials.formats.protobuf import (
 )
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.plain_file import read_file
+from grounded_trials.within import within
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages per channel
-MESSAGE_BYTES = 48  # memory of a message in addition to its numbers
 NAME_LIMIT = 1000  # number of states or of inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
@@ -132,13 +131,17 @@ class OwnFile:
         """Return the numbers of a topic's messages, (N, len(names))."""
         type, batches = self._topic(topic, names, listed=False)
         fields = [(double_tag(type.by_name[name].number), 1) for name in names]
-        blocks = []
-        for batch in batches:
-            values = uniform_doubles(batch.buffer, batch.starts, batch.ends, fields)
-            if values is None:
-                values = [self._values(type, batch, name)[0] for name in names]
-            blocks.append(np.column_stack(values))
-        return np.concatenate(blocks or [np.zeros((0, len(names)))])
+        read = [uniform_doubles(b.buffer, b.starts, b.ends, fields) for b in batches]
+        blocks = [values for values in read if values is not None]
+        if len(blocks) < len(batches):  # laid out otherwise: it may take long
+            blocks = within(self.name, len(self.data), self._doubles, type, batches, names)
+        joined = [np.column_stack(values) for values in blocks]
+        return np.concatenate(joined or [np.zeros((0, len(names)))])
+
+    def _doubles(
+        self, type: Struct, batches: list[Messages], names: list[str]
+    ) -> list[list[Array]]:
+        return [[self._values(type, batch, name)[0] for name in names] for batch in batches]
 
     def lists(self, topic: str, sizes: Mapping[str, int]) -> list[Array]:
         """Return the lists of a topic's messages, (N, size) each; (0, size) if all are empty."""
@@ -150,6 +153,11 @@ class OwnFile:
         uniform = [values for values in read if values is not None]
         if uniform and len(uniform) == len(batches):
             return [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
+        return within(self.name, len(self.data), self._lists, topic, type, batches, sizes)
+
+    def _lists(
+        self, topic: str, type: Struct, batches: list[Messages], sizes: Mapping[str, int]
+    ) -> list[Array]:
         found = []
         for name, size in sizes.items():
             parts = [self._values(type, batch, name) for batch in batches]
@@ -226,18 +234,13 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     """
     if not isinstance(source, bytes):
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
-    with budget(name, len(source)):
-        return _read(source, name, kind)
-
-
-def _read(source: bytes, name: str, kind: str) -> OwnFile:
     meta: dict[str, str] | None = None
     attachments: dict[str, bytes] = {}
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
     counts: Counter[str] = Counter()
-    for record in read_records(source, name, limit=FILE_LIMIT):
+    for record in read_records(source, name, packed=False):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
         elif isinstance(record, Attachment):
@@ -252,7 +255,6 @@ def _read(source: bytes, name: str, kind: str) -> OwnFile:
                 counts[topic] += len(own)
                 if counts[topic] > STEP_LIMIT:
                     raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
-                keep(MESSAGE_BYTES * len(own))
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "its checksum is missing")
     if meta is None or meta.get("format") != kind:

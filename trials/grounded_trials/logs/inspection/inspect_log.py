@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.budget import OverBudget, keep
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.formats.message_path import WORLD, is_topic, parse_path
@@ -36,12 +35,11 @@ from grounded_trials.formats.path_walk import (
     number_paths,
 )
 from grounded_trials.formats.text_tables import table_remarks
-from grounded_trials.logs.log_files import log_records, reading
+from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.signals import Decoder, decoder_of
 
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
-TIME_BYTES = 40  # memory for the times of a message
 GAP = 10.0  # intervals; longer gaps are reported
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 SAME = 0.95  # correlation above which two signals show the same motion
@@ -149,19 +147,22 @@ def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
     Raises:
         GroundedError: if a file can't be read, or is not a log.
     """
+    return read_apart(paths, _inspected)
+
+
+def _inspected(files: tuple[Path, ...]) -> LogReport:
     look = _Look()
-    with reading(paths) as files:
-        for path in files:
-            look.new_file()
-            try:
-                for record in log_records(path):
-                    look.add(record)
-            except DamagedFile as error:
-                if not look.headers:
-                    raise
-                look.damage = str(error)
-                break
-        return look.report(files)
+    for path in files:
+        look.new_file()
+        try:
+            for record in log_records(path):
+                look.add(record)
+        except DamagedFile as error:
+            if not look.headers:
+                raise
+            look.damage = str(error)
+            break
+    return look.report(files)
 
 
 class _Look:
@@ -237,7 +238,6 @@ class _Range:
 
     def add(self, values: Floats, log_times: Ints) -> None:
         if self.samples is not None:
-            keep(16 * len(values))
             self.samples.append((log_times, values))
         finite = values[np.isfinite(values)]
         self.count += len(values)
@@ -266,7 +266,6 @@ class _Topic:
 
     def add(self, batch: Messages) -> None:
         self.count += len(batch)
-        keep(TIME_BYTES * len(batch))
         self.log_times.append(batch.log_times)
         if self.problem or not len(batch):
             return
@@ -306,11 +305,8 @@ class _Topic:
                 found = _Range(bind(path, self.decoder.type))
                 found.samples = [] if measured_kind(path.text) else None
                 self.ranges[path.text] = found
-            except BadPath:
+            except (BadPath, GroundedError):
                 continue
-            except GroundedError as error:
-                if isinstance(error, OverBudget):
-                    raise
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)

@@ -22,6 +22,7 @@ from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import LENGTHS, Stated, factor_between, may_be
+from grounded_trials.within import OverBudget
 
 SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
@@ -298,6 +299,8 @@ class Signals:
         specs = {p: SignalSpec(p, clock=_clock(p, self._clocks)) for p in more}  # type: ignore[arg-type]
         try:
             series = read_signals(self._files, specs) if specs else {}
+        except OverBudget:
+            raise
         except GroundedError:
             series = _one_by_one(self._files, specs)
         for path, one in series.items():

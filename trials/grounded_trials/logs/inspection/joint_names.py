@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from grounded_trials.formats.mcap_records import Channel, Messages
 from grounded_trials.logs.inspection.inspect_guess import COMMAND_TOPIC, Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
-from grounded_trials.logs.log_files import log_records
+from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
@@ -50,8 +51,12 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
     A topic whose messages name different joints is left out, since its indices are ambiguous.
     """
     wanted = {t.topic for t in log.topics if t.type.endswith("/JointState") and t.messages}
+    return read_apart(log.files, _joint_names, wanted) if wanted else {}
+
+
+def _joint_names(files: tuple[Path, ...], wanted: set[str]) -> dict[str, tuple[str, ...]]:
     found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
-    for file in log.files if wanted else ():
+    for file in files:
         channels: dict[int, Channel] = {}
         for record in log_records(file):
             if isinstance(record, Channel):

@@ -87,6 +87,11 @@ def export_candidate(
     identity = candidate_named(workspace, identity, now)
     handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
     about = about_of(identity, handed.meta)
+    if form == "npz":
+        try:
+            onboard.check_limits(identity, handed.candidate.policy)
+        except ValueError as error:
+            raise GroundedError(str(error)) from None
     write_atomically(path, known[form](handed.candidate.policy, units_of(workspace), about))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:

@@ -20,7 +20,7 @@ from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import kind_of, log_files, log_records
+from grounded_trials.logs.log_files import kind_of, log_files, log_records, read_apart
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
@@ -264,13 +264,18 @@ def mapping_of(workspace: Folder, path: Path) -> LogMapping:
             "file of a run",
             NextCommand("ingest", (str(max(own, key=lambda file: file.stat().st_mtime)),)),
         )
-    for file in files:
-        next(iter(log_records(file)), None)
+    read_apart(files, _first_records)
     raise GroundedError(
         f"{path} is not a trial written by grounded, and grounded.toml has no [log] table to map "
         "it: `inspect` prints one",
         NextCommand("inspect", (str(path),)),
     )
+
+
+def _first_records(files: tuple[Path, ...]) -> None:
+    """Raise an error unless each file is a log."""
+    for file in files:
+        next(iter(log_records(file)), None)
 
 
 def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignLog:

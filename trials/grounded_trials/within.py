@@ -1,0 +1,280 @@
+"""Read a log in a child process, whose time, memory and files are limited by the size of the log.
+
+A file of a few kilobytes can require gigabytes (compressed zeros, nested JSON lists) or hours (a
+hundred thousand lists that must be skipped one by one), in our code or in a library that decodes
+it. `within` therefore runs whatever reads a log in a child process that the system ends at a limit,
+so that no loop has to count what it does. The child returns its result, or its exception.
+
+On Linux the child is a copy of this process (a fork): it starts in a few milliseconds, what it is
+given need not be picklable, and the system enforces every limit. Elsewhere a fork is not safe: the
+child is another Python, and its memory is looked at every `LOOK_S`. Time is the child's CPU time,
+so a slow disk or a busy machine does not matter.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from errno import EFBIG
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from grounded.errors import GroundedError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+MB = 10**6
+SECONDS, MEMORY = "GROUNDED_FILE_SECONDS", "GROUNDED_FILE_MB"
+DEFAULTS = {SECONDS: 3.0, MEMORY: 250.0}  # [s], [MB], for an empty file
+SECONDS_PER_MB, MEMORY_PER_BYTE = 1.0, 8.0  # in addition, for each MB and byte of the file
+DISK = 4  # [memory] largest decompressed file
+PATIENCE = 20  # [CPU time] after which a child that does not end is stuck
+LOOK_S = 0.1  # [s] between two looks at a child's memory
+ENDS = {77: "memory", 78: "disk", -9: "memory", -27: "time"}  # exit codes; SIGKILL, SIGPROF
+
+_inside = False  # whether this process is such a child
+
+
+class OverBudget(GroundedError):
+    """Reading a file takes more time or memory than its size justifies."""
+
+
+@dataclass(frozen=True)
+class _Limits:
+    name: str
+    size: int  # [bytes]
+
+    @property
+    def seconds(self) -> float:
+        return _setting(SECONDS) + SECONDS_PER_MB * self.size / MB
+
+    @property
+    def memory(self) -> int:
+        return int(_setting(MEMORY) * MB + MEMORY_PER_BYTE * self.size)
+
+    def over(self, what: str) -> GroundedError:
+        """Return the error for a child that ended at a limit, or for another reason."""
+        texts = {
+            "time": (f"{self.seconds:.1f} s of CPU time", SECONDS),
+            "memory": (f"{self.memory / MB:.0f} MB of memory", MEMORY),
+            "disk": (f"{DISK * self.memory / MB:.0f} MB on the disk", MEMORY),
+        }
+        size = f"{self.size / MB:.1f} MB" if self.size >= MB else f"{self.size} bytes"
+        if what not in texts:
+            return OverBudget(f"{self.name}: reading its {size} {what}: the file seems damaged")
+        text, setting = texts[what]
+        return OverBudget(
+            f"{self.name}: reading its {size} takes more than {text}: it is damaged or malicious. "
+            f"If you trust it, increase {setting} (now {_setting(setting):g})"
+        )
+
+
+def within(
+    name: str | Path, size: int, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+) -> T:
+    """Return function(...), computed in a child process with limits for a file of this size.
+
+    Args:
+        name: of the log, for the message.
+        size: of its files [bytes].
+        function: reads the log; what it returns is pickled, and what it modifies stays unmodified
+            here. Files that it writes to the temporary folder are deleted.
+        *args: its arguments.
+        **kwargs: its named arguments.
+
+    Raises:
+        OverBudget: if it exceeds a limit, or the child crashes.
+        GroundedError: for a setting in the environment that is not a positive number, and whatever
+            `function` raises.
+    """
+    if _inside:
+        return function(*args, **kwargs)
+    limits = _Limits(str(name), size)
+    with tempfile.TemporaryDirectory(prefix="grounded-") as room:
+        order = (limits.seconds, limits.memory, room, function, args, kwargs)
+        try:
+            child = _Child(*(_fork if sys.platform == "linux" else _spawn)(order))
+        except OSError as error:
+            raise GroundedError(f"{name} can't be read: no process can start: {error}") from None
+        try:
+            done, value = _answer(child, limits)
+        finally:  # also of Ctrl-C
+            child.end()
+    if not done:
+        raise value
+    result: T = value
+    return result
+
+
+@dataclass
+class _Child:
+    """A running child: the number of its process, and the stream of its answer."""
+
+    process: int
+    answer: Any
+    code: int | None = None  # its exit code, negative for a signal; None while it may run
+
+    def wait(self) -> int:
+        """Return the exit code, once it has ended."""
+        if self.code is None:
+            self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+        return self.code
+
+    def end(self) -> None:
+        """End it, if it still runs."""
+        self.answer.close()
+        with suppress(ChildProcessError):  # the program that this runs in may have waited
+            if self.code is None:
+                os.kill(self.process, signal.SIGKILL)
+                self.wait()
+
+
+def _answer(child: _Child, limits: _Limits) -> tuple[bool, Any]:
+    """Return what the child sent: whether it succeeded, and its result or exception."""
+    ready, until = select.poll(), time.monotonic() + PATIENCE * limits.seconds
+    ready.register(child.answer, select.POLLIN)
+    limited = sys.platform == "linux"  # by the system
+    while not ready.poll(1e3 * (PATIENCE * limits.seconds if limited else LOOK_S)):
+        if time.monotonic() > until:
+            return False, limits.over(f"does not end within {PATIENCE * limits.seconds:.0f} s")
+        if not limited and _resident(child.process) > limits.memory:
+            return False, limits.over("memory")
+    try:
+        found: tuple[bool, Any] = pickle.load(child.answer)
+        return found
+    except (EOFError, pickle.UnpicklingError):  # it ended before, or while it answered
+        code = child.wait()
+        return False, limits.over(ENDS.get(code) or f"crashes (exit code {code})")
+
+
+def _resident(process: int) -> int:
+    """Return the memory that a process uses [bytes], on any Unix."""
+    command = ["ps", "-o", "rss=", "-p", str(process)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return 1024 * int(done.stdout.strip() or 0)
+
+
+def _fork(order: tuple[Any, ...]) -> tuple[int, Any]:
+    """Start a copy of this process; return its number, and the stream of its answer."""
+    receive, send = os.pipe()
+    with warnings.catch_warnings():  # of other threads, whose locks no reader takes
+        warnings.simplefilter("ignore", DeprecationWarning)
+        process = os.fork()
+    if process:
+        os.close(send)
+        return process, os.fdopen(receive, "rb")
+    try:
+        gc.freeze()  # else the first collection copies the parent's memory
+        os.close(receive)
+        with os.fdopen(send, "wb") as out:
+            _serve(out, *order)
+    finally:
+        os._exit(1)
+
+
+def _spawn(order: tuple[Any, ...]) -> tuple[int, Any]:
+    """Start another Python; return its number, and the stream of its answer."""
+    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C ends it through its parent
+    )
+    assert child.stdin is not None
+    with child.stdin as stream, suppress(BrokenPipeError):
+        pickle.dump(order, stream)
+    child.returncode = 0  # `within` waits for it
+    return child.pid, child.stdout
+
+
+def main() -> None:
+    """Do what standard input says, in a process that `within` started."""
+    order = pickle.load(sys.stdin.buffer)
+    with os.fdopen(os.dup(1), "wb") as out:
+        os.dup2(2, 1)  # what a library prints is no answer
+        _serve(out, *order)
+
+
+def _serve(
+    out: Any, seconds: float, memory: int, room: str, function: Any, args: Any, kwargs: Any
+) -> None:
+    """Set the limits, call the function, send its result or exception, and end the process."""
+    global _inside
+    _inside, tempfile.tempdir, code = True, room, 0
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends it through its parent
+    try:
+        _limit(seconds, memory)
+        pickle.dump((True, function(*args, **kwargs)), out, pickle.HIGHEST_PROTOCOL)
+        out.flush()
+    except BaseException as error:
+        code = _cause(error)
+        if not code:
+            error.__traceback__, text = None, traceback.format_exc()
+            out.write(_pickled(error, text))
+            out.flush()
+    os._exit(code)
+
+
+def _limit(seconds: float, memory: int) -> None:
+    """Let the system end this process at its limits."""
+    import resource
+
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends it, also inside a library
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    limits = {resource.RLIMIT_FSIZE: DISK * memory}
+    if sys.platform == "linux":
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory
+    for kind, most in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (most, hard))
+
+
+def _cause(error: BaseException | None) -> int:
+    """Return the exit code of the limit that led to an exception; 0 for any other."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, MemoryError):
+            return 77
+        if isinstance(error, OSError) and error.errno == EFBIG:
+            return 78
+        error = error.__cause__ or error.__context__
+    return 0
+
+
+def _pickled(error: BaseException, text: str) -> bytes:
+    """Return an answer with an exception; with its traceback unless it is meant for the user."""
+    if not isinstance(error, GroundedError):
+        error.add_note(text)
+    try:
+        answer = pickle.dumps((False, error))
+        pickle.loads(answer)
+    except Exception:  # an exception of a library that can't be pickled
+        answer = pickle.dumps((False, RuntimeError(text)))
+    return answer
+
+
+def _setting(name: str) -> float:
+    text = os.environ.get(name) or str(DEFAULTS[name])
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not value > 0:
+        raise GroundedError(f"{name} is '{text[:40]}'; expected a positive number")
+    return value
