@@ -13,10 +13,11 @@ import gc
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import wraps
 from io import StringIO, TextIOWrapper
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
 
@@ -27,6 +28,8 @@ from grounded_cli.console.workspace_option import in_workspace
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
+
+T = TypeVar("T")
 
 # name -> (module, one line); in the order in which they are used
 COMMANDS = {
@@ -74,7 +77,10 @@ class LazyGroup(click.Group):
             gc.freeze()
             gc.enable()
         commands = (one for one in vars(module).values() if isinstance(one, click.Command))
-        return next(one for one in commands if one.name == name)
+        found = next(one for one in commands if one.name == name)
+        if found.callback is not None and not hasattr(found.callback, "apart"):
+            found.callback = _apart(found.callback)
+        return found
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -123,6 +129,20 @@ class LazyGroup(click.Group):
         """List the commands without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+def _apart(command: Callable[..., T]) -> Callable[..., T]:
+    """Return a command that keeps stdout for its data, whatever the user's code prints."""
+
+    @wraps(command)
+    def run(*args: Any, **options: Any) -> T:
+        from grounded_cli.console.terminal import stdout_kept
+
+        with stdout_kept():
+            return command(*args, **options)
+
+    vars(run)["apart"] = True
+    return run
 
 
 def _closest(name: str, options: Sequence[str]) -> list[str]:
@@ -184,7 +204,6 @@ INTERRUPTED = "interrupted; stored data is safe, run the same command again"
 
 def _run() -> tuple[int, str]:
     """Run the command; return its exit code and a final message."""
-    stdout = sys.stdout
     try:
         code = cli.main(standalone_mode=False, prog_name="grounded")
     except click.exceptions.Exit as stop:
@@ -196,10 +215,10 @@ def _run() -> tuple[int, str]:
     except (click.Abort, KeyboardInterrupt) as error:
         found = str(error.__cause__ or "") and f"{error.__cause__}\n"
         return 130, f"{found}{INTERRUPTED}"
-    except SystemExit:
-        if sys.stdout is not stdout:  # click found a closed pipe, and would exit with 1
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # click would exit with 1
             raise BrokenPipeError from None
-        raise
+        return 1, f"error: something that grounded called ended the program ({error.code})"
     except Exception as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class
             return 130, INTERRUPTED

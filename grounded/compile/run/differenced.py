@@ -24,6 +24,7 @@ from grounded.compile.names import Named, check_names, raised_at, where, wrong_v
 from grounded.compile.problem import Limits
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
+from grounded.foreign import contained
 from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
@@ -160,7 +161,8 @@ class DifferencedSystem(Interpreted):
 
         def call(xs: Sequence[Any], us: Sequence[Any]) -> Array:
             s, a = Named("state", names.states, xs), Named("input", names.inputs, us)
-            f_x, f_u = own(s, a, parameters, dt)
+            with contained():
+                f_x, f_u = own(s, a, parameters, dt)
             return np.concatenate([np.asarray(f_x, float), np.asarray(f_u, float)], axis=-1)
 
         shape = (len(x), self.n, self.n + self.m)
