@@ -14,6 +14,7 @@ temporary file, which the next process removes.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -27,18 +28,11 @@ from pathlib import Path
 from grounded.errors import GroundedError
 from grounded_trials.plain_file import open_file
 
-try:
-    import fcntl
-except ImportError:
-    raise GroundedError(
-        "trials can be stored on Linux and macOS only: the store locks its folder with fcntl, "
-        "which Windows lacks. Use WSL; grounded.policy, which drives a robot, also works here"
-    ) from None
-
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
 _TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+POLL_S = 0.01  # [s] between two attempts to lock a folder that another process has locked
 OLD_S = 3600.0  # [s] age at which a temporary file counts as abandoned
 
 
@@ -249,25 +243,31 @@ class Store:
         Raises:
             GroundedError: if the folder can't be written.
         """
+        from filelock import FileLock
+
+        lock = FileLock(self.folder / ".lock", mode=0o644)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+            lock.acquire(poll_interval=POLL_S)
         except OSError as error:
             raise self._unwritable(error) from None
+        except NotImplementedError:
+            raise GroundedError(
+                f"{self.folder} can't be locked, as its file system has no file locks: move the "
+                "workspace to a local disk"
+            ) from None
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            except OSError as error:
-                raise self._unwritable(error) from None
             yield
         finally:
             with suppress(OSError):  # nothing was written to it
-                os.close(descriptor)
+                lock.release()
 
     def _unwritable(self, error: OSError) -> GroundedError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        mend = "Free disk space" if full else "Get write permission"
         return GroundedError(
-            f"{self.folder} can't be written: {error.strerror}; the file is not stored. Free disk "
-            "space, or get write permission, and add it again"
+            f"{self.folder} can't be written: {error.strerror}; the file is not stored. {mend}, "
+            "and add it again"
         )
 
 

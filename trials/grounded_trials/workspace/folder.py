@@ -90,7 +90,20 @@ class Folder:
 
     @cached_property
     def config(self) -> Config:
-        """The checked grounded.toml."""
+        """The checked grounded.toml.
+
+        Raises:
+            GroundedError: also if a folder of the workspace is a link out of it, into which its
+                commands would write.
+        """
+        for name in ("trials", "candidates", "runs", "reports"):
+            place = self.folder / name
+            if place.is_symlink() and not place.resolve().is_relative_to(self.folder.resolve()):
+                raise GroundedError(
+                    f"{place} is a link to {place.resolve()}, outside the workspace: expected a "
+                    "folder of its own, since commands write there. Delete the link, and move the "
+                    "files here if they belong to this workspace"
+                )
         return read_config(self.folder)
 
     @cached_property
