@@ -1,8 +1,8 @@
 """A share of what is large: trials of which so many steps are used as an answer needs.
 
-A fit and a diagnosis take minutes for 100,000 steps, and what more data add to an answer falls with
-their root. So whole trials are taken at equal distances in the order in which they were recorded,
-as many as the budget has room for; a longer one is cut to its first steps.
+A fit and a diagnosis take minutes for 100,000 steps or 200 trials, and what more data add to an
+answer falls with their root. So whole trials are taken at equal distances in the order in which
+they were recorded, as many as the budget has room for; a longer one is cut to its first steps.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.trial import Trial
 
-STEPS = 100_000  # control steps of all trials together that are looked at
+STEPS, TRIALS = 100_000, 200  # control steps of all trials together, and trials, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,22 +26,23 @@ class Share:
     sentence: str
 
 
-def share_of(trials: Sequence[Trial], steps: int = STEPS) -> Share:
-    """Choose trials within a budget of steps.
+def share_of(trials: Sequence[Trial], steps: int = STEPS, most: int = TRIALS) -> Share:
+    """Choose trials within a budget of steps and of trials.
 
     Args:
         trials: in the order in which they were recorded.
         steps: the budget, of all trials together.
+        most: the largest number of trials.
 
     Returns:
         The trials themselves if they are within it.
     """
     total = sum(trial.steps for trial in trials)
-    if total <= steps:
+    if total <= steps and len(trials) <= most:
         return Share([*trials], "")
     cut = [trial.until(steps) for trial in trials]
     length = np.array([trial.steps for trial in cut])
-    for count in range(len(cut), 0, -1):
+    for count in range(min(len(cut), most), 0, -1):
         chosen = np.unique(np.linspace(0, len(cut) - 1, count).astype(int))
         if (used := int(length[chosen].sum())) <= steps:
             break
