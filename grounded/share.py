@@ -1,6 +1,6 @@
 """A share of what is large: trials of which so many steps are used as an answer needs.
 
-A fit and a diagnosis take minutes for 100,000 steps or 200 trials, and what more data add to an
+A fit and a diagnosis take minutes for 100,000 steps or 100 trials, and what more data add to an
 answer falls with their root. So whole trials are taken at equal distances in the order in which
 they were recorded, as many as the budget has room for; a longer one is cut to its first steps.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.trial import Trial
 
-STEPS, TRIALS = 100_000, 200  # control steps of all trials together, and trials, at most
+STEPS, TRIALS = 100_000, 100  # control steps of all trials together, and trials, at most
 
 
 @dataclass(frozen=True, eq=False)

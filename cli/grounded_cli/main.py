@@ -13,11 +13,13 @@ import gc
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import wraps
 from io import StringIO, TextIOWrapper
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
 
@@ -180,6 +182,7 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # show "?" for characters the encoding lacks
             stream.reconfigure(errors="replace")
+    warnings.showwarning = _noted
     try:
         code, words = _run()
         if words:
@@ -197,6 +200,21 @@ def main() -> NoReturn:
             sys.stderr.write(f"error: cannot write the output: {error.strerror}\n")
         _silence()
     sys.exit(code)
+
+
+def _noted(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning of Python, such as NumPy's about the user's model, as a remark."""
+    from grounded_cli.console.terminal import remark
+
+    with suppress(OSError):
+        remark("warning", f"{message} ({Path(filename).name}, line {lineno})")
 
 
 INTERRUPTED = "interrupted; stored data is safe, run the same command again"

@@ -32,3 +32,7 @@ def test_whole_trials_are_taken_at_equal_distances():
     numbers = [int(trial.id[1:]) for trial in found.trials]
     assert numbers[0] == 0 and numbers[-1] == 99 and np.ptp(np.diff(numbers)) <= 1
     assert all(trial.steps == 10 for trial in found.trials)
+
+
+def test_a_share_has_no_more_trials_than_are_asked_for():
+    assert len(share_of(trials(*[2] * 50), 1000, 10).trials) == 10

@@ -295,7 +295,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
-        _sweep_old(path.parent)
+        sweep(path.parent)
         _copy(data, temporary, mode=0o644)
         temporary.replace(path)
         sync_folder(path.parent)
@@ -310,13 +310,13 @@ def write_atomically(path: Path, data: bytes) -> None:
         _remove(temporary)
 
 
-def _sweep_old(folder: Path) -> None:
-    """Remove temporary files of killed processes, `OLD_S` after their last write."""
+def sweep(folder: Path, age_s: float = OLD_S) -> None:
+    """Remove temporary files of killed processes, so long after their last write."""
     with os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
     for path in (folder / name for name in names):
         with suppress(OSError):
-            if path.lstat().st_mtime < time.time() - OLD_S:
+            if path.lstat().st_mtime <= time.time() - age_s:
                 path.unlink()
 
 
