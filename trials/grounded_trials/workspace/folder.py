@@ -309,6 +309,9 @@ class Folder:
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
         broken: list[Damaged] = []
+        if lost is not None and "_trials" in vars(self):  # they were read, and none is damaged
+            lost += [Lost(one.path.name, one.reason) for one in self.noted.gone(self.store)]
+            return self._trials
         known, found = self.noted if lost is None else self._read_notes(broken), []
         entries = [e for e in self.store.list() if known.why_aside(e) is None]
         read = self._indexed if self._many else self._whole
@@ -322,7 +325,10 @@ class Folder:
         self.save_index()
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *known.gone(self.store))]
-        return named_apart(found, known, self.candidate_path)
+        trials = named_apart(found, known, self.candidate_path)
+        if not broken:
+            vars(self)["_trials"] = trials
+        return trials
 
     @property
     def _many(self) -> bool:
