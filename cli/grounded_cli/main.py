@@ -222,6 +222,7 @@ INTERRUPTED = "interrupted; stored data is safe, run the same command again"
 
 def _run() -> tuple[int, str]:
     """Run the command; return its exit code and a final message."""
+    stdout = sys.stdout
     try:
         code = cli.main(standalone_mode=False, prog_name="grounded")
     except click.exceptions.Exit as stop:
@@ -234,7 +235,7 @@ def _run() -> tuple[int, str]:
         found = str(error.__cause__ or "") and f"{error.__cause__}\n"
         return 130, f"{found}{INTERRUPTED}"
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # click would exit with 1
+        if sys.stdout not in (stdout, sys.stderr):  # click found a closed pipe
             raise BrokenPipeError from None
         return 1, f"error: something that grounded called ended the program ({error.code})"
     except Exception as error:
