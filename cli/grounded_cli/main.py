@@ -13,10 +13,13 @@ import gc
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import wraps
 from io import StringIO, TextIOWrapper
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
 
@@ -27,6 +30,8 @@ from grounded_cli.console.workspace_option import in_workspace
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
+
+T = TypeVar("T")
 
 # name -> (module, one line); in the order in which they are used
 COMMANDS = {
@@ -74,7 +79,10 @@ class LazyGroup(click.Group):
             gc.freeze()
             gc.enable()
         commands = (one for one in vars(module).values() if isinstance(one, click.Command))
-        return next(one for one in commands if one.name == name)
+        found = next(one for one in commands if one.name == name)
+        if found.callback is not None and not hasattr(found.callback, "apart"):
+            found.callback = _apart(found.callback)
+        return found
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -125,6 +133,20 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
 
+def _apart(command: Callable[..., T]) -> Callable[..., T]:
+    """Return a command that keeps stdout for its data, whatever the user's code prints."""
+
+    @wraps(command)
+    def run(*args: Any, **options: Any) -> T:
+        from grounded_cli.console.terminal import stdout_kept
+
+        with stdout_kept():
+            return command(*args, **options)
+
+    vars(run)["apart"] = True
+    return run
+
+
 def _closest(name: str, options: Sequence[str]) -> list[str]:
     """Return the options that are about as close to a misspelt one as the closest (--hmtl)."""
     from difflib import SequenceMatcher
@@ -160,6 +182,7 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # show "?" for characters the encoding lacks
             stream.reconfigure(errors="replace")
+    warnings.showwarning = _noted
     try:
         code, words = _run()
         if words:
@@ -179,6 +202,21 @@ def main() -> NoReturn:
     sys.exit(code)
 
 
+def _noted(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning of Python, such as NumPy's about the user's model, as a remark."""
+    from grounded_cli.console.terminal import remark
+
+    with suppress(OSError):
+        remark("warning", f"{message} ({Path(filename).name}, line {lineno})")
+
+
 INTERRUPTED = "interrupted; stored data is safe, run the same command again"
 
 
@@ -196,10 +234,10 @@ def _run() -> tuple[int, str]:
     except (click.Abort, KeyboardInterrupt) as error:
         found = str(error.__cause__ or "") and f"{error.__cause__}\n"
         return 130, f"{found}{INTERRUPTED}"
-    except SystemExit:
-        if sys.stdout is not stdout:  # click found a closed pipe, and would exit with 1
+    except SystemExit as error:
+        if sys.stdout not in (stdout, sys.stderr):  # click found a closed pipe
             raise BrokenPipeError from None
-        raise
+        return 1, f"error: something that grounded called ended the program ({error.code})"
     except Exception as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class
             return 130, INTERRUPTED

@@ -48,6 +48,7 @@ from grounded.adapters.mujoco_names import (
 )
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
+from grounded.compile.run.differenced import stencil
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
@@ -158,6 +159,8 @@ class MujocoStepper(Stepper):
         self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
         self._made = np.array([s.nominal for s in settings])  # its current parameters
+        spans = [self.limits.get(name, (-np.inf, np.inf)) for name in (*states, *controls.names)]
+        self._spans = np.array(spans).T  # (2, n + m), the lowest and the highest
         self._prepare()
 
     @property
@@ -248,11 +251,16 @@ class MujocoStepper(Stepper):
         return found
 
     def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """Return f_x and f_u by forward differences: n + m + 1 steps per sample, in one batch."""
+        """Return f_x and f_u by forward differences: n + m + 1 steps per sample, in one batch.
+
+        At the upper end of a control's range, where MuJoCo clamps, they are taken backwards.
+        """
         (N, n), d = x.shape, x.shape[1] + u.shape[1]
-        points = np.tile(np.hstack([x, u]), (d + 1, 1, 1))
+        both = np.hstack([x, u])
+        down, up = stencil(both, SHIFT * np.maximum(1.0, np.abs(both)), *self._spans)
+        points = np.tile(both, (d + 1, 1, 1))
         i = np.arange(d)
-        points[i + 1, :, i] += SHIFT * np.maximum(1.0, np.abs(points[0, :, i]))
+        points[i + 1, :, i] = np.where(2 * (up - both) < both - down, down, up).T
         width = points[i + 1, :, i] - points[0, :, i]  # the difference after rounding (d, N)
         flat = points.reshape(-1, d)
         y = self.advance(flat[:, :n], flat[:, n:], p, dt).reshape(d + 1, N, n)

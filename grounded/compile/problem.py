@@ -56,6 +56,7 @@ STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with
 
 Kind = Literal["derivative", "step"]
 Integrator = Literal["rk4", "euler"]
+Limits = tuple[Array, Array]
 
 FLAT = 1e-9  # slope of a differenced function that is rounding
 
@@ -128,6 +129,11 @@ class Problem:
         """What the model is given at steps t: z (..., nz), u (..., m) -> (..., m)."""
         sent = self.queue.effective(z, u)
         return sent if self.input_shift is None else sent - self.input_shift[t]
+
+    @property
+    def limits(self) -> Limits:
+        """The lowest and the highest inputs, (m,) each."""
+        return self.low, self.high
 
     def z_start(self) -> Array:
         """z_0: the start state and the input held before it, (nz,)."""
@@ -272,9 +278,19 @@ class System(ABC):
 
     @abstractmethod
     def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
     ) -> tuple[Array, Array]:
-        """f_x (N, n, n) and f_u (N, n, m)."""
+        """f_x (N, n, n) and f_u (N, n, m).
+
+        `limits` of the inputs, low and high (m,): derivatives that are differenced are taken
+        inwards there, as a simulator may clamp what lies beyond.
+        """
 
     @abstractmethod
     def sensitivities(

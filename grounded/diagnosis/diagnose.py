@@ -63,6 +63,7 @@ from grounded.instruments.lag import whole_steps
 from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
+from grounded.share import share_of
 from grounded.task import Task
 from grounded.trial import Trial, scattered
 
@@ -162,8 +163,9 @@ def diagnose(
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
-    trials, copies = counted_once(trials)
-    compare, more = counted_once(compare)
+    shares = share_of(trials), share_of(compare)
+    trials, copies = counted_once(shares[0].trials)
+    compare, more = counted_once(shares[1].trials)
     copies += more
     exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
@@ -177,7 +179,8 @@ def diagnose(
     early = options.interpolated_s
     data = replace(data, filters=filters, between=frozenset(between), interpolated_s=early)
     known = limits(data, looked.left_out)
-    known = replace(known, sentences=(*known.sentences, *copies))
+    told = filter(None, [share.sentence for share in shares])
+    known = replace(known, sentences=(*known.sentences, *copies, *told))
     tick("candidates")
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):

@@ -221,6 +221,29 @@ class Made(Document):
         return {str(effect["name"]): dict(effect) for effect in self.adopted}
 
 
+@dataclass(frozen=True, eq=False)
+class TrialGroup(Document):
+    """Trials of one motion in one condition, and the signals whose levels set them apart."""
+
+    id: str
+    trials: tuple[str, ...] = ()
+    differs_in: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Score(Document):
+    """Held-out log scores of open-loop predictions, of which the rule chooses.
+
+    A score is minus the mean logarithm of the rms errors, over states and horizons, in units of
+    each state's spread. The standard error is that of the reference's lead over the choice.
+    """
+
+    crude: float = math.nan
+    chosen: float = math.nan
+    reference: float = math.nan
+    standard_error: float = math.nan
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Document):
     """The result of a diagnosis, as in `diagnose --json`."""
@@ -252,7 +275,10 @@ class Diagnosis(Document):
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
     unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # between two groups
     trials: int = 0
-    motions: int = field(metadata=BRIEF, default=0)  # number of different motions in the trials
+    motions: int = field(metadata=BRIEF, default=0)  # number of groups
+    groups: tuple[TrialGroup, ...] = ()  # trials that differ in motion or condition
+    held_out: str = "no"  # what values were not fitted on: groups, trials, pieces of a log, no
+    score: Score = field(default_factory=Score)
     steps: int = 0
     candidates: int = 0
     made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace

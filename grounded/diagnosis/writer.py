@@ -25,7 +25,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
-from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked
+from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked, Score, TrialGroup
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial
@@ -219,9 +219,26 @@ class Writer:
             unchanged=apart.unchanged if apart else (),
             trials=data.count,
             motions=moved,
+            groups=tuple(
+                TrialGroup(
+                    f"g{k}",
+                    tuple(data.ids[i] or f"#{i + 1}" for i in group.trials),
+                    group.differs_in,
+                )
+                for k, group in enumerate(data.groups, 1)
+            ),
+            held_out=self.ruler.by,
+            score=self.score(),
             steps=data.steps,
             candidates=len(self.search.candidates),
         )
+
+    def score(self) -> Score:
+        """Log scores of the crude model, the choice and the reference."""
+        ruler, choice = self.ruler, self.decision.choice
+        crude = ruler.score(self.decision.crude)
+        chosen = crude + ruler.gain(self.decision.crude, self.best).mean
+        return Score(crude, chosen, chosen + choice.lost, choice.standard_error)
 
     def unrepeatable(self) -> dict[str, str]:
         """The trials that nobody can or should repeat."""

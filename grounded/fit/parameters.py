@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
+from grounded.share import Share, share_of
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -89,7 +91,10 @@ def fit(
         )
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     measurement = of_states(model) if measurement is None else measurement
-    records, given = records_of(model, trials), model
+    logged: Any = [trials] if isinstance(trials, Trial) else trials
+    whole = isinstance(logged, Sequence) and all(isinstance(trial, Trial) for trial in logged)
+    share = share_of(logged) if whole else Share(logged, "")
+    records, given = records_of(model, share.trials), model
     if filters:
         from grounded.fit.filtered import behind_filters
 
@@ -109,7 +114,7 @@ def fit(
                 tied[[*tied][-1]] += [n for n in before if n not in unidentified(found.params)]
             least = least_known(model, found)
             if least is None or unknowns.k == 1:
-                return _of(found.beside(asked, tied), given)
+                return _of(found.beside(asked, tied).of_share(share.sentence), given)
             before = [name for name in unidentified(found.params) if name != least]
             tied[least] = []
             unknowns = unknowns.less(unknowns.names.index(least))

@@ -110,6 +110,10 @@ class Fit(Result):
             sentence=sentence,
         )
 
+    def of_share(self, sentence: str) -> Fit:
+        """Return the fit with a sentence added on which share of the trials it used; "": all."""
+        return replace(self, sentence=f"{self.sentence}; {sentence}") if sentence else self
+
     @property
     def helps(self) -> bool:
         """Whether held-out time is predicted better by more than TIE.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
@@ -48,7 +49,7 @@ def halted(model: Model, trial: Trial) -> Halted | None:
     begins = _setting_off(x, still, steps)
     if not begins.any():
         return None
-    enough = (sent[:, None] >= sent[begins][None]).all(axis=2).any(axis=1)
+    enough = _reaching(sent, sent[begins])
     best: tuple[int, int] = (0, 0)
     for first, last in _stretches(still & enough):
         best = max(best, (first, last + steps), key=lambda one: one[1] - one[0])
@@ -65,6 +66,28 @@ def halted(model: Model, trial: Trial) -> Halted | None:
     return Halted(first * trial.dt, last * trial.dt, names)
 
 
+def _reaching(sent: Array, least: Array) -> NDArray[np.bool_]:
+    """Return which commands (T, m) are no smaller, in every input, than one of `least` (k, m).
+
+    Only those of `least` count that are not larger than another: they are taken by their sum.
+    """
+    reach, rest = np.zeros(len(sent), bool), least
+    while len(rest):
+        smallest = rest[np.argmin(rest.sum(axis=1))]
+        reach |= (sent >= smallest).all(axis=1)
+        rest = rest[~(rest >= smallest).all(axis=1)]
+    return reach
+
+
+def _ranges(signal: Array, steps: int) -> Array:
+    """Return the range of a signal (T, k) in each of its windows, (T - steps + 1, k)."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    ends = (maximum_filter1d(signal, steps, axis=0), minimum_filter1d(signal, steps, axis=0))
+    first = steps // 2  # the filters are centred
+    return np.asarray(ends[0] - ends[1])[first : first + len(signal) - steps + 1]
+
+
 def _over(signal: Array, steps: int) -> Array:
     """Return all windows of a signal (T, k) as (T - steps + 1, k, steps)."""
     return np.asarray(sliding_window_view(signal, steps, axis=0))
@@ -75,23 +98,23 @@ def _rest(x: Array) -> Array:
     return np.asarray(np.maximum(NOISE * white_noise(x), SHARE * np.ptp(x, axis=0)))
 
 
-def _still(model: Model, x: Array, steps: int) -> Array:
+def _still(model: Model, x: Array, steps: int) -> NDArray[np.bool_]:
     """Return in which windows every state keeps to its noise, rates to that about zero."""
-    most, windows = _rest(x), _over(x, steps)
+    most, means = _rest(x), _over(x, steps).mean(axis=2)
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
-    rest = np.abs(windows.mean(axis=2)) <= most
-    return np.asarray(((np.ptp(windows, axis=2) <= most) & (rest | ~rates)).all(axis=1))
+    moved = np.maximum(_ranges(x, steps), np.where(rates, np.abs(means), 0.0))
+    return np.asarray((moved <= most).all(axis=1))
 
 
-def _setting_off(x: Array, still: Array, steps: int) -> Array:
+def _setting_off(x: Array, still: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
     """Return the windows that begin after half of one at rest, and in which the robot moves."""
-    moves = (np.ptp(_over(x, steps), axis=2) > MOVED * _rest(x)).any(axis=1)
+    moves = (_ranges(x, steps) > MOVED * _rest(x)).any(axis=1)
     before = np.zeros_like(still)
     before[steps:] = still[:-steps]
-    return np.asarray(before & moves)
+    return before & moves
 
 
-def _stretches(mask: Array) -> list[tuple[int, int]]:
+def _stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first and last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]

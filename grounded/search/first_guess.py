@@ -159,7 +159,7 @@ def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
 
     def jacobian(w: Array, rows: Rows) -> Array:
         state, u = split(w, rows)
-        f_x, f_u = problem.system.linearise(state, u, *settings)
+        f_x, f_u = problem.system.linearise(state, u, *settings, problem.limits)
         J = np.concatenate([f_x[:, :, free], f_u], axis=2)
         J[:, :, : len(free)] -= np.eye(n)[:, free]
         J *= weight[:, None]

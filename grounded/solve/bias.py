@@ -166,7 +166,8 @@ def _moves(problem: Problem, x: Array, received: Array) -> LeastSquares:
         return np.hstack([(moved - x[rows + 1]) / problem.dt / scale, (w - received[rows]) * pull])
 
     def jacobian(w: Array, rows: Rows) -> Array:
-        _, f_u = problem.system.linearise(x[rows], np.ascontiguousarray(w), *settings)
+        u = np.ascontiguousarray(w)
+        _, f_u = problem.system.linearise(x[rows], u, *settings, problem.limits)
         pulls = np.broadcast_to(np.diag(pull), (len(rows), len(pull), len(pull)))
         return np.concatenate([f_u / problem.dt / scale[:, None], pulls], axis=1)
 

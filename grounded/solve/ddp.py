@@ -11,7 +11,8 @@ whose minimiser is du = k_t + K_t dz. The nonlinear model is then rolled out wit
 
 until the cost falls by at least a tenth of the predicted alpha d1 + alpha^2 d2. A failed sweep or
 search raises the regularisation mu of Q_uu (in units of the inputs' own weights), a success lowers
-it. Three things are this project's own:
+it. A search that ends under regularisation sweeps once more, with the least that factorises: its
+gains are handed out, and damped ones hardly feed back. Three things are this project's own:
 
 - the state is z = [x, inputs already sent], so input changes and transport delays are exact;
 - limits of the inputs are part of each step's quadratic programme (Tassa, Mansard, Todorov,
@@ -153,6 +154,9 @@ def _solution(problem: Problem, found: Descent) -> Solution:
     trace = tuple(Iteration(*line) for line in found.lines.tolist())
     sentence = ending(found.status, len(trace))
     k, K = found.k, found.K
+    if found.status != "not finite" and trace and trace[-1].mu > 0:
+        gains = sweep(problem, found.z, found.u).gains
+        k, K = gains.k, gains.K
     if found.status == "not finite":
         k, K = np.zeros(found.u.shape), np.zeros((*found.u.shape, problem.nz))
         first = _first_bad if found.failed_at < 0 else _first_slope

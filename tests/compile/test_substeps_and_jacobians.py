@@ -174,3 +174,34 @@ def test_single_precision_is_found_out_and_differenced_with_a_step_that_fits():
     double = Model(**NAMES, derivative=opaque)
     double.system.linearise(x, u, double.values, 0.02)
     assert "float32" not in double.system.note
+
+
+def test_differences_are_taken_inwards_at_the_limits_of_an_input():
+    def clamped(s, a, p):
+        return {"x": s.v, "v": (a.u if -1 < a.u < 1 else (1.0 if a.u > 0 else -1.0))}
+
+    model = Model(**NAMES, derivative=clamped)
+    u, limits = np.array([[-1.0], [0.0], [1.0], [1.0 - 1e-9]]), (-np.ones(1), np.ones(1))
+    system, x = model.system, np.zeros((4, 2))
+    assert system.how == "differenced"
+    _, f_u = system.linearise(x, u, model.values, 0.1, 0.0, limits)
+    np.testing.assert_allclose(f_u[:, 1, 0], 0.1, rtol=1e-6)
+    beyond = system.linearise(x, u + 2.0, model.values, 0.1, 0.0, limits)[1]
+    assert np.isfinite(beyond).all()
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.05, 0.1, 0.2])
+def test_derivatives_at_a_kink_may_be_those_of_either_side(slope):
+    def step(s, a, p, dt):
+        return {"x": s.x, "v": s.v + dt * min(float(a.u), 1.0)}
+
+    def jacobian(s, a, p, dt):
+        return np.eye(2), np.array([[0.0], [slope]])
+
+    system = Model(**NAMES, step=step, jacobian=jacobian).system
+    given = (np.zeros((1, 2)), np.ones((1, 1)), np.array([3.0]), 0.1)
+    if slope <= 0.1:
+        system.check(*given)
+    else:
+        with pytest.raises(GroundedError, match="'v' by 'u'"):
+            system.check(*given)

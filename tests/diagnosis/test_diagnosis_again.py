@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.diagnosis.validation.decide import LIKELY
 
 from grounded import Model, Param, Reward, Task, Trial
 from grounded.diagnosis.cause_words import meaning
@@ -18,6 +17,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.validation.decide import LIKELY
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again

@@ -367,3 +367,26 @@ def test_what_holds_of_a_whole_message_is_said_once_and_one_sorted_stamp_not_at_
     order[10:20] = np.arange(20, 10, -1) - 1
     (said,) = of_pose(order).warnings
     assert said == "'x', 'y' and 'psi': 9 stamps out of order"
+
+
+def test_a_sample_far_outside_everything_else_is_told() -> None:
+    def spiked(t: np.ndarray) -> np.ndarray:
+        y = np.sin(t)
+        y[len(y) // 2] = 1e4
+        return np.asarray(y)
+
+    assert any("'x'" in text and "1e+04" in text for text in grid(pose(spiked)).warnings)
+    stepped = grid(pose(lambda t: np.where(t > 1.0, 500.0, np.sin(t))))
+    assert not any("far outside" in text for text in stepped.warnings)
+
+
+def test_a_state_that_vanishes_half_way_is_told() -> None:
+    whole, part = pose(np.sin), pose(np.cos)
+    n = len(part.t) // 2
+    cut = {name: getattr(part, name)[:n] for name in ("t", "values", "log_times")}
+    half = replace(part, **cut)
+    signals = {"x": whole, "v": half, "u": command()}
+    found = to_grid(signals, 0.05, ["x", "v"], ["u"])
+    assert any("'v'" in text for text in found.warnings)
+    found = to_grid(signals | {"v": part}, 0.05, ["x", "v"], ["u"])
+    assert not any("'v'" in text for text in found.warnings)

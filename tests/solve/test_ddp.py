@@ -5,7 +5,10 @@ import pytest
 
 from grounded.compile import DescentOptions
 from grounded.errors import GroundedError
+from grounded.model import Model
 from grounded.solve.ddp import solve, sweep
+from grounded.task import Task
+from grounded.utility import Reward
 from problems import linear_least_squares, problem
 
 
@@ -73,6 +76,22 @@ def test_a_damped_sweep_descends_and_shrinks_with_damping():
         size = np.abs(gains.k).sum()
     new = task.system.rollout(task, u, gains.K, run.z[0], gains.k)
     assert new.cost[0] < run.cost[0]
+
+
+def test_a_search_without_improvement_hands_out_the_gains_of_the_least_regularised_sweep():
+    def friction(s, a, p):
+        return {"x": s.v, "v": a.u - 2.0 * np.tanh(s.v / 0.005)}
+
+    cart = Model({"x": "m", "v": "m/s"}, {"u": "N"}, {}, derivative=friction)
+    target = np.full((151, 2), np.nan)
+    target[:, 0] = 0.3 * (1 - np.cos(2 * np.pi * np.arange(151) * 0.02 / 3))
+    small, free = np.full(1, 1e-3), np.zeros(2)
+    reward, limit = Reward(np.array([10.0, 0.0]), free, small, small), np.full(1, 2.0)
+    task = Task(cart, 0.02, target, reward, free, np.zeros(1), -limit, limit, smoothing=0.0)
+    found = solve(task.problem(), np.zeros((150, 1)))
+    assert found.status == "no improvement"
+    least = sweep(task.problem(), found.z, found.u).gains
+    np.testing.assert_allclose(found.K, least.K, rtol=0.1, atol=0.1 * np.abs(least.K).max())
 
 
 def test_not_finite_is_a_status_that_names_the_step():

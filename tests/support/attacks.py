@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from bombs import BOMBS, OTHERS, explode
-from cli import COMMAND, grounded
+from cli import COMMAND, grounded, process
 from fuzzed_runner import HOSTILE, fuzz
 from fuzzed_runner import mutated as mutated_policy
 from grounded import onboard
@@ -43,6 +43,8 @@ from grounded_trials.store.documents import StudyStore
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from reliability import MEMORY, a_candidate, a_trial
+from user_code import COMMANDS
+from user_code import KINDS as user_code_kinds
 from workspaces import CONFIG, MODEL, make
 
 HANG_S = 10.0
@@ -659,6 +661,34 @@ def calls(rng: random.Random, seconds: float) -> Tally:
     return tally
 
 
+def user_code(rng: random.Random, seconds: float) -> Tally:
+    """Run commands in workspaces whose model.py or real.py does what it should not."""
+    tally = Tally()
+    kinds = list(user_code_kinds)
+    rng.shuffle(kinds)
+    end = time.monotonic() + seconds
+    for what, files, may_succeed in kinds:
+        with tempfile.TemporaryDirectory() as folder:
+            make(Path(folder) / "w", **files)
+            for words in COMMANDS:
+                tally.tries += 1
+                done = process("-C", "w", *words, "--json", cwd=Path(folder))
+                if "Traceback" in done.err or done.code not in (0, 1, 3):
+                    tally.add("traceback", f"{what}, {words}: exit {done.code}: {done.err}")
+                if done.code == 1 and (done.out or done.err.count("error: ") != 1):
+                    tally.add("traceback", f"{what}, {words}: {done.out} {done.err}")
+                if may_succeed and done.code == 1:
+                    tally.add("silent", f"{what}, {words}: it failed: {done.err}")
+                if done.code != 1:
+                    try:
+                        assert isinstance(done.json, dict)
+                    except (ValueError, AssertionError):
+                        tally.add("silent", f"{what}, {words}: not one document: {done.out}")
+        if time.monotonic() > end:
+            break
+    return tally
+
+
 ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
     "mutants": ("MCAP mutants with sound checksums: read, inspect, recover", mutants),
     "configurations": ("grounded.toml, model.py, target.csv mutated", configurations),
@@ -670,6 +700,7 @@ ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
     "other bombs": ("the same as bags, tables, archives and PX4 logs", other_bombs),
     "policies": ("exported policies mutated: load, run", policies),
     "calls": ("random calls of the exported runner", calls),
+    "user code": ("model.py and real.py that print, exit, raise or change the folder", user_code),
 }
 
 

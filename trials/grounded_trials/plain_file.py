@@ -41,14 +41,14 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
         raise
 
 
-def read_file(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file.
+def read_file(path: Path, limit: int, *, follow: bool = True) -> bytes:
+    """Return the bytes of a regular file; for `follow` see `open_file`.
 
     Raises:
         GroundedError: if it is missing, unreadable, or larger than `limit` bytes.
     """
     try:
-        with open_file(path) as stream:
+        with open_file(path, follow=follow) as stream:
             data = stream.read(limit + 1)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist") from None

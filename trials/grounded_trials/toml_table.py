@@ -144,7 +144,7 @@ def read_toml(path: Path) -> Table:
 
     try:
         with open_file(path) as stream:
-            text = stream.read(SIZE_LIMIT + 1).decode("utf-8")
+            text = stream.read(SIZE_LIMIT + 1).decode("utf-8-sig")
     except FileNotFoundError:
         near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
         if near:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from textwrap import TextWrapper
 
@@ -157,3 +157,14 @@ def folded(command: str, lead: str = "next: ") -> str:
             lines.append("    ")
         lines[-1] += word + " "
     return "\n".join(line.rstrip() for line in lines)
+
+
+def what_became(gone: Collection[str], aside: Collection[str]) -> str:
+    """Return what became of trials that are used no more: "set aside", or lost without a word.
+
+    Args:
+        gone: the trials.
+        aside: those that the user has set aside.
+    """
+    lost = [name for name in gone if name not in aside]
+    return f"set aside, or missing in trials/ ({', '.join(lost)})" if lost else "set aside"

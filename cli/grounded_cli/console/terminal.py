@@ -11,7 +11,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from grounded.progress import duration
@@ -55,7 +55,41 @@ def say(text: str) -> None:
 
 def show(text: str = "") -> None:
     """Write data to stdout."""
-    _write(text, sys.stdout)
+    _write(text, _output())
+
+
+_kept: list[TextIO] = []  # stdout, while code of others runs
+
+
+def _output() -> TextIO | None:
+    return _kept[-1] if _kept else sys.stdout
+
+
+@contextmanager
+def stdout_kept() -> Iterator[None]:
+    """Keep stdout for `show` and `show_json`: whatever else is printed goes to stderr.
+
+    That is the user's model and whatever it starts, in this process or another, now or when the
+    program ends: so the descriptor of stdout stays with stderr if it is the process's own.
+    """
+    data = before = sys.stdout
+    own = False
+    with suppress(OSError, ValueError, AttributeError):  # a stream without a descriptor, in tests
+        own = data.fileno() == 1 and sys.stderr.fileno() == 2
+    if own:
+        data.flush()
+        data = os.fdopen(os.dup(1), "w", encoding=data.encoding, errors="replace")
+        os.dup2(2, 1)
+    _kept.append(data)
+    sys.stdout = sys.stderr
+    try:
+        yield
+    finally:
+        _kept.pop()
+        if not own:
+            sys.stdout = before
+        with suppress(OSError):  # the reader has gone: `_write` said so
+            data.close() if own else None
 
 
 def _write(text: str, stream: TextIO | None, end: str = "\n") -> None:
@@ -80,7 +114,7 @@ def harmless(text: str, *, coloured: bool = False) -> str:
 def show_json(document: dict[str, Any]) -> None:
     """Write one JSON document to stdout, with null for NaN and infinities."""
     text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
-    _write(re.sub(r"[^\n -~]", _escaped, text), sys.stdout)
+    _write(re.sub(r"[^\n -~]", _escaped, text), _output())
 
 
 def _escaped(found: re.Match[str]) -> str:

@@ -36,6 +36,7 @@ from grounded.compile.problem import (
     Descent,
     DescentOptions,
     Integrator,
+    Limits,
     Problem,
     Swarm,
 )
@@ -163,7 +164,13 @@ class CompiledSystem(TracedSystem):
         return z
 
     def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
     ) -> tuple[Array, Array]:
         """See `System.linearise`."""
         N, n = len(x), self.n

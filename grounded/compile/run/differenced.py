@@ -8,6 +8,8 @@ Central differences with a step h = 6e-6 max(1, |x|) (the cube root of the machi
 are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go in one call. A
 function that computes in single precision would lose all its digits at that step: it is found out
 by outputs that are float32 numbers, and stepped by h = 5e-3 max(1, |x|).
+At a limit of the inputs the differences are taken inwards (`stencil`): what lies beyond, the
+function may clamp, and a plan that saturates would see half of the slope or none.
 `smoothing` is ignored here: what can't be traced can't be smoothed.
 """
 
@@ -19,8 +21,10 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
+from grounded.compile.problem import Limits
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
+from grounded.foreign import contained
 from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
@@ -36,6 +40,15 @@ SINGLE = (
     "jax.config.update('jax_enable_x64', True))"
 )
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
+
+
+def stencil(at: Array, h: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Return the points h below and above `at`, neither of them beyond a limit.
+
+    A point that lies beyond a limit itself is kept, and stepped from inwards.
+    """
+    down = np.maximum(at - h, np.minimum(at, low))
+    return down, np.minimum(at + h, np.maximum(at, high))
 
 
 class DifferencedSystem(Interpreted):
@@ -63,6 +76,8 @@ class DifferencedSystem(Interpreted):
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Compares derivatives that come with the model with differences, at three samples.
 
+        At a kink, such as a limit of an input, those of either side or between them are right.
+
         Raises:
             GroundedError: where they differ by more than a hundredth of the largest.
         """
@@ -71,9 +86,10 @@ class DifferencedSystem(Interpreted):
             return
         at = np.unique(np.linspace(0, len(x) - 1, 3).astype(int))
         given = self._given(x[at], u[at], p, dt)
-        found = self._by_state_and_input(np.concatenate([x[at], u[at]], axis=1), p, dt)
-        off = np.abs(given - found)
-        if off.max(initial=0.0) > WRONG * np.abs(found).max(initial=1e-9):
+        both, free = np.concatenate([x[at], u[at]], axis=1), np.full(self.n + self.m, np.inf)
+        sides = [self._differences(both, p, dt, *s) for s in ((both, free), (-free, both))]
+        off = np.abs(given - np.clip(given, np.minimum(*sides), np.maximum(*sides)))
+        if off.max(initial=0.0) > WRONG * np.abs(sides).max(initial=1e-9):
             _, i, j = np.unravel_index(int(np.argmax(off)), off.shape)
             by = (*self.signature.states, *self.signature.inputs)[j]
             raise GroundedError(
@@ -83,7 +99,14 @@ class DifferencedSystem(Interpreted):
             )
 
     def jacobian(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float,
+        width: int,
+        limits: Limits | None = None,
     ) -> Array:
         """See `Interpreted.jacobian`; by central differences.
 
@@ -91,14 +114,18 @@ class DifferencedSystem(Interpreted):
         steps, and none with a friction below zero.
         """
         shifted = self.n + self.m
-        both = np.concatenate([x, u], axis=1)
+        both, free = np.concatenate([x, u], axis=1), np.full(shifted, np.inf)
+        low, high = -free, free.copy()
+        if limits is not None:
+            low[self.n :], high[self.n :] = limits
         relative = self._relative_step(x, u, p, dt)
         J = np.empty((len(x), self.n, width))
         size = max(1, CHUNK // (2 * shifted))
         if self.signature.jacobian is not None:
             J[:, :, :shifted], size = self._given(x, u, p, dt), 0
         for at in range(0, len(x), size) if size else ():
-            J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
+            some = slice(at, at + size)
+            J[some, :, :shifted] = self._differences(both[some], p, dt, low, high)
         given = self.signature.jacobian is not None
         base = self.step(x, u, p, dt) if given and width > shifted else None
         for i in range(width - shifted):
@@ -134,7 +161,8 @@ class DifferencedSystem(Interpreted):
 
         def call(xs: Sequence[Any], us: Sequence[Any]) -> Array:
             s, a = Named("state", names.states, xs), Named("input", names.inputs, us)
-            f_x, f_u = own(s, a, parameters, dt)
+            with contained():
+                f_x, f_u = own(s, a, parameters, dt)
             return np.concatenate([np.asarray(f_x, float), np.asarray(f_u, float)], axis=-1)
 
         shape = (len(x), self.n, self.n + self.m)
@@ -152,15 +180,15 @@ class DifferencedSystem(Interpreted):
                 f"({self.n}, {self.m}) for one sample: {error}"
             ) from error
 
-    def _by_state_and_input(self, both: Array, p: Array, dt: float) -> Array:
-        """(N, n + m) points -> (N, n, n + m), in one call of the step."""
+    def _differences(self, both: Array, p: Array, dt: float, low: Array, high: Array) -> Array:
+        """(N, n + m) points -> (N, n, n + m) inside low and high, in one call of the step."""
         N, d = both.shape
         relative = self._relative_step(both[:, : self.n], both[:, self.n :], p, dt)
         h = relative * np.maximum(1.0, np.abs(both))
+        down, up = stencil(both, h, low, high)
         points = np.broadcast_to(both, (2, d, N, d)).copy()
         i = np.arange(d)
-        points[0, i, :, i] += h.T
-        points[1, i, :, i] -= h.T
+        points[0, i, :, i], points[1, i, :, i] = up.T, down.T
         width = (points[0, i, :, i] - points[1, i, :, i]).T  # what was really stepped (N, d)
         flat = points.reshape(-1, d)
         y = self.step(flat[:, : self.n], flat[:, self.n :], p, dt).reshape(2, d, N, self.n)

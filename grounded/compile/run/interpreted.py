@@ -43,6 +43,7 @@ from grounded.compile.problem import (
     STOP,
     Backward,
     Integrator,
+    Limits,
     Problem,
     Queue,
     Swarm,
@@ -81,9 +82,19 @@ class Interpreted(System):
 
     @abstractmethod
     def jacobian(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float,
+        width: int,
+        limits: Limits | None = None,
     ) -> Array:
-        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width).
+
+        `limits`: see `System.linearise`.
+        """
 
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
         """See `System.fault`; at the state itself, and where a first stage of the step goes."""
@@ -107,10 +118,16 @@ class Interpreted(System):
         return ""
 
     def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
     ) -> tuple[Array, Array]:
         """See `System.linearise`."""
-        J = self.jacobian(x, u, p, dt, smoothing, self.n + self.m)
+        J = self.jacobian(x, u, p, dt, smoothing, self.n + self.m, limits)
         f_x, f_u = np.split(J, [self.n], axis=2)
         return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u)
 
@@ -204,9 +221,8 @@ def linearised(system: System, problem: Problem, z: Array, u: Array) -> Quadrati
     queue, H, n = problem.queue, problem.horizon, system.n
     x = np.ascontiguousarray(z[:-1, :n])
     received = problem.received(z[:-1], u)
-    A, B = _augmented(
-        queue, *system.linearise(x, received, problem.p, problem.dt, problem.smoothing)
-    )
+    settings = (problem.p, problem.dt, problem.smoothing, problem.limits)
+    A, B = _augmented(queue, *system.linearise(x, received, *settings))
     R, S = problem.input_weight, problem.change_weight
     change = input_change(problem, u)
     l_z = np.zeros((H + 1, queue.nz))

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile.problem import STAGES, Integrator
+from grounded.compile.problem import STAGES, Integrator, Limits
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
 from grounded.errors import GroundedError
@@ -85,7 +85,14 @@ class TracedSystem(Interpreted):
             )
 
     def jacobian(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float,
+        width: int,
+        limits: Limits | None = None,
     ) -> Array:
         """See `Interpreted.jacobian`; exact."""
         J = np.empty((len(x), self.n, width))

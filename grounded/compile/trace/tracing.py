@@ -22,6 +22,7 @@ from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
 from grounded.compile.trace.tangents import Tangents
 from grounded.errors import GroundedError
+from grounded.foreign import contained
 from grounded.frozen import Array
 
 
@@ -53,10 +54,11 @@ class Signature:
     ) -> Mapping[str, Any]:
         """What the function, or a copy of it, returns for n, m and k values and dt."""
         a, parameters = Named("input", self.inputs, u), Named("parameter", self.params, p)
-        if self.within is not None:
-            return self._integrated(list(x), a, parameters, dt)
-        more = (dt,) if self.kind == "step" else ()
-        return self.function(Named("state", self.states, x), a, parameters, *more)
+        with contained():
+            if self.within is not None:
+                return self._integrated(list(x), a, parameters, dt)
+            more = (dt,) if self.kind == "step" else ()
+            return self.function(Named("state", self.states, x), a, parameters, *more)
 
     def _integrated(self, x: list[Any], a: Named, p: Named, dt: Any) -> Mapping[str, Any]:
         """The next state by equal steps of Runge-Kutta or Euler within a control step."""

@@ -107,4 +107,4 @@ def folds(group: Any, trial: Any, steps: Any) -> Any:
 def _tenths(values: Array) -> Array:
     """Return means over tenths of the time, (TENTHS, k) of (T, k)."""
     edges = np.linspace(0, len(values), TENTHS + 1).astype(int)
-    return np.stack([values[min(a, b - 1) : b].mean(axis=0) for a, b in pairwise(edges)])
+    return np.stack([values[a : max(b, a + 1)].mean(axis=0) for a, b in pairwise(edges)])

@@ -11,7 +11,8 @@ A guard refuses a cause whatever it gains:
     cut        beside it, a parameter of the model ends at a bound at which it is not without it:
                the bound decides how large the cause is
     no size    none of its values differs from zero by NO_SIZE standard deviations
-    one group  it names no mechanism (`Family.loose`) and only one group of trials shows it
+    one group  only one of several groups of trials shows it, or all trials are of one group and
+               it names no mechanism (`Family.loose`)
     refuted    it limits a rate that the log exceeds, or that no command reaches (`no_limits`)
 """
 
@@ -207,16 +208,17 @@ def _of_no_size(search: HypothesisSearch, fit: Fitted) -> list[str]:
 
 
 def one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> int:
-    """Return the number of trials of the only group that shows an effect without a mechanism.
+    """Return the number of trials of the only group that shows an effect; 0 if several do.
 
-    0 if several groups show it, or if it names a mechanism.
-
-    Along one motion, any error of the model is the same function of time, and of every state; each
-    repeat raises the evidence of an effect that fits it, and none confirms it. So the group with
-    the most evidence is not counted. (Of a single long log, its pieces are the groups.)
+    So the evidence of the group that has most of it is not counted. Where all trials are of one
+    group, no effect can be asked for a second one but those that name no mechanism: along one
+    motion, any error of the model is the same function of time and of every state, and each repeat
+    raises the evidence of an effect that fits it. (Of a single log, its pieces are the groups.)
     """
     data, h = search.data, fit.hypothesis
-    if not h.effects[h.names.index(name)].family.loose:
+    family = h.effects[h.names.index(name)].family
+    several = len(data.groups) > 1 and not isinstance(family, ParamFamily)
+    if not (family.loose or several):
         return 0
     lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]

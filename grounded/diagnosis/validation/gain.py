@@ -46,6 +46,12 @@ class Gain:
     channels: Array  # (n',) mean over horizons, by shown state
     scatters: Array  # (n',) standard errors of these
     again: float  # gain of all pieces but those of the best trial, in scatters of their sum
+    whole: tuple[float, float] = (0.0, 0.0)  # gain over whole trials and its standard error
+
+    @property
+    def ruins(self) -> bool:
+        """Whether predictions of whole trials are clearly worse."""
+        return self.whole[0] < -max(CLEARLY * self.whole[1], LEAST)
 
     @property
     def clear(self) -> bool:
@@ -87,7 +93,8 @@ class Comparison:
 
         whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
         counts = np.maximum(seen.sum(axis=(0, 1)), 1)
-        by, some = ratio(without(a), without(b)).sum(axis=0), max(int(seen.sum()), 1)
+        each, some = ratio(without(a), without(b)), max(int(seen.sum()), 1)
+        by, last = each.sum(axis=0), max(int(seen[-1].sum()), 1)
         return Gain(
             float(whole.sum() / some),
             float(_jackknife(by.sum(axis=-1) / some)),
@@ -95,6 +102,7 @@ class Comparison:
             whole.sum(axis=(0, 1)) / counts,
             _jackknife(by / counts),
             self._again(before, after),
+            (float(whole[-1].sum() / last), float(_jackknife(each[-1].sum(axis=-1) / last))),
         )
 
     def _by_unit(self, values: Array) -> Array:

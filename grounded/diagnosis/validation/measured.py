@@ -187,7 +187,7 @@ class Measured:
                     seconds,
                     k == len(self.ruler.steps),
                     self.units,
-                    by if self.ruler.held_out else "no",
+                    self.ruler.by,
                     floor_from=self.source,
                     floor_at_most=self.at_most,
                     floor_unsure=float(self.unsure[k].max()),

@@ -226,6 +226,21 @@ class Ruler:
         short, whole = self.fine[self.shown], self.fine_whole[self.shown]
         return np.stack([*[short] * len(self.steps), whole])
 
+    def score(self, fit: Fitted) -> float:
+        """Return the log score of a hypothesis: minus the mean log of errors, by spread."""
+        rms = np.hypot(self.errors(fit).rms[:, self.shown], self._matters())
+        spread = np.maximum(self.data.filled.std(axis=0)[self.shown], 1e-300)
+        logs = np.log(rms / spread)
+        return -float(np.mean(logs[np.isfinite(logs)])) if np.isfinite(logs).any() else 0.0
+
+    @property
+    def by(self) -> str:
+        """What is held out: groups of trials, trials, pieces of a single log, or nothing."""
+        if not self.held_out:
+            return "no"
+        several = "groups" if len(self.data.groups) > 1 else "trials"
+        return several if self.data.count > 1 else "pieces"
+
     def by_run(self, pieces: Array) -> Array:
         """Return the sums of pieces (K, P, n) by run (K, B, n)."""
         return np.asarray(np.add.reduceat(pieces, self.piece0[:-1], axis=1))

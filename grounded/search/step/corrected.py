@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import Backward, Problem, Swarm, System, deepest
+from grounded.compile.problem import Limits
 from grounded.compile.run.interpreted import linearised, rolled_out, sweep, trajectory_cost
 from grounded.frozen import Array, readonly, wrapped
 from grounded.policy import Policy
@@ -103,11 +104,17 @@ class Corrected(System):
         self.base.check(self._own(x), u, p, dt)
 
     def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
     ) -> tuple[Array, Array]:
         """See `System.linearise`."""
         n, m = self.base.n, self.m
-        f_x, f_u = self.base.linearise(self._own(x), u, p, dt, smoothing)
+        f_x, f_u = self.base.linearise(self._own(x), u, p, dt, smoothing, limits)
         F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
         by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
         F[:, n : 2 * n, : 2 * n + m] = np.concatenate([by_x, by_y, by_before], axis=2)

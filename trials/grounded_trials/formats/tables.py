@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, needs
+from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 from grounded_trials.formats.messages import Floats
 
@@ -59,10 +60,10 @@ def npz_records(path: Path) -> Iterator[Record]:
             f"{path} is an exported candidate, {arrays['candidate']}: the policy to run, not a log "
             "of its run. Pass the log that the robot's program wrote"
         )
-    yield from table_records(_npz_tables(arrays), "npz", path)
+    yield from table_records(_npz_tables(arrays, path), "npz", path)
 
 
-def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
+def _npz_tables(arrays: Mapping[str, Any], path: Path) -> dict[str, Columns]:
     labels = {
         key: list(map(column_name, a))
         for key, a in arrays.items()
@@ -83,17 +84,17 @@ def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
         ]
         key = f"{stem}_names" if f"{stem}_names" in fits else next(iter(fits), "")
         table = column_name(stem)
-        tables["/" + table] = {"t": t} | _columns(own, labels.get(key, []), table)
+        named = _columns(own, labels.get(key, []), table)
+        tables["/" + table] = {"t": t} | columns_by_name(named, path)
     used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
     times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]
     for k in times[:1]:
-        flat: dict[str, Floats] = {column_name(k): rest.pop(k)}
-        length = len(next(iter(flat.values())))
+        flat: list[tuple[str, str, Floats]] = [(column_name(k), k, rest.pop(k))]
         for name, a in rest.items():
-            if len(a) == length:
-                flat |= _columns(a, [], column_name(name))
-        tables["/npz"] = flat
+            if len(a) == len(flat[0][2]):
+                flat += _columns(a, [], column_name(name))
+        tables["/npz"] = columns_by_name(flat, path)
     return tables
 
 
@@ -103,11 +104,11 @@ def _names_another(key: str, table: str, numbers: Mapping[str, Any]) -> bool:
     return key.endswith("_names") and other != table and other in numbers
 
 
-def _columns(array: Floats, names: list[str], table: str) -> dict[str, Floats]:
+def _columns(array: Floats, names: list[str], table: str) -> list[tuple[str, str, Floats]]:
     if array.ndim == 1:
-        return {table: array}
+        return [(table, table, array)]
     names = names or [f"{table}_{i}" for i in range(array.shape[1])]
-    return {name: array[:, i] for i, name in enumerate(names) if not is_time(name)}
+    return [(name, name, array[:, i]) for i, name in enumerate(names) if not is_time(name)]
 
 
 def ulog_records(path: Path) -> Iterator[Record]:

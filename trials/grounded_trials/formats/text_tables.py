@@ -24,6 +24,7 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import column_name, is_time, table_records, time_among
@@ -72,7 +73,8 @@ def csv_records(path: Path) -> Iterator[Record]:
             values, stamps = _with_texts(_rows(stream, head, cut), head, times, path)
     if not values.size:
         raise GroundedError(f"{path} has no rows below line {head.line} with the column names")
-    columns: dict[str, Any] = {name: values[:, i] for i, name in enumerate(head.names) if name}
+    named = zip(head.names, head.cells, values.T, strict=True)
+    columns: dict[str, Any] = columns_by_name(named, path)
     if stamps is not None:
         columns[times] = stamps
     yield from table_records({"/csv": columns}, "csv", path)

@@ -14,11 +14,13 @@ from grounded.errors import GroundedError
 from grounded.result import listed
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
+from grounded_trials.formats.tables import LATEST
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
 from grounded_trials.toml_table import Table
 
 CLOCKS = ("header", "log", "publish")
+LATEST_S = 1e-9 * LATEST
 
 
 def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
@@ -46,7 +48,7 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
 
 
 def _signal(table: Table, clock: str) -> SignalSpec:
-    age = table.take("max_age_s", float) if table.has("max_age_s") else None
+    age = _time(table, "max_age_s") if table.has("max_age_s") else None
     how = table.choice("resample", ("linear", "hold", ""), "")
     spec = SignalSpec(
         path=_path(table),
@@ -54,7 +56,7 @@ def _signal(table: Table, clock: str) -> SignalSpec:
         unwrap=table.take("unwrap", bool, False),
         scale=table.take("scale", float, 1.0),
         offset=table.take("offset", float, 0.0),
-        delay_s=table.take("delay_s", float, 0.0),
+        delay_s=_time(table, "delay_s") if table.has("delay_s") else 0.0,
         max_age_s=age,
         resample=cast('Literal["linear", "hold"] | None', how or None),
     )
@@ -64,6 +66,14 @@ def _signal(table: Table, clock: str) -> SignalSpec:
     if spec.scale == 0:
         raise table.error("scale", "must not be 0: the signal would always be 0")
     return spec
+
+
+def _time(table: Table, key: str) -> float:
+    """Return a time [s], of a log's clock at the most: later ones have no whole nanoseconds."""
+    value: float = table.take(key, float)
+    if abs(value) > LATEST_S:
+        raise table.error(key, f"must be a time within {LATEST_S:g} s, found {value:g}")
+    return value
 
 
 def _path(table: Table) -> str:
@@ -94,7 +104,7 @@ def _end(table: Table, key: str) -> Any:
     if isinstance(value, str):
         return table.choice(key, ("first-input",), "first-input")
     if not isinstance(value, dict):
-        return table.take(key, float)
+        return _time(table, key)
     crossing = table.sub(key)
     found = Crossing(
         path=_path(crossing),

@@ -33,8 +33,10 @@ from grounded_trials.logs.samples import REGULAR, Samples, check_overlap, tidy
 from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
+    outliers,
     report_of,
     staircases,
+    vanished,
     warnings_of,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
@@ -193,7 +195,10 @@ def to_grid(
             for (name, at), column in zip(times.items(), columns, strict=True)
         )
         stairs = staircases(tracked, start, int(grid[-1]), dt)
-        return reports, (*warnings_of(reports, late), *stairs)
+        odd = outliers(tracked, start, int(grid[-1]))
+        cut = stop == until and (steps is None or count < steps) and span.end is None
+        gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
+        return reports, (*warnings_of(reports, late), *stairs, *odd, *gone)
 
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:

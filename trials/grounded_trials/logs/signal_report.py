@@ -22,6 +22,8 @@ SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
 BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
 LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
 COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
+FAR = 10.0  # times the range of all other samples of a signal: a sample is far outside them
+LOST = 0.1  # least share of a log that is told if one state lacks it
 DISORDERED = 0.01  # least share of stamps out of order that is told; sorting loses nothing of them
 
 
@@ -153,6 +155,53 @@ def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> l
             f"{which} change{s} at {text} on average. {advice}: then they are interpolated"
         )
     return found
+
+
+def outliers(series: Sequence[Samples], first: int, last: int) -> list[str]:
+    """Return warnings on single samples far outside everything else that their signal has.
+
+    Args:
+        series: of states.
+        first: the trial's start [ns].
+        last: the trial's end [ns].
+    """
+    found = []
+    for samples in series:
+        inside = (samples.t >= first) & (samples.t <= last)
+        t, y = samples.t[inside], samples.y[inside]
+        if len(y) < LEAST_RUNS:
+            continue
+        jump = np.abs(np.diff(y))  # in and out again, or a step would count
+        alone = np.minimum(jump[:-1], jump[1:])
+        i = int(np.argmax(alone)) + 1
+        others = np.delete(y, i)
+        if alone[i - 1] > FAR * np.ptp(others) > 0:
+            found.append(
+                f"'{samples.name}' is {y[i]:.4g} at {(t[i] - first) * 1e-9:.3f} s, far outside all "
+                f"its other samples, {others.min():.4g} to {others.max():.4g}: delete that row or "
+                "message from the log"
+            )
+    return found
+
+
+def vanished(series: Sequence[Samples], last: int) -> list[str]:
+    """Return a warning on a signal that ends the trial, long before the others end.
+
+    Args:
+        series: of states.
+        last: the trial's end [ns].
+    """
+    ends = {samples.name: int(samples.t[-1]) for samples in series}
+    origin = min((int(samples.t[0]) for samples in series), default=0)
+    gone = [name for name, end in ends.items() if end <= last]
+    goes_on = max(ends.values(), default=0)
+    if not gone or last - origin > (1 - LOST) * (goes_on - origin):
+        return []
+    until, whole = ((end - origin) * 1e-9 for end in (ends[gone[0]], goes_on))
+    return [
+        f"{listed(map(repr, gone))} has no sample after {until:.2f} s of the log, in which other "
+        f"states go on until {whole:.2f} s: the trial ends there"
+    ]
 
 
 def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:

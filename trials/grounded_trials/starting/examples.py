@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 from grounded.task import Task
-from grounded_trials.store.store import made_folder, write_atomically
+from grounded_trials.store.store import made_folder, sweep, write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import target_text
@@ -181,6 +181,7 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
     try:
         for made in (folder, folder / "trials", folder / "candidates"):
             made_folder(made)
+        sweep(folder, 0.0)  # of an `init` that was killed: the folder is no workspace yet
         yield
     except BaseException:
         for path in [folder] if new else [folder / name for name in files]:

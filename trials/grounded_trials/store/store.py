@@ -14,6 +14,7 @@ temporary file, which the next process removes.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -27,18 +28,11 @@ from pathlib import Path
 from grounded.errors import GroundedError
 from grounded_trials.plain_file import open_file
 
-try:
-    import fcntl
-except ImportError:
-    raise GroundedError(
-        "trials can be stored on Linux and macOS only: the store locks its folder with fcntl, "
-        "which Windows lacks. Use WSL; grounded.policy, which drives a robot, also works here"
-    ) from None
-
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
 _TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+POLL_S = 0.01  # [s] between two attempts to lock a folder that another process has locked
 OLD_S = 3600.0  # [s] age at which a temporary file counts as abandoned
 
 
@@ -249,25 +243,31 @@ class Store:
         Raises:
             GroundedError: if the folder can't be written.
         """
+        from filelock import FileLock
+
+        lock = FileLock(self.folder / ".lock", mode=0o644)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+            lock.acquire(poll_interval=POLL_S)
         except OSError as error:
             raise self._unwritable(error) from None
+        except NotImplementedError:
+            raise GroundedError(
+                f"{self.folder} can't be locked, as its file system has no file locks: move the "
+                "workspace to a local disk"
+            ) from None
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            except OSError as error:
-                raise self._unwritable(error) from None
             yield
         finally:
             with suppress(OSError):  # nothing was written to it
-                os.close(descriptor)
+                lock.release()
 
     def _unwritable(self, error: OSError) -> GroundedError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        mend = "Free disk space" if full else "Get write permission"
         return GroundedError(
-            f"{self.folder} can't be written: {error.strerror}; the file is not stored. Free disk "
-            "space, or get write permission, and add it again"
+            f"{self.folder} can't be written: {error.strerror}; the file is not stored. {mend}, "
+            "and add it again"
         )
 
 
@@ -295,7 +295,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
-        _sweep_old(path.parent)
+        sweep(path.parent)
         _copy(data, temporary, mode=0o644)
         temporary.replace(path)
         sync_folder(path.parent)
@@ -310,13 +310,13 @@ def write_atomically(path: Path, data: bytes) -> None:
         _remove(temporary)
 
 
-def _sweep_old(folder: Path) -> None:
-    """Remove temporary files of killed processes, `OLD_S` after their last write."""
+def sweep(folder: Path, age_s: float = OLD_S) -> None:
+    """Remove temporary files of killed processes, so long after their last write."""
     with os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
     for path in (folder / name for name in names):
         with suppress(OSError):
-            if path.lstat().st_mtime < time.time() - OLD_S:
+            if path.lstat().st_mtime <= time.time() - age_s:
                 path.unlink()
 
 

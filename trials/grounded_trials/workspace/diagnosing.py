@@ -17,6 +17,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
 from grounded.result import begun
+from grounded.share import Share, share_of
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
@@ -82,8 +83,11 @@ def diagnose_in(
         n: float(e["d"]) for n, e in zip(names, effects, strict=True) if n.startswith("delay:")
     }
     library = (library or Library()).without(without)
-    planner, used = workspace.planner, _chosen(workspace, trials)
-    others = _chosen(workspace, compare) if compare else []
+    planner = workspace.planner
+    share = _chosen(workspace, trials)
+    second = _chosen(workspace, compare) if compare else Share([], "")
+    used, others = share.trials, second.trials
+    told = filter(None, [share.sentence, second.sentence])
     memory = planner.plan.model.state_names[planner.task.model.n :]
     rows, early = unsure_times(workspace.whole_trials(), {one.id for one in (*used, *others)})
     options = DiagnosisOptions(
@@ -96,7 +100,7 @@ def diagnose_in(
         interpolated_s=early,
         origin=workspace.origin if effects or workspace.config.model.params else None,
     )
-    lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
+    lifted, apart = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
         trials=tuple(trial.id for trial in used + others),
         adopted=tuple(effects),
@@ -109,19 +113,17 @@ def diagnose_in(
         interpolated_s=early,
     )
     began = time.monotonic()
-    found = diagnose(
-        planner.plan, lifted, options, compare=second, engine=engine, progress=progress
-    )
+    found = diagnose(planner.plan, lifted, options, compare=apart, engine=engine, progress=progress)
     took = time.monotonic() - began
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    limits = (*found.unknowable, *_not_compared(workspace))
+    limits = (*found.unknowable, *_not_compared(workspace), *told)
     found = replace(found, made=made, preflight=seen, ranking=known, unknowable=limits)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
     try:
-        identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+        identity, words = _probe(workspace, found, lifted + apart, library, write=probe)
     except Exception as error:  # a failed probe must not lose the diagnosis
         if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
@@ -145,7 +147,7 @@ def diagnose_in(
         )
         found = replace(found, next_trial=f"{first} {found.next_trial}")
     more = len(diagnosable(workspace)) - len(made.trials)
-    if unasked := found.no_cause and more > 0:
+    if unasked := found.no_cause and more > 0 and not share.sentence:
         words = f"{count(more, 'stored trial')} of this task can be diagnosed as well."
         found = replace(found, next_trial=words)
     write_diagnosis(workspace.reports, found)  # again, now with `next_trial`
@@ -245,7 +247,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
-    used = _chosen(workspace, trials)
+    used = _chosen(workspace, trials).trials
     lifted, together = [planner.lift(trial) for trial in used], one_message(workspace)
     found = sound_trials(planner.plan, lifted, memory, one_message=together)
     return where_to_mend(workspace, used, found.findings)
@@ -255,7 +257,7 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
     from grounded.instruments.kinematics.rows import unheld
 
-    return unheld(workspace.planner.task.model, _chosen(workspace, trials))
+    return unheld(workspace.planner.task.model, _chosen(workspace, trials).trials)
 
 
 def unwritten_in(workspace: Folder) -> list[str]:
@@ -273,8 +275,10 @@ def unwritten_in(workspace: Folder) -> list[str]:
     ]
 
 
-def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
-    """Return the trials to diagnose; states filled in by a smoother are no evidence: NaN again.
+def _chosen(workspace: Folder, names: Sequence[str]) -> Share:
+    """Return the trials to diagnose, or a share of them.
+
+    States that were filled in by a smoother are no evidence: NaN again.
 
     Raises:
         GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
@@ -285,12 +289,14 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
 
     used, model = diagnosable(workspace), workspace.base_model
     names = named_trials(workspace, names, [trial.id for trial in used])
-    some = [trial for trial in used if not names or trial.id in names]
-    stop_at_folded(model, some, kinematic_rows(model, range(model.n)))
+    share = share_of([trial for trial in used if not names or trial.id in names])
+    stop_at_folded(model, share.trials, kinematic_rows(model, range(model.n)))
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
-    return [
-        _measured(trial, [name for name in guessed[trial.id].split(",") if name]) for trial in some
+    measured = [
+        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
+        for trial in share.trials
     ]
+    return replace(share, trials=measured)
 
 
 def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:

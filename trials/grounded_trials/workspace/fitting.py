@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
+from grounded.share import share_of
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import estimated_in, unsure_times
@@ -77,12 +78,13 @@ def fit_in(
         GroundedError: if `apply` is set but the fit predicts held-out time worse than before;
             nothing is written then.
     """
-    used = fittable(workspace, trials)
+    share = share_of(fittable(workspace, trials))
+    used = share.trials
     found, seen = fit_trials(
         workspace, used, names, latency=latency, engine=engine, progress=progress
     )
     rows, early = unsure_times(workspace.whole_trials(), ids_of(used))
-    found, row, mean = _as_times_tell(workspace, found, rows, early)
+    found, row, mean = _as_times_tell(workspace, found.of_share(share.sentence), rows, early)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
         write_fit(workspace, used, found)

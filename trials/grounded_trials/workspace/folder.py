@@ -90,7 +90,20 @@ class Folder:
 
     @cached_property
     def config(self) -> Config:
-        """The checked grounded.toml."""
+        """The checked grounded.toml.
+
+        Raises:
+            GroundedError: also if a folder of the workspace is a link out of it, into which its
+                commands would write.
+        """
+        for name in ("trials", "candidates", "runs", "reports"):
+            place = self.folder / name
+            if place.is_symlink() and not place.resolve().is_relative_to(self.folder.resolve()):
+                raise GroundedError(
+                    f"{place} is a link to {place.resolve()}, outside the workspace: expected a "
+                    "folder of its own, since commands write there. Delete the link, and move the "
+                    "files here if they belong to this workspace"
+                )
         return read_config(self.folder)
 
     @cached_property
@@ -296,6 +309,9 @@ class Folder:
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
         broken: list[Damaged] = []
+        if lost is not None and "_trials" in vars(self):  # they were read, and none is damaged
+            lost += [Lost(one.path.name, one.reason) for one in self.noted.gone(self.store)]
+            return self._trials
         known, found = self.noted if lost is None else self._read_notes(broken), []
         entries = [e for e in self.store.list() if known.why_aside(e) is None]
         read = self._indexed if self._many else self._whole
@@ -309,7 +325,10 @@ class Folder:
         self.save_index()
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *known.gone(self.store))]
-        return named_apart(found, known, self.candidate_path)
+        trials = named_apart(found, known, self.candidate_path)
+        if not broken:
+            vars(self)["_trials"] = trials
+        return trials
 
     @property
     def _many(self) -> bool:

@@ -198,7 +198,8 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         return DIAGNOSE
     if now is None:
         with suppress(GroundedError):  # a task that can't be planned, of which data say nothing
-            ran = any(one.candidate for one in workspace.task_trials())
+            handed = any(workspace.candidate_path("c").parent.glob("c*.mcap"))
+            ran = handed and any(one.candidate for one in workspace.task_trials())
             if ran and (now := standing_in(workspace)).phase == "await-trial":
                 return another_trial(workspace, now)
         return DIAGNOSE

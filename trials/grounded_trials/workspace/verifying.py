@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
-from grounded.result import Result
+from grounded.result import Result, listed
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
@@ -40,9 +40,10 @@ def verify_in(workspace: Folder) -> Verified:
     broken = [*workspace.store.verify()]
     known = noted(workspace.notes.read(broken))
     broken += known.gone(workspace.store)
+    gone = {one.path.name for one in broken}
     damaged = [Lost(str(one.path), one.reason) for one in broken]
     checked = len(workspace.store.list()) + len(workspace.notes.store.list())
-    for path, check in (*_candidates(workspace, known), *_documents(workspace)):
+    for path, check in (*_candidates(workspace, known, gone), *_documents(workspace)):
         checked += 1
         try:
             check()
@@ -51,9 +52,18 @@ def verify_in(workspace: Folder) -> Verified:
     return Verified(checked, tuple(damaged))
 
 
-def _candidates(workspace: Folder, known: Noted) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Yield the path of each candidate that exists or existed, with a function that checks it."""
+def _candidates(
+    workspace: Folder, known: Noted, gone: set[str]
+) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """Yield the path of each candidate that exists or existed, with a function that checks it.
+
+    Args:
+        workspace: the workspace.
+        known: its notes.
+        gone: trials that are reported as missing already.
+    """
     folder = workspace.folder / "candidates"
+    stored = {one.id for one in workspace.store.list()} | gone
     names = {path.stem for path in folder.glob("*.mcap")} | set(known.handed)
     for name in sorted(names):
         path = workspace.candidate_path(name)
@@ -62,8 +72,13 @@ def _candidates(workspace: Folder, known: Noted) -> Iterator[tuple[Path, Callabl
             handed = known.handed.get(name)
             if not path.exists() and _carried(workspace, handed or set()):
                 return
-            data = read_file(path, FILE_LIMIT)
-            intact(data, name)
+            data = read_file(path, FILE_LIMIT, follow=False)
+            lost = sorted({*intact(data, name)[0].seen} - stored)
+            if lost:
+                raise GroundedError(
+                    f"{path} was made from {listed(lost)}, which trials/ does not have any more: "
+                    "bring the files back from a copy, or ingest the original logs again"
+                )
             if handed and sha256(data) not in handed:
                 raise GroundedError(
                     f"{path} is not the file that was handed out as {name}: it was rewritten"

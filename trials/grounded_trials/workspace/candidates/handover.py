@@ -36,7 +36,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.store import Stored
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.wording import ranges, with_unit
+from grounded_trials.wording import ranges, what_became, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
 from grounded_trials.workspace.where_to_mend import twice_in_time
@@ -328,8 +328,9 @@ class Check:
         if tried is not None and tried.void:
             yield (
                 f"{name} was made from {ranges(tried.gone)}, which "
-                f"{'is' if len(tried.gone) == 1 else 'are'} set aside: `propose` says what to run "
-                "instead"
+                f"{'is' if len(tried.gone) == 1 else 'are'} "
+                f"{what_became(tried.gone, self.workspace.discarded())}: `propose` says what to "
+                "run instead"
             )
         if tried is not None and tried.accepted is False and best is not None:
             lost = "crashed" if tried.utility == -np.inf else f"lost with {tried.utility:.4g}"

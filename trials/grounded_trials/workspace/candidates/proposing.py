@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, figure
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
-from grounded_trials.wording import ranges, rendered
+from grounded_trials.wording import ranges, rendered, what_became
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
@@ -35,7 +36,7 @@ from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
     from grounded.diagnosis.report import Diagnosis
     from grounded.figures.figure import Figure
@@ -147,7 +148,7 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate = proposal.candidate
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
-    left = _disowned(proposal.standing)
+    left = _disowned(proposal.standing, workspace.discarded())
     if candidate is not None and proposal.is_new:
         notes = notes or left or _void(workspace, before)
     elif candidate is not None:
@@ -261,7 +262,7 @@ def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[
     return None
 
 
-def _disowned(now: Standing) -> list[str]:
+def _disowned(now: Standing, aside: Collection[str]) -> list[str]:
     """Explain which latest candidates, never run, are void since a trial was discarded."""
     found = []
     for tried in reversed(now.history):
@@ -271,8 +272,9 @@ def _disowned(now: Standing) -> list[str]:
             name = tried.candidate.id
             found.append(
                 f"{name} was not run and is void: {ranges(tried.gone)}, which it was made from, "
-                f"{'is' if len(tried.gone) == 1 else 'are'} set aside. If the robot has run it "
-                f"meanwhile, ingest that log with --candidate {name}: it counts"
+                f"{'is' if len(tried.gone) == 1 else 'are'} {what_became(tried.gone, aside)}. If "
+                f"the robot has run it meanwhile, ingest that log with --candidate {name}: it "
+                "counts"
             )
     return found
 
@@ -344,7 +346,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
             *notes,
             *_nothing_stored(workspace),
             *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
-            *(_disowned(standing) if standing.phase != "propose" else ()),
+            *(_disowned(standing, workspace.discarded()) if standing.phase != "propose" else ()),
             *_lost_by_starts(standing),
             *_namesakes(workspace),
             *not_counted(uncounted(workspace, workspace.trials(), standing)),

@@ -105,13 +105,15 @@ def simulated_plant(workspace: Folder) -> Plant:
                     "state: " + nearest(name, model.states)
                 )
     noise = Noise(**{kind: dict(values) for kind, values in system.noise.items()})
-    latency = getattr(module, "latency", {})
-    return Plant(
-        model=model,
-        latency=dict(latency),
-        noise=noise,
-        substeps=int(getattr(module, "substeps", 5)),
-    )
+    try:
+        latency = {str(k): float(v) for k, v in dict(getattr(module, "latency", {})).items()}
+        substeps = int(getattr(module, "substeps", 5))
+    except (TypeError, ValueError) as error:
+        raise GroundedError(
+            f"{system.model}: latency must be {{input: seconds}} and substeps a whole number: "
+            f"{error}"
+        ) from None
+    return Plant(model=model, latency=latency, noise=noise, substeps=substeps)
 
 
 def _next_run(folder: Path, identity: str) -> Path:

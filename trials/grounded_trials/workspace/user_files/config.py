@@ -267,7 +267,7 @@ def set_target(
     """
     import tomlkit
 
-    old_text = file.read_text(encoding="utf-8")
+    old_text = file.read_text(encoding="utf-8-sig")
     document, made, blank = tomlkit.parse(old_text), made_changes(old_text), dict[str, float]()
     _put(document, "task", {"target": name, "horizon": steps})
     reward = document.get("reward", {})
@@ -339,7 +339,7 @@ def _is_offered(terminal: float, weight: float | None) -> bool:
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
     import tomlkit
 
-    document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
     _put(document, where, changes)
     write_atomically(file, tomlkit.dumps(document).encode())
 

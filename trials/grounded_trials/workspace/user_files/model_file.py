@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.adapters.beside import beside
 from grounded.errors import GroundedError, nearest
+from grounded.foreign import contained
 from grounded.model import Model
 from grounded.trusted import check_own
 from grounded_trials.workspace.user_files.config import FILE
@@ -61,11 +62,11 @@ def load_module(
     sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
         # a model's prints must not mix with our output; files it reads are relative to its folder
-        with contextlib.redirect_stdout(sys.stderr), beside(path.parent):
+        with contextlib.redirect_stdout(sys.stderr), beside(path.parent), contained():
             spec.loader.exec_module(found)
     except GroundedError as error:
         raise GroundedError(f"{path}: {error}") from None
-    except (Exception, SystemExit) as error:
+    except Exception as error:
         raise GroundedError(_where(error, str(path))) from None
     finally:
         sys.dont_write_bytecode = writes
@@ -85,9 +86,11 @@ def _installed(name: str) -> ModuleType:
             registered = {point.name: point for point in entry_points(group="grounded.models")}
         if name in registered:
             found = ModuleType(name)
-            vars(found)["model"] = registered[name].load()
+            with contained():
+                vars(found)["model"] = registered[name].load()
             return found
-        return importlib.import_module(name)
+        with contained():
+            return importlib.import_module(name)
     except ModuleNotFoundError as error:
         raise GroundedError(
             f"[model] module = '{name}' can't be imported: {error}; install its package in this "

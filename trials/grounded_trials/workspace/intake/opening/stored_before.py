@@ -188,9 +188,12 @@ def same_recording(
     Raises:
         GroundedError: if it has more of the recording than the stored trial, or other numbers.
     """
+    stored = workspace.whole_trials()
+    if not stored:
+        return None
     trial, meta, _ = read_trial(data)
     begin, end = _span(meta, trial)
-    for one in workspace.whole_trials():
+    for one in stored:
         first, last = _span(one.meta, one.measured)
         foreign = "source" in one.meta
         if foreign != (log is not None) or not (first < end and begin < last):

@@ -14,6 +14,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import ranges
@@ -70,8 +71,9 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
 
     Args:
         workspace: the workspace with the model and [safety].
-        trial: the trial, with gaps bridged.
+        trial: the trial, with gaps bridged; of a long one its first steps are looked at.
     """
+    trial = trial.until(STEPS)
     model, known = workspace.base_model, trial.until(trial.known_steps)
     if exchanged := _by_model(workspace, known):
         return exchanged  # other faults may only be a consequence

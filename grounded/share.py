@@ -1,0 +1,56 @@
+"""A share of what is large: trials of which so many steps are used as an answer needs.
+
+A fit and a diagnosis take minutes for 100,000 steps or 100 trials, and what more data add to an
+answer falls with their root. So whole trials are taken at equal distances in the order in which
+they were recorded, as many as the budget has room for; a longer one is cut to its first steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.trial import Trial
+
+STEPS, TRIALS = 100_000, 100  # control steps of all trials together, and trials, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """The trials that are used, and a sentence that says which these are; "" for all."""
+
+    trials: list[Any]
+    sentence: str
+
+
+def share_of(trials: Sequence[Trial], steps: int = STEPS, most: int = TRIALS) -> Share:
+    """Choose trials within a budget of steps and of trials.
+
+    Args:
+        trials: in the order in which they were recorded.
+        steps: the budget, of all trials together.
+        most: the largest number of trials.
+
+    Returns:
+        The trials themselves if they are within it.
+    """
+    total = sum(trial.steps for trial in trials)
+    if total <= steps and len(trials) <= most:
+        return Share([*trials], "")
+    cut = [trial.until(steps) for trial in trials]
+    length = np.array([trial.steps for trial in cut])
+    for count in range(min(len(cut), most), 0, -1):
+        chosen = np.unique(np.linspace(0, len(cut) - 1, count).astype(int))
+        if (used := int(length[chosen].sum())) <= steps:
+            break
+    which = f"{len(chosen)} of {len(cut)} trials, at equal distances" * (len(chosen) < len(cut))
+    first = "the first steps" + " of each longer one" * bool(which)
+    which = ", ".join(filter(None, [which, first * any(t.steps > steps for t in trials)]))
+    return Share(
+        [cut[i] for i in chosen],
+        f"of {total:,} steps {used:,} were used, as many as are looked at together: {which}. "
+        "Name some with --trials to use others",
+    )

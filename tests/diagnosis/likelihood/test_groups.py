@@ -1,0 +1,105 @@
+"""Groups of trials that differ in motion or in condition, and the folds made of them."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
+from grounded.diagnosis.likelihood.groups import Signals, folds
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.effects import Library
+
+MODEL = Model(
+    states={"x": "m", "v": "m/s"},
+    inputs={"u": "m/s^2"},
+    params={"k": Param(1.0, "1", std=0.1)},
+    roles={"position": ("x",), "speed": "v"},
+    derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v},
+)
+DT, STEPS = 0.05, 120
+
+
+def trial(u, noise=0.01, seed=0, steps=STEPS, **more):
+    """A cart under a command u(t), with noise that makes no motion different."""
+    rng, x, states = np.random.default_rng(seed), np.zeros(2), [np.zeros(2)]
+    sent = np.array([[u(k * DT)] for k in range(steps)])
+    for value in sent[:, 0]:
+        x = x + DT * np.array([x[1], value - x[1]])
+        states.append(x)
+    y = np.array(states) + noise * rng.standard_normal((steps + 1, 2))
+    return Trial(y, sent, DT, ("x", "v"), ("u",), **more)
+
+
+def slow(t):
+    return np.sin(1.1 * t)
+
+
+def fast(t):
+    return np.sin(2.7 * t)
+
+
+@pytest.mark.parametrize(
+    ("trials", "groups"),
+    [
+        ([trial(slow), trial(slow, seed=1), trial(fast)], [(0, 1), (2,)]),
+        ([trial(slow), trial(lambda t: 0.5 * slow(t)), trial(slow, seed=2)], [(0, 2), (1,)]),
+        ([trial(lambda t: 0.2), trial(lambda t: 0.4), trial(lambda t: 0.2)], [(0, 2), (1,)]),
+        ([trial(slow), trial(slow, steps=60)], [(0,), (1,)]),
+        ([trial(slow, group="wet"), trial(slow, seed=1, group="dry")], [(0,), (1,)]),
+        ([trial(slow, group="wet"), trial(fast, group="wet"), trial(fast)], [(0, 1), (2,)]),
+        ([trial(slow)], [(0,)]),
+    ],
+)
+def test_trials_of_one_motion_in_one_condition_are_a_group(trials, groups):
+    assert [group.trials for group in prepare(MODEL, trials).groups] == groups
+
+
+def test_a_group_says_which_levels_set_it_apart():
+    found = prepare(MODEL, [trial(lambda t, a=a: a) for a in (0.2, 0.4, 0.2)]).groups
+    assert all(set(group.differs_in) == {"u", "v"} for group in found)
+    one = Signals(["u"], [np.ones((50, 1))], [""])
+    assert one.groups()[0].differs_in == ()
+
+
+@pytest.mark.parametrize(
+    ("group", "steps", "expected"),
+    [
+        ([0, 1, 0, 1], [50, 50, 50, 50], [0, 1, 0, 1]),  # half of all: held out whole
+        ([0, 0, 0, 1], [50, 50, 50, 50], [1, 2, 3, 0]),  # most of all: trial by trial
+        ([0, 1, 2], [10, 10, 80], [0, 1, 2]),
+        ([0], [100], [0]),
+    ],
+)
+def test_a_fold_is_a_group_or_part_of_one_that_holds_most(group, steps, expected):
+    assert folds(np.array(group), np.arange(len(group)), steps).tolist() == expected
+
+
+def test_many_groups_make_few_folds_and_pieces_of_a_log_stay_apart():
+    many = np.arange(100)
+    assert len(set(folds(many, many, np.ones(100)).tolist())) == 20
+    one = np.zeros(30, int)
+    assert len(set(folds(one, one, np.ones(30)).tolist())) == 30
+
+
+def test_a_coefficient_that_only_what_is_held_out_shows_predicts_nothing_there():
+    data = prepare(MODEL, [trial(slow), trial(fast)])
+    effect = Library().effect("viscous_friction:v", MODEL, data.scales)
+    h = Hypothesis().plus(effect, {"k": 0.7})
+    gram, score = np.array([[[100.0]], [[0.0]]]), np.zeros((2, 1))
+    zero = np.zeros(2)
+    fit = Fitted(h, None, data.y, 0, 0, 0, gram, score, zero, zero, data.y, data.y)
+    shifts, _ = leave_one_out(fit, np.array([0, 1]))
+    np.testing.assert_allclose(shifts[:, 0], [-0.7, 0.0], atol=1e-3)
+
+
+@pytest.mark.parametrize(("before", "told"), [(0.0, None), (0.6, None), (0.6, 0.1)])
+def test_the_input_before_a_log_is_what_its_first_samples_fit(before, told):
+    first = 0.6 if before else 0.0  # at rest under the first command, or hit by it as a step
+    x, states = np.array([0.0, first]), [np.array([0.0, first])]
+    for _ in range(60):
+        x = x + DT * np.array([x[1], (0.6 if len(states) > 6 or before else 0.0) - x[1]])
+        states.append(x)
+    start = None if told is None else np.array([told])
+    one = Trial(np.array(states), np.full((60, 1), 0.6), DT, ("x", "v"), ("u",), start_inputs=start)
+    assert prepare(MODEL, [one]).held[0, 0] == (before if told is None else told)
