@@ -25,6 +25,7 @@ def held_out(found: Diagnosis) -> str:
     """Say how the errors were held out and what the noise floor is from."""
     row = found.prediction_error[0]
     by = {
+        "groups": "each group of trials predicted with values from the others",
         "trials": "each trial predicted with values from the others",
         "pieces": "each piece of the log predicted with values from the others",
     }
