@@ -445,7 +445,6 @@ def _adopted_off(claims: Claims, name: str, told: Mapping[str, str]) -> str:
 
 
 STAND_IN = "While that gap remains, what is named above may stand in for what is missing."
-BARELY = 0.01  # share of the improvement below which a claim needs another reason
 OPEN = ", unless the gap that remains is the reason"  # a value that a parameter should have
 OPEN_TIE = ", unless the gap that remains or what ties with it is the reason"
 UNSURE = ", but its size is uncertain: within 2 standard deviations of zero"

@@ -35,7 +35,6 @@ from grounded.frozen import Array
 
 CHANCE = 1e-3  # p-value of a common value below which trials disagree, if
 APART = 0.05  # their scatter beyond chance is more than this fraction of the value
-MOVED = 0.25  # of the radius of a patch: scatter of its places beyond chance
 OFF = 3.0  # standard deviations from which a single trial is off
 GOES_WITH = 0.8  # correlation from which a value depends on a condition
 CHANGE = 5.0  # nats from which a change is stated
@@ -118,21 +117,6 @@ def by_trial(
         estimate = Estimate(one.value, float(beyond), unit=one.unit)
         tests.append(Agreement(one.effect, one.quantity, not differs, chance, estimate, with_))
     return tuple(rows), tuple(tests)
-
-
-def is_nowhere(fit: Fitted, data: Data, name: str) -> bool:
-    """Check whether the trials place an effect that acts at one place at different places.
-
-    Such an effect stands in for what the model lacks all over. A car's cornering drag of another
-    form was a patch of ground that lay 2.4 m farther on in one trial than in another.
-    """
-    values = fit.hypothesis.values[fit.hypothesis.names.index(name)]
-    if "radius" not in values:
-        return False
-    _, tests = by_trial(fit, data, ())
-    off = {t.quantity: t.estimate.std for t in tests if t.effect == name and not t.agrees}
-    places = off.keys() - {"c", "radius"}
-    return any(off[q] > MOVED * abs(values["radius"]) for q in places)
 
 
 def _goes_with(data: Data, some: Any, own: Array) -> str:

@@ -114,6 +114,10 @@ class Rule:
             self._unsupported[option.causes] = known
         return known
 
+    def refuse(self, option: Option, causes: list[str]) -> None:
+        """Take some causes of a set for unsupported from now on."""
+        self._unsupported[option.causes] = causes
+
     def _needed(self, option: Option, cause: str) -> bool:
         """Check whether a set is likelier and predicts better with one of its causes."""
         if cause in option.refused:

@@ -29,6 +29,7 @@ from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.choose import CLAIM, Choice, Option, Rule
 from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.ruler import Ruler
@@ -102,6 +103,9 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
     options = Options(search, ruler)
     rule = Rule(options.hopeful(), ruler.compared, options.less, held_out=ruler.held_out)
     choice = rule.choose()
+    while vague := options.vague(choice.chosen):
+        rule.refuse(choice.chosen, vague)
+        choice = rule.choose()
     own = choice.chosen.causes
     fit, crude = options.fits[own], options.fits[frozenset()]
     less = {c: options.fits[one.causes] for c in own if (one := options.less(choice.chosen, c))}
@@ -151,10 +155,39 @@ class Options:
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            refused = {*_of_no_size(search, fit), *no_limits(search.data, fit.hypothesis)}
+            refused = {*self._of_no_size(fit, self.alone(fit)[0])}
+            refused |= {*no_limits(search.data, fit.hypothesis)}
             errors, score = self.ruler.errors(fit), search.score(fit)
             self._known[own] = Option(own, score, errors, order, frozenset(refused))
         return self._known[own]
+
+    def alone(self, fit: Fitted) -> tuple[Array, Array]:
+        """Return the standard deviations and half-widths of a fit's values, by that fit alone."""
+        data, worth = self.search.data, self.search.tempering.factor
+        return standard_deviations(self.search.predictor, fit, data.folds, worth)
+
+    def vague(self, option: Option) -> list[str]:
+        """Return the effects without a size if all likely fits of the same effects are asked."""
+        fit = self.fits[option.causes]
+        if not fit.hypothesis.effects:
+            return []
+        return self._of_no_size(fit, averaged(self.search, fit, self.ruler, self.alone)[0])
+
+    def _of_no_size(self, fit: Fitted, std: Array) -> list[str]:
+        """Return the effects of which no coefficient is known to differ from zero.
+
+        Of effects without coefficients, their times or thresholds are asked. Parameters are exempt,
+        since they have priors.
+        """
+        at, found, theta = 0, list[str](), fit.hypothesis.theta
+        for effect in fit.hypothesis.effects:
+            every = [at + k for k in range(len(effect.free))]
+            own = [k for k, q in zip(every, effect.free, strict=True) if not q.grid] or every
+            at += len(every)
+            none = (np.abs(theta[own]) < NO_SIZE * std[own]).all()
+            if own and none and not isinstance(effect.family, ParamFamily):
+                found.append(effect.name)
+        return found
 
     def less(self, option: Option, cause: str) -> Option | None:
         """Return a set without one cause, fitted from the values and the noise of the larger one.
@@ -186,25 +219,6 @@ def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
     values = model.values if shift is None else model.values + shift
     params = zip(model.params.items(), values, strict=True)
     return [name for (name, param), value in params if param.stopped(float(value))]
-
-
-def _of_no_size(search: HypothesisSearch, fit: Fitted) -> list[str]:
-    """Return the effects of a fit of which no coefficient is known to differ from zero.
-
-    Parameters are exempt, since they have priors.
-    """
-    at, sizes = 0, dict[str, list[int]]()
-    for effect in fit.hypothesis.effects:
-        own = [at + k for k, q in enumerate(effect.free) if not q.grid]
-        own = own or [at + k for k in range(len(effect.free))]
-        if own and not isinstance(effect.family, ParamFamily):
-            sizes[effect.name] = own
-        at += len(effect.free)
-    if not sizes:
-        return []
-    theta = fit.hypothesis.theta
-    std: Array = standard_deviations(search.predictor, fit, search.data.folds)[0]
-    return [n for n, k in sizes.items() if (np.abs(theta[k]) < NO_SIZE * std[k]).all()]
 
 
 def one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> int:

@@ -169,9 +169,6 @@ class Measured:
             "with_effects": self.rms(self.best),
             "noise_floor": self.floor,
         }
-        by = (
-            "groups" if len(self.data.groups) > 1 else "trials" if self.data.count > 1 else "pieces"
-        )
         rows = []
         for k, seconds in self.horizons():
             found = {

@@ -113,11 +113,6 @@ class Ruler:
         self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
         self._compared.clear()
 
-    def negligible(self, fit: Fitted, channel: str) -> bool:
-        """Check whether errors of a state at the furthest horizon are negligible."""
-        i = self.data.model.state_names.index(channel)
-        return bool(self.errors(fit).rms[len(self.steps) - 1, i] <= 2 * self.fine[i])
-
     def since_outset(self, fit: Fitted) -> float:
         """Return the mean gain of a hypothesis over the model before anything was adopted."""
         return self.compared(self.outset, self.errors(fit)).mean

@@ -1,0 +1,166 @@
+"""The decision of a diagnosis on blind cases: fitted once, decided in seconds.
+
+    python -m benchmarks.decide make FOLDER --kind single --cases 48 --seed 911290001
+    python -m benchmarks.decide FOLDER [--half open|sealed|all] [--curves]
+
+`make` diagnoses cases of the challenge and keeps of each what the rule (`grounded.diagnosis.
+validation.choose`) decides on: every set of causes that was fitted, with evidence, held-out errors
+and guards, the document, its label and the oracle's. Without `make`, the rule is applied to all of
+them again: names found, false and spurious ones with Wilson's intervals, what the rule now names
+otherwise, and with --curves the same as each of its numbers changes. The halves are by seed: look
+at the open one, and open the sealed one once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pickle
+from pathlib import Path
+
+import grounded.diagnosis.diagnose as diagnosing
+from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
+from grounded.challenge.score import share
+from grounded.diagnosis.validation import choose
+from grounded.diagnosis.validation.decide import Options, decide
+from grounded.diagnosis.validation.gain import Comparison
+
+CURVES = {
+    "CLAIM": (1.0, 2.0, 3.0, 5.0, 8.0),
+    "SCATTERS": (0.5, 1.0, 1.5, 2.0),
+    "SHARE": (0.0, 0.01, 0.02, 0.05),
+    "WITHIN": (0.0, 0.5, 1.0, 2.0),
+    "LEAST": (0.0, 0.01, 0.03, 0.1),
+}
+
+
+def fitted(case):
+    """Diagnose a case; return what its decision rests on, with the label and the marks."""
+    kept = {}
+
+    def watched(search, ruler):
+        kept.update(search=search, ruler=ruler)
+        return decide(search, ruler)
+
+    diagnosing.decide = watched
+    try:
+        document = diagnosing.diagnose(task_of(case), case.trials).to_json()
+    finally:
+        diagnosing.decide = decide
+    options = Options(kept["search"], kept["ruler"])
+    known = {one.causes: one for one in options.hopeful()}
+    less = {}
+    for one in list(known.values()):
+        for cause in one.causes - one.refused:
+            if (rest := options.less(one, cause)) is not None:
+                less[one.causes, cause] = rest
+    label = of_crude(case.label, case.model)
+    true = oracle(case.model, case.trials, case.latency, label, document["ranking"])
+    ruler = kept["ruler"]
+    compare = Comparison(ruler.shown, ruler._matters(), ruler.unit)
+    return {
+        "options": list(known.values()), "less": less, "compare": compare, "label": label,
+        "oracle": true, "document": document, "marks": judge(label, document, true),
+        "held_out": ruler.held_out,
+    }  # fmt: skip
+
+
+def decided(case):
+    """Return the names that the rule gives now."""
+    memory = {}
+
+    def gain(before, after):
+        key = id(before), id(after)
+        if key not in memory:
+            memory[key] = case["compare"](before, after)
+        return memory[key]
+
+    def less(option, cause):
+        return case["less"].get((option.causes, cause))
+
+    rule = choose.Rule(case["options"], gain, less, held_out=case["held_out"])
+    return rule.choose().chosen.causes - {"calibration"}
+
+
+def marked(case, names):
+    """Return the marks of some names; what the instruments corrected counts as in the document."""
+    label, true = case["label"], case["oracle"]
+    truth = {e["effect"] for e in label["effects"]}
+    names = {*names, *_corrected(case)}
+    if label["param_error"]:
+        names = {n for n in names if n in truth or not n.startswith("parameter:")}
+    clear = true is not None and all(nats > 3.0 for nats in true.each.values())
+    return {
+        "kind": label["kind"], "clear": clear, "found": truth <= names,
+        "spurious": bool(truth) and len(names | (truth & names)) > len(truth),
+        "false": not truth and bool(names),
+    }  # fmt: skip
+
+
+def _corrected(case):
+    kinds = {"delay": "sensor_delay", "lag": "sensor_lag"}
+    found = [f for f in case["document"].get("preflight", ()) if f["corrected"]]
+    return {f"{kinds[f['kind']]}:{f['signal']}" for f in found if f["kind"] in kinds}
+
+
+def told(marks):
+    """Return the figures of some marks in a line."""
+    rows = []
+    for kind in ("single", "double"):
+        rows.append((kind, [m["found"] for m in marks if m["kind"] == kind and m["clear"]]))
+    rows.append(("spurious", [m["spurious"] for m in marks if m["kind"] in ("single", "double")]))
+    for kind in ("none", "withheld"):
+        rows.append((f"named in {kind}", [m["false"] for m in marks if m["kind"] == kind]))
+    words = []
+    for name, each in rows:
+        found = share(each)
+        if found["of"]:
+            low, high = (100 * end for end in found["interval"])
+            words.append(f"{name} {found['count']} of {found['of']} ({low:.0f} to {high:.0f} %)")
+    return ", ".join(words)
+
+
+def main():
+    """Make cases, or decide them again."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("words", nargs="+", metavar="[make] FOLDER")
+    parser.add_argument("--kind", choices=KINDS, default="single")
+    parser.add_argument("--cases", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--systems", default="own,kinked,mujoco")
+    parser.add_argument("--half", choices=("open", "sealed", "all"), default="open")
+    parser.add_argument("--curves", action="store_true")
+    options = parser.parse_args()
+    folder = Path(options.words[-1])
+    if options.words[0] == "make":
+        folder.mkdir(parents=True, exist_ok=True)
+        for case in make(
+            options.kind, options.cases, options.seed, groups=options.systems.split(",")
+        ):
+            path = folder / f"{options.seed}-{case.name}.pkl"
+            if not path.exists():
+                path.write_bytes(pickle.dumps(fitted(case)))
+                print(path.name, flush=True)
+        return
+    halves = {"open": (1,), "sealed": (0,), "all": (0, 1)}[options.half]
+    paths = [p for p in sorted(folder.glob("*.pkl")) if int(p.name.split("-")[0]) % 2 in halves]
+    cases = {path.stem: pickle.loads(path.read_bytes()) for path in paths}
+    for name, case in cases.items():
+        then = set(case["document"]["verdict"]["effects"])
+        now = decided(case)
+        if now != then:
+            truth = [e["effect"] for e in case["label"]["effects"]]
+            print(f"{name}: truth {truth}; when made {sorted(then)}; now {sorted(now)}")
+    then = [marked(c, c["document"]["verdict"]["effects"]) for c in cases.values()]
+    print(f"{len(cases)} cases\nwhen made: {told(then)}")
+    print("now:       " + told([marked(case, decided(case)) for case in cases.values()]))
+    for name, values in CURVES.items() if options.curves else ():
+        usual = getattr(choose, name)
+        for value in values:
+            setattr(choose, name, value)
+            line = told([marked(case, decided(case)) for case in cases.values()])
+            print(f"{name} {value:g}{' *' if value == usual else ''}: {line}")
+        setattr(choose, name, usual)
+
+
+if __name__ == "__main__":
+    main()
