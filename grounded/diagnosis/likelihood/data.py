@@ -80,8 +80,9 @@ class Data:
     @cached_property
     def folds(self) -> Any:
         """The fold of each run that is held out together, (B,): its group, or part of it."""
-        steps = self.valid.sum(axis=1)
-        return folds(self.group_of[self.trial_of], self.trial_of, steps)
+        group, steps = self.group_of[self.trial_of], self.valid.sum(axis=1)
+        levels = np.array([bool(one.differs_in) for one in self.groups] or [False])
+        return folds(group, self.trial_of, steps, levels[group])
 
     @property
     def steps(self) -> int:

@@ -23,13 +23,13 @@ from grounded.frozen import Array
 REPEATS = 0.03  # fraction of a signal's power below which two trials make the same motion
 TENTHS = 10  # stretches whose means are compared
 LENGTH = 0.2  # relative difference of the lengths of trials of one group, at most
-MOST_LEFT_OUT = 0.5  # of all steps: with less, the rest would be one motion that tells too little
+MOTION, LEVEL = 1 / 3, 0.5  # most of all steps that are left out together, see `folds`
 MOST_FOLDS = 20
 
 
 @dataclass(frozen=True)
 class Group:
-    """Trials of one motion in one condition, and the signals whose levels set it apart."""
+    """Trials of one motion in one condition, and the signals with levels of their own there."""
 
     trials: tuple[int, ...]
     differs_in: tuple[str, ...] = ()
@@ -73,32 +73,37 @@ class Signals:
         return np.where(named, self.named == self.named[i], same)
 
     def _apart(self, own: Any) -> tuple[str, ...]:
-        """Return the signals whose mean levels differ between some trials and all others."""
-        levels = self.means.mean(axis=1)
-        others = np.delete(levels, own, axis=0)
-        if not len(others):
+        """Return the signals whose range in some trials overlaps that in none of the others."""
+        low, high = self.means.min(axis=1), self.means.max(axis=1)
+        others_low, others_high = np.delete(low, own, axis=0), np.delete(high, own, axis=0)
+        if not len(others_low):
             return ()
-        nearest = np.abs(levels[own][:, None] - others[None]).min(axis=(0, 1))
-        far = self.moves & (0.5 * nearest**2 > REPEATS * self.spread)
+        above = others_low > high[own].max(axis=0)
+        below = others_high < low[own].min(axis=0)
+        far = self.moves & (above | below).all(axis=0)
         return tuple(name for name, differs in zip(self.names, far, strict=True) if differs)
 
 
-def folds(group: Any, trial: Any, steps: Any) -> Any:
+def folds(group: Any, trial: Any, steps: Any, levels: Any) -> Any:
     """Return the fold of each run, (B,) of int: the runs that are held out together.
 
-    A fold is a group. A group with more than MOST_LEFT_OUT of all steps is held out trial by trial,
-    and such a trial in pieces (its runs). Many small groups form a fold together.
+    A fold is a group. Leaving out too much would have the rest extrapolate: a group with more than
+    MOTION of all steps (LEVEL, if it has levels of its own, which are to be foretold) is held out
+    trial by trial, and such a trial in pieces (its runs). Many small groups form a fold together.
 
     Args:
         group: the group of each run (B,).
         trial: its trial (B,).
         steps: its number of steps (B,).
+        levels: whether its group has levels of its own (B,).
     """
     steps = np.asarray(steps, float) / max(float(np.sum(steps)), 1.0)
-    fold = np.asarray(group)
+    fold, most = np.asarray(group), np.where(levels, LEVEL, MOTION)
     for finer in (trial, np.arange(len(fold))):
         whole = np.bincount(fold, steps)[fold]
-        fold = np.where(whole > MOST_LEFT_OUT, fold.max() + 1 + np.asarray(finer), fold)
+        apart = whole > most
+        fold = np.where(apart, fold.max() + 1 + np.asarray(finer), fold)
+        most = np.where(apart, MOTION, most)
     fold = np.unique(fold, return_inverse=True)[1]
     count, pieces = int(fold.max()) + 1, len(np.unique(trial)) == 1
     return fold if pieces or count <= MOST_FOLDS else fold * MOST_FOLDS // count

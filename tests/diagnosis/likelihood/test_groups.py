@@ -57,29 +57,31 @@ def test_trials_of_one_motion_in_one_condition_are_a_group(trials, groups):
 
 def test_a_group_says_which_levels_set_it_apart():
     found = prepare(MODEL, [trial(lambda t, a=a: a) for a in (0.2, 0.4, 0.2)]).groups
-    assert all(set(group.differs_in) == {"u", "v"} for group in found)
+    assert all(group.differs_in == ("u",) for group in found)
     one = Signals(["u"], [np.ones((50, 1))], [""])
     assert one.groups()[0].differs_in == ()
 
 
 @pytest.mark.parametrize(
-    ("group", "steps", "expected"),
+    ("group", "steps", "levels", "expected"),
     [
-        ([0, 1, 0, 1], [50, 50, 50, 50], [0, 1, 0, 1]),  # half of all: held out whole
-        ([0, 0, 0, 1], [50, 50, 50, 50], [1, 2, 3, 0]),  # most of all: trial by trial
-        ([0, 1, 2], [10, 10, 80], [0, 1, 2]),
-        ([0], [100], [0]),
+        ([0, 1, 0, 1], [50, 50, 50, 50], True, [0, 1, 0, 1]),  # half of all, at its own level
+        ([0, 1, 0, 1], [50, 50, 50, 50], False, [0, 1, 2, 3]),  # the rest would extrapolate
+        ([0, 0, 0, 1], [50, 50, 50, 50], True, [1, 2, 3, 0]),  # most of all: trial by trial
+        ([0, 1, 2], [10, 10, 80], False, [0, 1, 2]),
+        ([0], [100], False, [0]),
     ],
 )
-def test_a_fold_is_a_group_or_part_of_one_that_holds_most(group, steps, expected):
-    assert folds(np.array(group), np.arange(len(group)), steps).tolist() == expected
+def test_a_fold_is_a_group_or_part_of_one_that_holds_most(group, steps, levels, expected):
+    own = np.full(len(group), levels)
+    assert folds(np.array(group), np.arange(len(group)), steps, own).tolist() == expected
 
 
 def test_many_groups_make_few_folds_and_pieces_of_a_log_stay_apart():
     many = np.arange(100)
-    assert len(set(folds(many, many, np.ones(100)).tolist())) == 20
+    assert len(set(folds(many, many, np.ones(100), many < 0).tolist())) == 20
     one = np.zeros(30, int)
-    assert len(set(folds(one, one, np.ones(30)).tolist())) == 30
+    assert len(set(folds(one, one, np.ones(30), one < 0).tolist())) == 30
 
 
 def test_a_coefficient_that_only_what_is_held_out_shows_predicts_nothing_there():
