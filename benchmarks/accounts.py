@@ -469,7 +469,7 @@ def _refused(model: Model, text: str) -> tuple[str, frozenset[str]]:
     text = re.split(r"\. (?:Correct|Multiply|Put|Check|Rotate|Reverse|Subtract|Was)", text)[0]
     kind = next((k for k, how in TEXTS.items() if re.search(how, text)), "other")
     names = "|".join(sorted([*model.states, *model.inputs], key=len, reverse=True))
-    text = re.sub(rf"^in (every )?trials? [^:]*?(?=\b(?:{names})\b)", "", text)
+    text = re.sub(rf"^(in )?(every )?trials? .*?(?=the columns|\b(?:{names})\b)", "", text)
     found = re.findall(rf"(?<![\w.])(?:{names})(?!\w)", re.split(r"[:(]| shows", text)[0])
     if kind == "unit" and "as fast as" in text:
         found = re.findall(rf"says: ({names}) looks", text)
