@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.frozen import Array
+from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import motion, true_values
 from grounded.rollout import stepper
@@ -23,7 +23,8 @@ from grounded.trial import Trial
 
 AHEAD = 0.25  # [s]
 FAR = 1e9  # bound on predicted states
-STARTS = 200  # samples that the model as it is predicts from
+HORIZONS, LOUD = (AHEAD, 0.5, 1.0), 4.0  # [s] tried in turn; motion over noise that is enough
+FLOOR = 0.05  # of a motion: smaller errors count as this
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
 LEAST = 20  # fewest samples
 LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
@@ -32,56 +33,6 @@ SAME = 1e-6  # singular values below this share of the largest count as zero
 ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 
 Steps = NDArray[np.intp]
-
-
-def predicted(
-    model: Model, trial: Trial, shown: Sequence[int], horizon: float = AHEAD
-) -> tuple[Array, Array, Array] | None:
-    """Predict a trial by a horizon [s] ahead, from many of its samples.
-
-    Args:
-        model: that predicts.
-        trial: of this model's states.
-        shown: indices of the states with a sensor.
-        horizon: [s].
-
-    Returns:
-        The states (N, n) logged at the start, those predicted, and those logged at the horizon;
-        None if too little is known.
-    """
-    steps = max(1, round(horizon / trial.dt))
-    logged = starts_from(model, trial, shown)
-    good = np.asarray(np.isfinite(logged).all(axis=1))
-    at = np.flatnonzero(good[:-steps] & good[steps:])
-    if len(at) < 5:
-        return None
-    at = at[:: max(1, len(at) // STARTS)]
-    x = logged[at]
-    for j in range(steps):
-        x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
-        x = np.fmax(np.fmin(x, FAR), -FAR)
-    return logged[at], x, logged[at + steps]
-
-
-def missed(
-    model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
-) -> float:
-    """Return the rms error of predictions a quarter of a second ahead, over the states `some`.
-
-    Args:
-        model: that predicts.
-        trial: of this model's states.
-        some: indices of the states that count.
-        shown: indices of the states with a sensor.
-        unit: divides the error of each state.
-
-    Returns:
-        NaN if too little of the trial is known.
-    """
-    if (ahead := predicted(model, trial, shown)) is None:
-        return float("nan")
-    _, x, logged = ahead
-    return size_of(model.difference(x, logged)[:, some] / unit)
 
 
 def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
@@ -107,9 +58,15 @@ def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
     return x
 
 
-def size_of(x: Array) -> float:
-    """Return the root mean square of x, of any shape, ignoring NaN; 0 if it is empty."""
-    return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0
+def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
+    """Return how far ahead to predict [s]: until most states move by more than their noise."""
+    noise = np.maximum(white_noise(trial.states[:, list(shown)]), TINY)
+    for seconds in HORIZONS:
+        steps = max(1, round(seconds / trial.dt))
+        moved = trial.states[steps:, list(shown)] - trial.states[:-steps, list(shown)]
+        if len(moved) < LEAST or np.median(np.nanstd(moved, axis=0) / noise) > LOUD:
+            return seconds
+    return HORIZONS[-1]
 
 
 @dataclass(frozen=True)
@@ -119,15 +76,27 @@ class Fit:
     Args:
         rms: rms error of each state (n,), in its unit; 1 for states without a sensor.
         gains: gain of each input (m,).
+        moved: how far each state moves in that time (n,); 1 for states without a sensor.
     """
 
     rms: Array
     gains: Array
+    moved: Array
 
     @property
     def score(self) -> float:
         """Sum of the logarithms of the errors [nats]; it is invariant to exchanged columns."""
         return float(np.log(self.rms).sum())
+
+    @property
+    def share(self) -> Array:
+        """Share of each state's motion that is missed (n,), at most 1: nothing is predicted."""
+        return np.asarray(np.clip(self.rms / np.maximum(self.moved, TINY), FLOOR, 1.0))
+
+    @property
+    def missed(self) -> float:
+        """Sum of the logarithms of the shares [nats], at most 0; it is the same in any unit."""
+        return float(np.log(self.share).sum())
 
 
 class Ahead:
@@ -304,7 +273,7 @@ class Ahead:
     def _fit(self, size: Array, gains: Array) -> Fit:
         rms = np.ones(self.model.n)
         rms[self.shown] = size
-        return Fit(rms, gains)
+        return Fit(rms, gains, self.moved)
 
 
 def basis(told: Array) -> Array:

@@ -1,0 +1,1 @@
+"""How did this log come about?"""

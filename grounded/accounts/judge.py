@@ -1,0 +1,412 @@
+"""START HERE: tell how logs came about, by scoring the accounts of the table.
+
+Every account is scored by what it leaves unexplained: the kinematic rows of the trial as it would
+be otherwise (`kinematics`), and the motion that the model, calibrated on it, misses (`motion`), both
+in nats. No physics breaks a row, so an account of rows is told if it mends every row that it
+touches; the motion then decides between accounts that mend the same rows. What rows can't show is
+told by the motion alone, and there "as logged" may use any gains and signs of its inputs, whereas
+an account must stay near the model's: a model that is only wrong gains nothing by a fault of a log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.accounts.kinematics import (
+    Gap,
+    Row,
+    Turned,
+    away,
+    dead,
+    folded,
+    gaps,
+    kinematic_rows,
+    turned,
+)
+from grounded.accounts.motion import Ahead, Fit, horizon_of
+from grounded.accounts.table import Account, of_motion, of_rows
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
+BETTER = 3.0  # factor by which a bad row's share must fall
+ROUNDING = 0.01  # of a row's motion: smaller shares count as this
+OF_A_UNIT = 0.03  # of a unit's factor in nats: how near the row's own ratio must be
+TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
+SNAPPED = np.deg2rad(3)  # offsets this near to a right angle are one
+NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
+CLEAR, HINT, HALF = 1.0, 0.4, 0.5  # [nats] by calibrated and plain predictions; share of one error
+LIKE = 4.0  # factor within which an input must act as in the model
+TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
+SHORTLIST = 8  # accounts for which the model is calibrated
+FAR = 20.0  # times as large as in other trials: a trial to be examined
+
+
+@dataclass(frozen=True)
+class Told:
+    """An account of some trials, and what shows it.
+
+    Args:
+        account: the story.
+        trials: indices of the trials that it concerns.
+        gain: by how much less is unexplained [nats].
+        others: accounts that explain the trials as well.
+        whole: whether it concerns all trials.
+        by_motion: the state that the model predicts best with it, its rms error as logged and
+            mended, and how far ahead [s]; None if kinematics show it.
+        moved: of a dead velocity: its position, its mean and how far the position moves.
+    """
+
+    account: Account
+    trials: tuple[int, ...]
+    gain: float
+    others: tuple[Account, ...] = ()
+    whole: bool = True
+    by_motion: tuple[int, float, float, float] | None = None
+    moved: tuple[int, float, float] | None = None
+
+    @property
+    def certain(self) -> bool:
+        """Whether trials are corrected, rather than refused."""
+        if self.account.kind == "dead":
+            return not self.whole
+        if self.by_motion:
+            return self.account.unit == "deg"
+        return self.account.certain
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is told of trials.
+
+    Args:
+        told: accounts in the order in which they were found.
+        trials: as they would be without any fault.
+        corrected: the same without what is certain alone.
+        rows: the kinematic rows.
+        open: the rows that no account explains, with their gaps.
+        folded: angles in degrees that were unwrapped as radians, with their trials.
+    """
+
+    told: tuple[Told, ...]
+    trials: tuple[Trial, ...]
+    corrected: tuple[Trial, ...]
+    rows: tuple[Row, ...]
+    open: Mapping[Row, Gap]
+    folded: Mapping[int, Sequence[int]]
+
+
+def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdict:
+    """Tell how trials came about.
+
+    Args:
+        model: however crude.
+        trials: of its states and inputs, of one time step.
+        shown: indices of the states with a sensor.
+    """
+    rows, mended, told = kinematic_rows(model, shown), list(trials), list[Told]()
+    with np.errstate(all="ignore"):
+        lost = folded(model, trials, rows)
+        # dead sensors first: as noise they would look like anything
+        for one in _dead(model, mended, shown):
+            told.append(one)
+            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+        for one in [] if lost else _by_rows(model, mended, rows, shown):
+            told.append(one)
+            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+        left = _pooled([gaps(model, trial, rows) for trial in mended])
+        for one in [] if lost else _by_motion(model, mended, rows, shown):
+            told.append(one)
+            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+    corrected = list(trials)
+    for one in (one for one in told if one.certain):
+        corrected = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(corrected)]
+    bad = {row: gap for row, gap in left.items() if gap.share > BAD}
+    return Verdict(tuple(told), tuple(mended), tuple(corrected), tuple(rows), bad, lost)
+
+
+def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Told]:
+    """Yield the velocities that show no motion."""
+    each = [dead(model, trial, shown) for trial in trials]
+    for j in sorted({j for one in each for j in one}):
+        some = tuple(k for k, one in enumerate(each) if j in one)
+        account = Account("dead", (j,))
+        yield Told(account, some, 0.0, whole=len(some) == len(trials), moved=each[some[0]][j])
+
+
+# --- by rows --------------------------------------------------------------------------------------
+
+
+def _by_rows(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> list[Told]:
+    """Return the fewest accounts of each trial after which its rows agree, alike ones together."""
+    plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
+    each = [gaps(model, trial, rows) for trial in trials]
+    sound = [t for t, one in zip(trials, each, strict=True) if not _bad(one)]
+    usual = None
+    if sound:
+        usual = np.median([np.nanstd(trial.states, axis=0) for trial in sound], axis=0)
+    found = dict[Account, list[tuple[int, Account, float, tuple[Account, ...]]]]()
+    for k, trial in enumerate(trials):
+        before = each[k]
+        for _ in range(len(rows)):
+            best = _best(model, trial, rows, before, plane, shown, usual) if _bad(before) else None
+            if best is None:
+                break
+            account, gain, others = best
+            found.setdefault(replace(account, offset=0.0), []).append((k, account, gain, others))
+            trial = account.mended(trial)
+            before = gaps(model, trial, rows)
+    return [_together(some, len(trials), sound) for some in found.values()]
+
+
+def _together(
+    some: Sequence[tuple[int, Account, float, tuple[Account, ...]]],
+    count: int,
+    sound: Sequence[Trial],
+) -> Told:
+    """Return one account of several trials; an offset is their mean, or a right angle nearby."""
+    trials = tuple(dict.fromkeys(k for k, *_ in some))
+    _, account, gain, others = some[0]
+    if account.fitted:
+        turn = float(np.angle(np.mean([np.exp(1j * one.offset) for _, one, *_ in some])))
+        right = float(np.rint(turn / (np.pi / 2)) * np.pi / 2)
+        account = replace(account, offset=right if abs(turn - right) < SNAPPED else turn)
+    return Told(account, trials, gain, () if sound else others, len(trials) == count)
+
+
+def _bad(found: Mapping[Row, Gap]) -> list[Row]:
+    return [row for row, gap in found.items() if gap.share > BAD]
+
+
+def _best(
+    model: Model,
+    trial: Trial,
+    rows: Sequence[Row],
+    before: Mapping[Row, Gap],
+    plane: Turned | None,
+    shown: Sequence[int],
+    usual: Array | None,
+) -> tuple[Account, float, tuple[Account, ...]] | None:
+    """Return the account of a trial that mends its rows best, its gain and those as good; or None."""
+    bad = _bad(before)
+    some = frozenset(k for row in bad for k in row.states)
+    cost = dict[Account, float]()
+    for account in [*_of_bad(model, some, rows, plane), *_paces(model, bad, before)]:
+        account, mended = _fitted(model, trial, account, rows, plane)
+        if account.fitted and abs(account.offset) < TURNED_AWAY:
+            continue
+        entered = [r for r in before if r.states & account.touched or account.kind == "pace"]
+        after = gaps(model, mended, entered)
+        if all(_agrees(row, before, after, account) for row in entered):
+            gained = sum(_nats(after[row].share) - _nats(before[row].share) for row in entered)
+            cost[account] = gained + account.price + _strange(account, mended, usual)
+    if not cost:
+        return None
+    # accounts that mend the same rows are told apart by the motion
+    least = min(cost.values())
+    near = [account for account in cost if cost[account] < least + NEAR]
+    if len(near) > 1:
+        ahead = horizon_of(trial, shown)
+        for account in near:
+            cost[account] += _unpredicted(model, account.mended(trial), shown, ahead)
+    near.sort(key=lambda account: cost[account])
+    others = tuple(
+        one
+        for one in near[1:]
+        if cost[one] < cost[near[0]] + TIED and not one.touched > near[0].touched
+    )
+    return near[0], -least, others
+
+
+def _of_bad(
+    model: Model, some: frozenset[int], rows: Sequence[Row], plane: Turned | None
+) -> Iterator[Account]:
+    columns: tuple[int, ...] = ()
+    if plane is not None and {plane.i, plane.j} & some:
+        rate = next((row.by[0] for row in rows if row.i == plane.k and len(row.by) == 1), -1)
+        units = list(model.states.values())
+        own = {k for row in rows if row.i in (plane.i, plane.j) for k in row.by}
+        speeds = [k for k in sorted(own) if units[k] == "m/s"]
+        columns = (plane.i, plane.j, plane.k, rate, *speeds)
+    return of_rows(model, some, columns)
+
+
+def _paces(model: Model, bad: Sequence[Row], before: Mapping[Row, Gap]) -> Iterator[Account]:
+    """Yield that time stamps are in ms, or were taken for ms, if no row is sound."""
+    if len(bad) == len(before):
+        yield Account("pace", tuple(range(model.n)), 1e3, unit="ms", price=1.0)
+        yield Account("pace", tuple(range(model.n)), 1e-3, unit="ms", price=1.0)
+
+
+def _fitted(
+    model: Model, trial: Trial, account: Account, rows: Sequence[Row], plane: Turned | None
+) -> tuple[Account, Trial]:
+    """Return an account with its offset estimated, and the trial without the fault."""
+    mended = account.mended(trial)
+    if account.fitted and plane is not None:
+        turn = away(model, mended, rows, plane)
+        columns = (plane.k,)
+        plus = replace(account, kind="offset", columns=columns, factor=1.0, offset=turn)
+        return replace(account, offset=turn), plus.mended(mended)
+    return account, mended
+
+
+def _agrees(
+    row: Row, before: Mapping[Row, Gap], after: Mapping[Row, Gap], account: Account
+) -> bool:
+    """Check whether a row that an account touches is mended, or stays good."""
+    if row not in after:
+        return False
+    bad, left = before[row].share > BAD, after[row].share
+    if not left < (min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)):
+        return False
+    size = abs(np.log(abs(account.factor)))
+    named = account.kind == "unit" and size > 0
+    return not named or abs(np.log(abs(after[row].ratio) + 1e-300)) < OF_A_UNIT * max(size, 0.5)
+
+
+def _strange(account: Account, mended: Trial, usual: Array | None) -> float:
+    """Return how unlike other trials the columns of a trial are in size [nats]."""
+    some = [k for k in account.touched if usual is not None and k < len(usual)]
+    if usual is None or not some or account.kind == "pace":
+        return 0.0
+    size = np.nanstd(mended.states[:, some], axis=0)
+    return float(np.minimum(np.abs(np.log(size / usual[some])), NEAR).sum())
+
+
+def _nats(share: float) -> float:
+    return float(np.log(max(share, ROUNDING)))
+
+
+def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
+    """Return the median gap of each row over several trials."""
+    found = dict[Row, list[Gap]]()
+    for one in every:
+        for row, gap in one.items():
+            found.setdefault(row, []).append(gap)
+    return {
+        row: sorted(some, key=lambda gap: gap.share)[len(some) // 2] for row, some in found.items()
+    }
+
+
+# --- by motion ------------------------------------------------------------------------------------
+
+
+def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
+    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+
+
+def _unpredicted(model: Model, trial: Trial, shown: Sequence[int], ahead: float) -> float:
+    """Return how much of a trial's motion the calibrated model misses [nats], at most 0."""
+    made = Ahead(model, trial, _known(trial, shown), FEWER, horizon=ahead)
+    if not made.enough or not np.isfinite(trial.inputs).all():
+        return 0.0
+    return made.best([np.ones(model.m)], free=False).missed
+
+
+def _by_motion(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> Iterator[Told]:
+    """Yield the account that predictions of some trials show and none contradicts, if any."""
+    some = _examined(trials, shown)
+    found = dict[Account, dict[int, tuple[Fit, Fit, float]]]()
+    against = dict[Account, set[int]]()
+    table = list(of_motion(model, shown, [trials[k] for k in some]))
+    for k in some:
+        for account, fits in _each(model, trials[k], rows, shown, table):
+            if fits is None:
+                against.setdefault(account, set()).add(k)
+            else:
+                found.setdefault(account, {})[k] = fits
+    # a trial in another unit may be one of many; columns are exchanged in all of a kind
+    whole = {
+        account: fits
+        for account, fits in found.items()
+        if not against.get(account) or account.kind == "unit"
+    }
+    if not whole:
+        return
+    most = max(map(len, whole.values()))
+    cost = {
+        account: float(np.mean([after.missed for _, after, _ in fits.values()])) + account.price
+        for account, fits in whole.items()
+        if len(fits) == most
+    }
+    best, *others = sorted(cost, key=lambda account: cost[account])
+    near = tuple(one for one in others if cost[one] < cost[best] + TIED and one.kind == best.kind)
+    before, after, ahead = next(iter(whole[best].values()))
+    i = int(np.argmin(after.share / before.share))
+    seen = (i, float(before.rms[i]), float(after.rms[i]), ahead)
+    gain = float(np.mean([b.missed - a.missed for b, a, _ in whole[best].values()]))
+    every = tuple(range(len(trials))) if not against.get(best) else tuple(whole[best])
+    yield Told(best, every, gain, near, len(every) == len(trials), seen)
+
+
+def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
+    """Return the trials that are predicted: some, and those of another size than the others."""
+    some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
+    size = np.array([np.nanstd(t.states[:, list(shown)], axis=0) + 1e-300 for t in trials])
+    apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
+    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(FAR))[:TRIALS]})
+
+
+def _each(
+    model: Model,
+    trial: Trial,
+    rows: Sequence[Row],
+    shown: Sequence[int],
+    table: Sequence[Account],
+) -> Iterator[tuple[Account, tuple[Fit, Fit, float] | None]]:
+    """Yield each account on which a trial is informative, with the fits as logged and mended.
+
+    None in place of the fits if the log is better as it is.
+    """
+    known, ones, seconds = _known(trial, shown), np.ones(model.m), horizon_of(trial, shown)
+    logged = Ahead(model, trial, known, FEWER, horizon=seconds)
+    if not logged.enough or not np.isfinite(trial.inputs).all():
+        return
+    before, gains = gaps(model, trial, rows), dict[Account, float]()
+    plain, ahead = logged.plain(ones).missed, dict[Account, Ahead]()
+    for account in table:
+        mended = account.mended(trial)
+        entered = [row for row in before if row.states & account.touched]
+        after = gaps(model, mended, entered)
+        if any(row not in after or after[row].share > max(MENDED, before[row].share) for row in entered):
+            continue  # the rows contradict it
+        made = Ahead(model, mended, known, FEWER, horizon=seconds)
+        if made.enough:
+            ahead[account], gains[account] = made, plain - made.plain(ones).missed
+    for account in sorted(gains, key=lambda one: -gains[one])[:SHORTLIST]:
+        if gains[account] > HINT and (fits := _compared(model, logged, ahead[account], account)):
+            yield account, (*fits, seconds)
+    for account, gain in gains.items():
+        if gain < -HINT:
+            yield account, None
+
+
+def _compared(
+    model: Model, logged: Ahead, mended: Ahead, account: Account
+) -> tuple[Fit, Fit] | None:
+    """Return both calibrated fits; None if the account is not clearly better after calibration."""
+    ones, unit = np.ones(model.m), account.kind == "unit"
+    free = mended.best([ones])
+    sent = [k - model.n for k in account.touched if k >= model.n]
+    size = np.abs(np.log(np.maximum(free.gains[sent], 1e-9)))
+    if (size > (np.log(LIKE) if not unit else abs(np.log(account.factor)) / 3)).any():
+        return None  # the inputs act otherwise than in the model
+    after = mended.best([ones], free=False) if unit else free
+    if mended.still().missed - after.missed < CLEAR * (0.5 if unit else 1.0):
+        return None  # commands explain nothing
+    if unit:
+        before = logged.best([ones], free=False)
+    else:
+        signs = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
+        before = logged.best([ones, -ones, 0.0 * ones, *(signs if model.m > 1 else ())])
+    better = before.missed - after.missed > CLEAR
+    return (before, after) if better and (after.share < HALF * before.share).any() else None
