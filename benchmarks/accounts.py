@@ -448,7 +448,7 @@ TEXTS = {
 
 def named(model: Model, trials: Sequence[Trial]) -> tuple[list[tuple[str, frozenset[str]]], bool]:
     """Return kinds and signals of what `sound_trials` names, and whether it refused."""
-    from grounded.instruments.sound_trials import sound_trials
+    from grounded.accounts.sound_trials import sound_trials
 
     try:
         found = sound_trials(model, trials).findings

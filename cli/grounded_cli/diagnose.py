@@ -28,7 +28,7 @@ from grounded_trials.wording import percent, with_unit
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.engine import Engine
-    from grounded.instruments.finding import Finding
+    from grounded.accounts.finding import Finding
 
 REGIONS = 3  # named in the details
 

@@ -13,7 +13,6 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Document
 from grounded.trial import Trial
 
-DEGREES = 57.29577951308232  # in a radian
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
 LEFT_OUT = "left out of the diagnosis: it tells nothing more than"  # the log of its position
 SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
@@ -100,7 +99,7 @@ def late_as_positions(
     """Yield a finding for each velocity that is computed from a position whose sensor is late.
 
     It is late by as much, too: what the sensors show of it is only how far behind its position it
-    is. A ball's speed was planned for as 57 ms old, behind a position 32 ms old.
+    is.
 
     Args:
         findings: those of all sensors.
@@ -132,24 +131,6 @@ def derived_from(position: str, age: float) -> str:
         f"is a filtered derivative of {position}, {age:.2g} s behind it on average; "
         f"{LEFT_OUT} {position}"
     )
-
-
-A_SECOND = " a second"  # of a rate in degrees
-
-
-def in_degrees(name: str, unit: str) -> Finding:
-    """Return the finding of a signal that was converted from degrees to radians."""
-    text, log = (
-        f"is in degrees{A_SECOND * unit.endswith('/s')}, not in {unit}",
-        f"scale = {1 / DEGREES:.8g}",
-    )
-    return put_right(name, text, "degrees", log, scale=DEGREES)
-
-
-def in_rpm(name: str) -> Finding:
-    """Return the finding of a velocity that was converted from rpm to radians a second."""
-    log = f"scale = {1 / RPM:.8g}"
-    return put_right(name, "is in rpm, not in rad/s", "degrees", log, scale=RPM)
 
 
 def scaled(name: str, position: str, size: float, unit: str) -> Finding:

@@ -33,6 +33,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
+KEYS = ("share", "varying", "rate")
 BETTER = 3.0  # factor by which a bad row's share must fall
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT = 0.03  # of a unit's factor in nats: how near the row's own ratio must be
@@ -110,14 +111,14 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
     """
     rows, mended, told = kinematic_rows(model, shown), list(trials), list[Told]()
     with np.errstate(all="ignore"):
-        lost = folded(model, trials, rows)
         # dead sensors first: as noise they would look like anything
         for one in _dead(model, mended, shown):
             told.append(one)
             mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
-        for one in [] if lost else _by_rows(model, mended, rows, shown):
+        for one in _by_rows(model, mended, rows, shown):
             told.append(one)
             mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+        lost = folded(model, mended, rows)
         left = _pooled([gaps(model, trial, rows) for trial in mended])
         for one in [] if lost else _by_motion(model, mended, rows, shown):
             told.append(one)
@@ -144,24 +145,34 @@ def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterat
 def _by_rows(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Told]:
-    """Return the fewest accounts of each trial after which its rows agree, alike ones together."""
+    """Return the fewest accounts after which all rows agree, of trials with the same bad rows."""
     plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
     each = [gaps(model, trial, rows) for trial in trials]
-    sound = [t for t, one in zip(trials, each, strict=True) if not _bad(one)]
+    groups = dict[frozenset[Row], list[int]]()
+    for k, one in enumerate(each):
+        groups.setdefault(frozenset(_bad(one)), []).append(k)
+    sound = [trials[k] for k in groups.pop(frozenset(), [])]
     usual = None
     if sound:
         usual = np.median([np.nanstd(trial.states, axis=0) for trial in sound], axis=0)
     found = dict[Account, list[tuple[int, Account, float, tuple[Account, ...]]]]()
-    for k, trial in enumerate(trials):
-        before = each[k]
-        for _ in range(len(rows)):
-            best = _best(model, trial, rows, before, plane, shown, usual) if _bad(before) else None
-            if best is None:
+    queue = list(groups.values())
+    while queue:
+        group = queue.pop()
+        some, before = [trials[k] for k in group], _pooled([each[k] for k in group])
+        story = list[tuple[Account, float, tuple[Account, ...]]]()
+        while bad := _bad(before):
+            best = _best(model, some, rows, before, plane, shown, usual)
+            if best is None or len(story) > len(bad) + len(rows):
                 break
-            account, gain, others = best
-            found.setdefault(replace(account, offset=0.0), []).append((k, account, gain, others))
-            trial = account.mended(trial)
-            before = gaps(model, trial, rows)
+            story.append(best)
+            some = [best[0].mended(trial) for trial in some]
+            before = _pooled([gaps(model, trial, rows) for trial in some])
+        if not story and len(group) > 1:
+            queue += [[k] for k in group]  # each may have a fault of its own
+        for account, gain, others in story:
+            same = replace(account, offset=0.0)
+            found.setdefault(same, []).extend((k, account, gain, others) for k in group)
     return [_together(some, len(trials), sound) for some in found.values()]
 
 
@@ -186,35 +197,35 @@ def _bad(found: Mapping[Row, Gap]) -> list[Row]:
 
 def _best(
     model: Model,
-    trial: Trial,
+    trials: Sequence[Trial],
     rows: Sequence[Row],
     before: Mapping[Row, Gap],
     plane: Turned | None,
     shown: Sequence[int],
     usual: Array | None,
 ) -> tuple[Account, float, tuple[Account, ...]] | None:
-    """Return the account of a trial that mends its rows best, its gain and those as good; or None."""
+    """Return the account that mends the rows of trials best, its gain and those as good; or None."""
     bad = _bad(before)
     some = frozenset(k for row in bad for k in row.states)
     cost = dict[Account, float]()
     for account in [*_of_bad(model, some, rows, plane), *_paces(model, bad, before)]:
-        account, mended = _fitted(model, trial, account, rows, plane)
+        account, mended = _fitted(model, trials, account, rows, plane)
         if account.fitted and abs(account.offset) < TURNED_AWAY:
             continue
         entered = [r for r in before if r.states & account.touched or account.kind == "pace"]
-        after = gaps(model, mended, entered)
+        after = _pooled([gaps(model, one, entered) for one in mended])
         if all(_agrees(row, before, after, account) for row in entered):
             gained = sum(_nats(after[row].share) - _nats(before[row].share) for row in entered)
-            cost[account] = gained + account.price + _strange(account, mended, usual)
+            cost[account] = gained + account.price + _strange(account, mended[0], usual)
     if not cost:
         return None
     # accounts that mend the same rows are told apart by the motion
     least = min(cost.values())
     near = [account for account in cost if cost[account] < least + NEAR]
     if len(near) > 1:
-        ahead = horizon_of(trial, shown)
+        ahead = horizon_of(trials[0], shown)
         for account in near:
-            cost[account] += _unpredicted(model, account.mended(trial), shown, ahead)
+            cost[account] += _unpredicted(model, account.mended(trials[0]), shown, ahead)
     near.sort(key=lambda account: cost[account])
     others = tuple(
         one
@@ -245,15 +256,18 @@ def _paces(model: Model, bad: Sequence[Row], before: Mapping[Row, Gap]) -> Itera
 
 
 def _fitted(
-    model: Model, trial: Trial, account: Account, rows: Sequence[Row], plane: Turned | None
-) -> tuple[Account, Trial]:
-    """Return an account with its offset estimated, and the trial without the fault."""
-    mended = account.mended(trial)
+    model: Model,
+    trials: Sequence[Trial],
+    account: Account,
+    rows: Sequence[Row],
+    plane: Turned | None,
+) -> tuple[Account, list[Trial]]:
+    """Return an account with its offset estimated, and the trials without the fault."""
+    mended = [account.mended(trial) for trial in trials]
     if account.fitted and plane is not None:
         turn = away(model, mended, rows, plane)
-        columns = (plane.k,)
-        plus = replace(account, kind="offset", columns=columns, factor=1.0, offset=turn)
-        return replace(account, offset=turn), plus.mended(mended)
+        account = replace(account, offset=turn)
+        mended = [account.mended(trial) for trial in trials]
     return account, mended
 
 
@@ -285,13 +299,17 @@ def _nats(share: float) -> float:
 
 
 def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
-    """Return the median gap of each row over several trials."""
+    """Return the gap of each row over several trials (rms)."""
     found = dict[Row, list[Gap]]()
     for one in every:
         for row, gap in one.items():
             found.setdefault(row, []).append(gap)
     return {
-        row: sorted(some, key=lambda gap: gap.share)[len(some) // 2] for row, some in found.items()
+        row: Gap(
+            *(float(np.sqrt(np.mean([getattr(g, key) ** 2 for g in some]))) for key in KEYS),
+            float(np.mean([gap.ratio for gap in some])),
+        )
+        for row, some in found.items()
     }
 
 
@@ -408,5 +426,5 @@ def _compared(
     else:
         signs = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
         before = logged.best([ones, -ones, 0.0 * ones, *(signs if model.m > 1 else ())])
-    better = before.missed - after.missed > CLEAR
+    better = before.missed - after.missed > CLEAR + account.price
     return (before, after) if better and (after.share < HALF * before.share).any() else None

@@ -245,14 +245,14 @@ def _near(a: Array, b: Array) -> bool:
     return bool(np.abs(a - b).max() < 1e-3 * max(float(np.abs(b).max()), 1e-9))
 
 
-def away(model: Model, trial: Trial, rows: Sequence[Row], plane: Turned) -> float:
+def away(model: Model, trials: Sequence[Trial], rows: Sequence[Row], plane: Turned) -> float:
     """Return the constant angle [rad] by which a heading must grow for positions to follow it."""
-    both = [row for row in rows if row.i in (plane.i, plane.j)]
-    sums = [
-        ((s[:, plane.i] - 1j * s[:, plane.j]) * (m[:, plane.i] + 1j * m[:, plane.j])).sum()
-        for m, s in per_step(model, trial, both)
-    ]
-    return float(np.angle(sum(sums))) if sums else 0.0
+    both, total = [row for row in rows if row.i in (plane.i, plane.j)], 0j
+    for trial in trials:
+        for moved, said in per_step(model, trial, both):
+            m, s = (one[:, plane.i] + 1j * one[:, plane.j] for one in (moved, said))
+            total += complex((m * s.conj()).sum())
+    return float(np.angle(total))
 
 
 def dead(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[int, float, float]]:
@@ -281,7 +281,8 @@ def dead(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[in
             way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
             said = np.concatenate([[0.0], np.cumsum(one.c * piece[:-1, 1] * trial.dt)])
             a, b = (s[k:] - s[:-k] for s in (way, said))
-            if a.std() < 10 * float(white_noise(way[:, None])[0]):
+            noise = float(white_noise(way[:, None])[0])
+            if a.std() < 3 * noise or np.ptp(way) < 20 * noise:
                 continue
             late = round(0.5 / trial.dt)
             if b.std() > QUIET * a.std() or _alike(a, b, late) > SHAPE:
@@ -323,6 +324,7 @@ def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> dict[i
                 for by in (DEGREES, 1.0)
             )
             fast = (np.abs(DEGREES * said) > np.pi).mean() > 0.01
+            fast &= bool(np.nanmax(np.abs(np.diff(trial.states[:, row.i]))) <= np.pi + 1e-6)
             if len(moved) > 20 and fast and off < min(0.8, plain / 2):  # 1.8 by chance
                 found.setdefault(row.i, []).append(k)
     return found

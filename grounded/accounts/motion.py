@@ -1,8 +1,8 @@
-"""Predictions of one trial a quarter of a second ahead, from many samples at once.
+"""The motion given the model: predictions of one trial 0.25 to 1 s ahead, from many samples.
 
-The model predicts as it is (`predicted`, `missed`), or calibrated on the trial itself (`Ahead`):
-uncertain parameters, a gain on every input and a common delay of the commands are fitted, and a
-constant rate of each state is removed. The remaining error is what no plain calibration explains.
+The model predicts as it is, or calibrated on the trial itself: uncertain parameters, a gain on
+every input and a common delay of the commands are fitted, and a constant rate of each state is
+removed. The remaining error is what no plain calibration explains.
 On request everything linear in the states (unmodelled friction, back-EMF, springs) or in the
 commands is removed as well.
 """
@@ -39,10 +39,8 @@ def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
     """Return the states that predictions start from at each sample, (T + 1, n).
 
     States without a sensor are taken as 0, but the memory of adopted inputs' effects as the trial
-    has it, where it follows the commands: without it, an input that lags by 0.26 s after 0.16 s
-    seemed to act by 388 % and -365 % in two drives. True values behind a delayed log are taken as
-    what is logged later. A boat's sway follows from its true speed. Predicted from 0, 98 % of it
-    was missed, and less of it with all lengths divided by 100, as if the log was in cm.
+    has it, where it follows the commands, and true values behind a delayed log as what is logged
+    later.
     """
     names, x = model.state_names, np.array(trial.states)
     hidden, own = [i for i in range(model.n) if i not in shown], motion(model).state_names
@@ -161,6 +159,15 @@ class Ahead:
         off = self.model.difference(self.last, self.first)[:, self.shown]
         found[self.shown] = off.std(axis=0)
         return found
+
+    def moved_by(self, j: int) -> float:
+        """Return which share of input j's effect on the motion the initial states don't foretell."""
+        gains = np.vstack([np.ones(self.model.m), np.arange(self.model.m) != j])
+        with_it, without = self.missed(gains, self.model.values, 0)
+        by = with_it - without
+        own = by - self.left_out @ (self.left_out.T @ by)
+        size = float(((by - by.mean(axis=0)) ** 2 / self.least**2).sum())
+        return float(np.sqrt((own**2 / self.least**2).sum() / size)) if size > 0 else 0.0
 
     def whatever_commands_do(self) -> Ahead:
         """Return a copy that also removes errors linear in the past and present commands."""

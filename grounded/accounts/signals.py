@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from grounded.frozen import Array, white_noise
-from grounded.instruments.finding import Finding
+from grounded.accounts.finding import Finding
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial

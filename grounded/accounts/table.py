@@ -183,9 +183,11 @@ def of_motion(model: Model, shown: Sequence[int], trials: Sequence[Trial]) -> It
     angles = tuple(k for k in turning if units[k] == "rad")
     also = tuple(n + j for j, unit in enumerate(sent) if unit == "rad")
     lengths = tuple(k for k in shown if units[k].partition("/")[0] == "m")
-    groups = dict.fromkeys(g for g in (turning, angles, *((k,) for k in angles), angles + also) if g)
-    for group in groups:
+    single = [(k,) for k in turning if (k,) in alone or units[k] == "rad"]
+    for group in dict.fromkeys(g for g in (turning, angles, *single, angles + also) if g):
         yield Account("unit", group, DEGREES, unit="deg", price=0.1 * len(group))
+    for group in (one for one in single if units[one[0]] == "rad/s"):
+        yield Account("unit", group, RPM, unit="rpm", price=0.1)
     if not any(unit.partition("/")[0] == "m" for unit in sent):
         single = [(k,) for k in lengths if (k,) in alone and units[k] == "m"]
         for group in dict.fromkeys(g for g in (lengths, *single) if g):

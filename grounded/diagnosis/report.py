@@ -27,7 +27,7 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.ruler_words import objection
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.instruments.finding import Finding, late_effects
+from grounded.accounts.finding import Finding, late_effects
 from grounded.result import Document, number
 
 if TYPE_CHECKING:

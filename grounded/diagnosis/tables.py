@@ -14,7 +14,7 @@ from grounded.result import figure, html_table, or_zero, percent, shown, with_un
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
-    from grounded.instruments.finding import Finding
+    from grounded.accounts.finding import Finding
 
 Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing

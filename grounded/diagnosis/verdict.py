@@ -52,7 +52,7 @@ from grounded.diagnosis.ruler_words import (
     worsened,
 )
 from grounded.errors import GroundedError
-from grounded.instruments.finding import Finding, in_the_log
+from grounded.accounts.finding import Finding, in_the_log
 from grounded.model import Model
 from grounded.result import begun, listed, number, percent, with_unit
 

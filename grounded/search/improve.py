@@ -186,7 +186,7 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     predict held-out time worse than the model's own values.
     """
     from grounded.fit import fit
-    from grounded.instruments.sound_trials import sound_trials
+    from grounded.accounts.sound_trials import sound_trials
 
     names = task.model.state_names
     whole = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]

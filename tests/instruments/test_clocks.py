@@ -9,7 +9,7 @@ import grounded as gr
 from facts import holds
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.predictions.clocks import Early, answers_early, judge_clocks
+from grounded.accounts.commands import Early, answers_early, judge_clocks
 from grounded.trial import Trial
 
 
@@ -230,7 +230,7 @@ def test_one_swing_of_several_that_looks_early_is_not_the_clock(monkeypatch, odd
     trials = [driven(model, seed=seed) for seed in range(3)]
     early = iter([Early(0.1, 0, 0.5, 0.2, gain)] * odd + [None] * 3)
     monkeypatch.setattr(
-        "grounded.instruments.predictions.clocks.answers_early", lambda *_: next(early)
+        "grounded.accounts.commands.answers_early", lambda *_: next(early)
     )
     if told:
         with pytest.raises(GroundedError, match="clocks"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.instruments.finding import DEGREES
+from grounded.accounts.finding import DEGREES
 from grounded.instruments.preflight import preflight
 from grounded.instruments.units.odd_trial import all_in_degrees
 

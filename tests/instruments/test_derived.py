@@ -10,7 +10,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
-from grounded.instruments.finding import (
+from grounded.accounts.finding import (
     a_mean,
     in_degrees,
     late_as_positions,

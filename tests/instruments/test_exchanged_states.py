@@ -9,10 +9,10 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.instruments.finding import UnusableTrials
+from grounded.accounts.finding import UnusableTrials
 from grounded.instruments.predictions.exchanged_states import exchanged_states, judge_exchanged
 from grounded.instruments.predictions.mistaken import Mistake
-from grounded.instruments.sound_trials import sound_trials
+from grounded.accounts.sound_trials import sound_trials
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from real_systems import ACROBOT, BAM_KP, EMPS, SYSID

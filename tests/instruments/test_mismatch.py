@@ -6,7 +6,7 @@ import pytest
 from grounded import Model, Param
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.instruments.kinematics.rows import Row, gaps, kinematic_rows, unheld
+from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
 from grounded.instruments.preflight import preflight
 from grounded.models.car import model as CAR
 from grounded.trial import Trial

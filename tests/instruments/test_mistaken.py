@@ -19,7 +19,7 @@ from grounded.instruments.predictions.mistaken import (
     mended_by,
     mistaken,
 )
-from grounded.instruments.predictions.short_runs import Ahead, Fit
+from grounded.accounts.motion import Ahead, Fit
 from grounded.trial import Trial
 from ros_bags import thruster_bag
 

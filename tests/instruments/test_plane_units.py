@@ -5,8 +5,8 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.effects import Library, wrap
-from grounded.instruments.predictions.short_runs import predicted
-from grounded.instruments.sound_trials import sound_trials
+from grounded.accounts.motion import predicted
+from grounded.accounts.sound_trials import sound_trials
 from grounded.instruments.units.plane_units import judge_positions, positions_off
 
 DT = 0.02

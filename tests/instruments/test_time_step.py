@@ -8,7 +8,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
-from grounded.instruments.predictions.time_step import judge_time_step, too_long
+from grounded.accounts.time_step import judge_time_step, too_long
 from grounded.models.car import model as car
 
 DT = 0.02

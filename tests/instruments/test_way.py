@@ -10,7 +10,7 @@ from grounded import Model
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.instruments.kinematics.relations import lag_of
-from grounded.instruments.kinematics.rows import kinematic_rows, tied
+from grounded.accounts.kinematics import kinematic_rows, tied
 from grounded.instruments.kinematics.way import plane_of, stop_at_axes
 from grounded.instruments.predictions.mistaken import mistaken
 from grounded.instruments.preflight import preflight

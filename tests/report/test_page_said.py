@@ -12,7 +12,7 @@ from facts import holds
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
-from grounded.instruments.finding import put_right
+from grounded.accounts.finding import put_right
 from grounded_trials.report.diagnosis_notes import note_lines, pattern_line
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure

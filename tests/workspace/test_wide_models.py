@@ -7,7 +7,7 @@ from facts import holding
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError
 from grounded.fit import fit
-from grounded.instruments.lag import alike
+from grounded.accounts.lag import alike
 from grounded.instruments.preflight import preflight
 from grounded.model import Model, Param
 from grounded.trial import Trial

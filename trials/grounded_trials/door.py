@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
-    from grounded.instruments.finding import Finding
+    from grounded.accounts.finding import Finding
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted, Undone

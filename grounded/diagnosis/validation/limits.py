@@ -32,7 +32,7 @@ from grounded.effects import (
 from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
 from grounded.frozen import Array
-from grounded.instruments.finding import Finding
+from grounded.accounts.finding import Finding
 from grounded.model import Model, Param
 from grounded.places import integrals, told_by
 from grounded.result import listed

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from grounded.instruments.predictions.mistaken import Mistake
-from grounded.instruments.predictions.short_runs import Ahead, Fit
+from grounded.accounts.motion import Ahead, Fit
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.instruments.predictions.input_signs import Acts, how_inputs_act
-from grounded.instruments.predictions.short_runs import Ahead
+from grounded.accounts.commands import Acts, how_inputs_act
+from grounded.accounts.motion import Ahead
 from grounded.search.planner import Planner
 from grounded.search.returned.as_predicted import multiplied
 from grounded.trial import Trial

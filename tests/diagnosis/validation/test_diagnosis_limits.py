@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.limits import (
 )
 from grounded.effects import Library
 from grounded.effects.wrap import wrap
-from grounded.instruments.finding import Finding
+from grounded.accounts.finding import Finding
 from grounded.models.pendulum import model as pendulum
 
 

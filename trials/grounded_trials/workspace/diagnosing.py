@@ -14,7 +14,7 @@ import numpy as np
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.instruments.finding import in_the_log
+from grounded.accounts.finding import in_the_log
 from grounded.progress import duration
 from grounded.result import begun
 from grounded_trials.wording import count, rendered
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
-    from grounded.instruments.finding import Finding
+    from grounded.accounts.finding import Finding
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
     from grounded.search.planner import Planner
@@ -241,7 +241,7 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
     """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
-    from grounded.instruments.sound_trials import sound_trials
+    from grounded.accounts.sound_trials import sound_trials
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
@@ -253,7 +253,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
-    from grounded.instruments.kinematics.rows import unheld
+    from grounded.accounts.kinematics import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials))
 
@@ -280,7 +280,7 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
         GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
             an adopted delay of that sensor has no rows that show it.
     """
-    from grounded.instruments.kinematics.rows import kinematic_rows
+    from grounded.accounts.kinematics import kinematic_rows
     from grounded.instruments.units.mismatch import stop_at_folded
 
     used, model = diagnosable(workspace), workspace.base_model

@@ -27,7 +27,7 @@ from grounded_trials.workspace.user_files.config import set_in_model, set_latenc
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
-    from grounded.instruments.finding import Finding
+    from grounded.accounts.finding import Finding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -205,7 +205,7 @@ def fit_trials(
     """
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
-    from grounded.instruments.sound_trials import sound_trials
+    from grounded.accounts.sound_trials import sound_trials
     from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
     planner = workspace.planner

@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest, type_of
 from grounded.frozen import Array, numbers
-from grounded.instruments.finding import DEGREES
+from grounded.accounts.finding import DEGREES
 from grounded.model import Model
 from grounded.places import role
 from grounded.task import MAX_HORIZON

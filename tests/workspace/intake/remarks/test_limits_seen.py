@@ -7,7 +7,7 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.instruments.inputs import beyond_limits
+from grounded.accounts.inputs import beyond_limits
 from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace

@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.predictions.mistaken import CLEAR, HALF
-from grounded.instruments.predictions.short_runs import Ahead
+from grounded.accounts.motion import Ahead
 from grounded.model import Model
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_guess import Guess

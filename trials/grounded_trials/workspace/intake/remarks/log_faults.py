@@ -216,8 +216,8 @@ def _thousands(model: Model, known: Trial) -> list[Fault]:
 
 def way_faults(model: Model, known: Trial) -> list[Fault]:
     """Return faults of heading and speeds found from the path: other axes, a compass, knots."""
-    from grounded.instruments.finding import UnusableTrials
-    from grounded.instruments.kinematics.rows import kinematic_rows, tied
+    from grounded.accounts.finding import UnusableTrials
+    from grounded.accounts.kinematics import kinematic_rows, tied
     from grounded.instruments.kinematics.way import judge_way
 
     rows = tied(kinematic_rows(model, range(model.n)))
@@ -242,8 +242,8 @@ def positions_faults(model: Model, known: Trial) -> list[Fault]:
 
 def _degrees(model: Model, known: Trial) -> list[Fault]:
     """Return faults for angles in degrees that a diagnosis would correct, or refuse."""
-    from grounded.instruments.finding import DEGREES
-    from grounded.instruments.kinematics.rows import kinematic_rows
+    from grounded.accounts.finding import DEGREES
+    from grounded.accounts.kinematics import kinematic_rows
     from grounded.instruments.preflight import preflight
     from grounded.instruments.units.mismatch import folded
 
@@ -301,7 +301,7 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     """Return a fault if measured states respond to commands before they are sent."""
-    from grounded.instruments.predictions.clocks import answers_early, one_clock, too_soon
+    from grounded.accounts.commands import answers_early, one_clock, too_soon
 
     model, table = workspace.base_model, workspace.config.estimate
     measured: Collection[str] = model.state_names
