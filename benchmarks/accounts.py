@@ -140,7 +140,9 @@ def _drone() -> Robot:
     def held(x: Array, want: Array) -> Array:
         lean = np.clip(0.25 * (x[0] - want[1]) + 0.3 * x[3], -0.5, 0.5)
         up = 0.5 * (9.81 + 4 * (want[0] - x[1]) - 3 * x[4]) / np.cos(np.clip(x[2], -0.9, 0.9))
-        return np.array([np.clip(up, 1, 9), np.clip(0.006 * (60 * (lean - x[2]) - 14 * x[5]), -1, 1)])
+        return np.array(
+            [np.clip(up, 1, 9), np.clip(0.006 * (60 * (lean - x[2]) - 14 * x[5]), -1, 1)]
+        )
 
     noise = (0.005, 0.005, 0.004, 0.02, 0.02, 0.02)
     return Robot(model, lacks, noise, ((-1.0, 1.0), (-1.5, 1.5)), 0.02, (0,) * 6, held)
@@ -336,7 +338,9 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     def exchanged(a: str, b: str) -> Callable[[dict[str, Array]], None]:
         def change(c: dict[str, Array]) -> None:
             length = min(len(c[a]), len(c[b]))
-            c[a], c[b] = (np.concatenate([c[y][:length], c[x][length:]]) for x, y in ((a, b), (b, a)))
+            c[a], c[b] = (
+                np.concatenate([c[y][:length], c[x][length:]]) for x, y in ((a, b), (b, a))
+            )
 
         return change
 
@@ -371,16 +375,28 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         yield Fault("positions in mm", "unit", one(*lengths), times(lengths, 1e3))
         feet = (frozenset(lengths),)
         yield Fault("positions in feet", "unit", feet, times(lengths, 3.28084))
-        yield Fault("positions exchanged", "exchange", one(*lengths[:2]), _set(trials, exchanged(*lengths[:2])))
+        yield Fault(
+            "positions exchanged",
+            "exchange",
+            one(*lengths[:2]),
+            _set(trials, exchanged(*lengths[:2])),
+        )
         yield Fault("sign of a position", "sign", one(length), times([length], -1.0))
         late = float(rng.uniform(0.12, 0.25)) / dt
         yield Fault("late positions", "late", one(*lengths), shifted(lengths, late))
     if speed:
         yield Fault("speeds in km/h", "unit", one(*speeds), times(speeds, 3.6))
         yield Fault("speeds in knots", "unit", one(*speeds), times(speeds, 1.943844))
-        yield Fault("all lengths in mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3))
+        yield Fault(
+            "all lengths in mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3)
+        )
     if length and angle and "heading" in model.roles:
-        yield Fault("position and heading exchanged", "exchange", one(length, angle), _set(trials, exchanged(length, angle)))
+        yield Fault(
+            "position and heading exchanged",
+            "exchange",
+            one(length, angle),
+            _set(trials, exchanged(length, angle)),
+        )
         turn = float(rng.choice([np.pi / 2, -0.7, 1.2]))
         off = _set(trials, lambda c: c.update({angle: c[angle] + turn}))
         yield Fault("heading with an offset", "offset", one(angle), off)
@@ -391,9 +407,15 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         if others:
             yield Fault("compass and gyro", "sign", one(angle, *others), both)
         yield Fault("sign of the heading", "sign", one(angle), times([angle], -1.0))
-    pairs = [(q, w) for q, w in (("q1", "w1"), ("th", "w"), ("x", "vx"), ("psi", "r")) if {q, w} <= {*units}]
+    pairs = [
+        (q, w)
+        for q, w in (("q1", "w1"), ("th", "w"), ("x", "vx"), ("psi", "r"))
+        if {q, w} <= {*units}
+    ]
     for q, w in pairs[:1]:
-        yield Fault("position and velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w)))
+        yield Fault(
+            "position and velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w))
+        )
     for q, w in [one for one in pairs if one[0] in ("q1", "th")][:1]:
         yield Fault("sign of a joint", "sign", one(q, w), times([q, w], -1.0))
     if "q2" in units:
@@ -417,7 +439,9 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     # samples
     name = str(rng.choice(model.state_names))
     every = int(rng.integers(3, 6))
-    hold = _set(trials, lambda c: c.update({name: np.repeat(c[name][::every], every)[: len(c[name])]}))
+    hold = _set(
+        trials, lambda c: c.update({name: np.repeat(c[name][::every], every)[: len(c[name])]})
+    )
     yield Fault("held values", "held", one(name), hold)
 
     def sticks(c: dict[str, Array]) -> None:
@@ -426,15 +450,23 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
 
     yield Fault("stuck at times", "stuck", one(name), _set(trials, sticks))
 
+    gone = 40 * float(np.std(trials[0].states[:, model.state_names.index(name)])) + 5
+
     def drops(c: dict[str, Array]) -> None:
-        c[name][10::37] = 40 * float(np.std(c[name])) + 5
+        c[name][10::17] = gone
 
     yield Fault("drop-outs", "dropout", one(name), _set(trials, drops))
 
 
 # --- what was named -----------------------------------------------------------------------------
 
-KINDS = {"degrees": "unit", "delay": "late", "lag": "late", "scale": "scale", "mismatch": "mismatch"}
+KINDS = {
+    "degrees": "unit",
+    "delay": "late",
+    "lag": "late",
+    "scale": "scale",
+    "mismatch": "mismatch",
+}
 QUIET = {"saturated", "beyond", "constant", "copy", "quantised", "missing", "smoothed", "time step"}
 TEXTS = {
     "exchange": r"exchanged",
@@ -516,7 +548,10 @@ def main() -> None:
                     names[fault.name][one] += 1
                 if args.all:
                     told = "; ".join(f"{k} {'+'.join(sorted(s))}" for k, s in found)
-                    print(f"{kind:7}{which:6}{seed:3} {fault.name:32} {'refused' * refused:8}{told}", flush=True)
+                    print(
+                        f"{kind:7}{which:6}{seed:3} {fault.name:32} {'refused' * refused:8}{told}",
+                        flush=True,
+                    )
     print(f"\n{'true fault':34}{'right':>6}{'part':>6}{'silent':>7}{'wrong':>6}   named")
     total = Counter[str]()
     for name, row in table.items():
@@ -524,8 +559,10 @@ def main() -> None:
         said = ", ".join(f"{k} {n}" for k, n in names[name].most_common(4))
         print(f"{name:34}{row['right']:6}{row['part']:6}{row['silent']:7}{row['wrong']:6}   {said}")
     every = sum(total.values())
-    print(f"{'all':34}{total['right']:6}{total['part']:6}{total['silent']:7}{total['wrong']:6}   "
-          f"{100 * total['right'] / max(every, 1):.1f} % right")
+    print(
+        f"{'all':34}{total['right']:6}{total['part']:6}{total['silent']:7}{total['wrong']:6}   "
+        f"{100 * total['right'] / max(every, 1):.1f} % right"
+    )
     used = time.process_time() - began
     print(f"{cases} cases, {used / max(cases, 1):.2f} s CPU each")
     refusals = told = runs = 0

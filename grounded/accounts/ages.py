@@ -602,7 +602,9 @@ def _left(
         along = (slope * ahead).sum(axis=1, keepdims=True) * ahead
         turn = (slope * side).sum(axis=1, keepdims=True) / size
         late = [along, slope - along] if apart else [slope]
-        design = np.stack([*(-one for one in late), turn * side, -turn * ahead, ahead, side], axis=2)
+        design = np.stack(
+            [*(-one for one in late), turn * side, -turn * ahead, ahead, side], axis=2
+        )
         for k in (0, 1):
             rests.append((z - s)[:, k] - (z - s)[:, k].mean())
             designs.append(design[:, k] - design[:, k].mean(axis=0))

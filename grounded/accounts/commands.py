@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.accounts.finding import UnusableTrials, unusable
 from grounded.accounts.motion import HORIZONS, Ahead, Fit
 from grounded.errors import NextCommand
 from grounded.frozen import Array
-from grounded.accounts.finding import UnusableTrials, unusable
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.result import listed

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.accounts.finding import Finding
 from grounded.accounts.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import extent
 from grounded.task import Task

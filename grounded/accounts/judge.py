@@ -125,7 +125,9 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
             mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
     corrected = list(trials)
     for one in (one for one in told if one.certain):
-        corrected = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(corrected)]
+        corrected = [
+            one.account.mended(t) if k in one.trials else t for k, t in enumerate(corrected)
+        ]
     bad = {row: gap for row, gap in left.items() if gap.share > BAD}
     return Verdict(tuple(told), tuple(mended), tuple(corrected), tuple(rows), bad, lost)
 
@@ -137,6 +139,26 @@ def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterat
         some = tuple(k for k, one in enumerate(each) if j in one)
         account = Account("dead", (j,))
         yield Told(account, some, 0.0, whole=len(some) == len(trials), moved=each[some[0]][j])
+
+
+def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Account) -> bool:
+    """Check whether the model predicts a trial clearly better as logged than without a fault.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: indices of the states with a sensor.
+        account: the fault, of another trial.
+    """
+    known, ones = _known(trial, shown), np.ones(model.m)
+    seconds = horizon_of(trial, known)
+    logged, mended = (
+        Ahead(model, one, known, STARTS, horizon=seconds) for one in (trial, account.mended(trial))
+    )
+    if not (logged.enough and mended.enough) or not np.isfinite(trial.inputs).all():
+        return False
+    with np.errstate(all="ignore"):
+        return mended.plain(ones).missed - logged.plain(ones).missed > HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------
@@ -278,7 +300,9 @@ def _agrees(
     if row not in after:
         return False
     bad, left = before[row].share > BAD, after[row].share
-    if not left < (min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)):
+    if not left < (
+        min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
+    ):
         return False
     size = abs(np.log(abs(account.factor)))
     named = account.kind == "unit" and size > 0
@@ -395,7 +419,9 @@ def _each(
         mended = account.mended(trial)
         entered = [row for row in before if row.states & account.touched]
         after = gaps(model, mended, entered)
-        if any(row not in after or after[row].share > max(MENDED, before[row].share) for row in entered):
+        if any(
+            row not in after or after[row].share > max(MENDED, before[row].share) for row in entered
+        ):
             continue  # the rows contradict it
         made = Ahead(model, mended, known, FEWER, horizon=seconds)
         if made.enough:

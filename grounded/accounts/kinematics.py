@@ -318,7 +318,9 @@ def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> dict[i
     for row in (row for row in rows if model.angle_mask[row.i]):
         for k, trial in enumerate(trials):
             steps = per_step(model, trial, [row])
-            moved, said = (np.concatenate([[0.0], *(z[n][:, row.i] for z in steps)]) for n in (0, 1))
+            moved, said = (
+                np.concatenate([[0.0], *(z[n][:, row.i] for z in steps)]) for n in (0, 1)
+            )
             off, plain = (
                 float(np.sqrt((wrapped((moved - by * said)[:, None], [True]) ** 2).mean()))
                 for by in (DEGREES, 1.0)

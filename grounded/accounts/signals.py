@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.frozen import Array, white_noise
 from grounded.accounts.finding import Finding
+from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial

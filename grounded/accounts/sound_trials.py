@@ -25,10 +25,9 @@ from grounded.accounts.kinematics import folded, gaps, kinematic_rows
 from grounded.accounts.signals import judge_signal, signal_of
 from grounded.accounts.table import DEGREES
 from grounded.accounts.time_step import judge_resolution, judge_time_step
-from grounded.accounts.words import clause, mend, remedy
+from grounded.accounts.words import clause, is_folded, mend, remedy
 from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
-from grounded.places import speed
 from grounded.result import listed, per_second, with_unit
 from grounded.task import Task
 from grounded.trial import Trial
@@ -163,8 +162,7 @@ def stop_at_folded(
         where = f"in trial{'s' * (len(ids) > 1)} {listed(ids)} " if ids else ""
         unit = model.states[name]
         raise GroundedError(
-            f"{where}{name} is in degrees, but was unwrapped as an angle in {unit} when the log "
-            f"was ingested: multiply the scale in [log.state.{name}] by {1 / DEGREES:.8g} (a "
+            f"{where}{name} {is_folded(model, i)} when the log was ingested: multiply the scale in [log.state.{name}] by {1 / DEGREES:.8g} (a "
             f"missing scale is 1) or write {unit} into the log, discard "
             f"{'these trials' if ids[1:] else 'it'} and ingest {'their logs' if ids[1:] else 'the log'} "
             "again",

@@ -14,7 +14,6 @@ from itertools import combinations
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
@@ -197,7 +196,10 @@ def of_motion(model: Model, shown: Sequence[int], trials: Sequence[Trial]) -> It
     # inputs in another unit: all that share theirs, or one
     for name in dict.fromkeys(sent):
         same = tuple(n + j for j, unit in enumerate(sent) if unit == name)
-        most = max((float(np.abs(t.inputs[:, j - n]).max(initial=0.0)) for t in trials for j in same), default=0)
+        most = max(
+            (float(np.abs(t.inputs[:, j - n]).max(initial=0.0)) for t in trials for j in same),
+            default=0,
+        )
         for group in dict.fromkeys((same, *((j,) for j in same))):
             for unit, f in units_of(name, most).items():
                 if name != "%" or most < OVER:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.frozen import Array
 from grounded.accounts.finding import Finding
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import percent
 from grounded.trial import Trial

@@ -23,6 +23,12 @@ def table(model: Model, k: int) -> str:
     return f"[log.{'state' if k < model.n else 'input'}.{names_of(model, [k])[0]}]"
 
 
+def is_folded(model: Model, i: int) -> str:
+    """Return a clause on an angle in degrees that was unwrapped in radians, after its name."""
+    unit = list(model.states.values())[i]
+    return f"is in degrees, but was unwrapped as an angle in {unit}"
+
+
 def clause(model: Model, told: Told, *, log: bool = True, robot: bool = False) -> str:
     """Return one clause: what is wrong, and the evidence.
 

@@ -8,8 +8,8 @@ import pytest
 import grounded as gr
 from facts import holds
 from grounded import Model, Param
-from grounded.errors import GroundedError
 from grounded.accounts.commands import Early, answers_early, judge_clocks
+from grounded.errors import GroundedError
 from grounded.trial import Trial
 
 
@@ -229,9 +229,7 @@ def test_one_swing_of_several_that_looks_early_is_not_the_clock(monkeypatch, odd
     model = cart()
     trials = [driven(model, seed=seed) for seed in range(3)]
     early = iter([Early(0.1, 0, 0.5, 0.2, gain)] * odd + [None] * 3)
-    monkeypatch.setattr(
-        "grounded.accounts.commands.answers_early", lambda *_: next(early)
-    )
+    monkeypatch.setattr("grounded.accounts.commands.answers_early", lambda *_: next(early))
     if told:
         with pytest.raises(GroundedError, match="clocks"):
             judge_clocks(model, trials)

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
+from grounded.instruments.units.odd_trial import all_in_degrees
 
 from grounded import Model, Param, Trial
 from grounded.accounts.finding import DEGREES
-from grounded.instruments.preflight import preflight
-from grounded.instruments.units.odd_trial import all_in_degrees
 
 DT, FINE = 0.02, 20  # [s], and parts of a step
 ARM = Model(

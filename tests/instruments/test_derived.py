@@ -4,12 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from grounded import Model, Trial, diagnose
-from grounded.diagnosis.diagnose import DiagnosisOptions
-from grounded.diagnosis.tables import instrument_lines
-from grounded.effects import Scales, Site, wrap
-from grounded.effects.sensor import sensor_lag
 from grounded.accounts.finding import (
     a_mean,
     in_degrees,
@@ -17,7 +14,10 @@ from grounded.accounts.finding import (
     late_effects,
     put_right,
 )
-from grounded.instruments.preflight import preflight
+from grounded.diagnosis.diagnose import DiagnosisOptions
+from grounded.diagnosis.tables import instrument_lines
+from grounded.effects import Scales, Site, wrap
+from grounded.effects.sensor import sensor_lag
 
 DT = 0.04
 SWING = Model(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from grounded.instruments.predictions.exchanged_states import exchanged_states, judge_exchanged
+from grounded.instruments.predictions.mistaken import Mistake
 
 from cli import grounded
 from facts import holds
 from grounded.accounts.finding import UnusableTrials
-from grounded.instruments.predictions.exchanged_states import exchanged_states, judge_exchanged
-from grounded.instruments.predictions.mistaken import Mistake
 from grounded.accounts.sound_trials import sound_trials
 from grounded.trial import Trial
 from grounded_trials import Workspace

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from grounded import Model, Trial
 from grounded.accounts.halted import halted
-from grounded.instruments.preflight import preflight
 from grounded_trials import Workspace
 from tests.workspace.intake.recognising.test_mistaken_logs import CONFIG, MODEL, TARGET
 from workspaces import make

@@ -8,10 +8,10 @@ import pytest
 
 from facts import holds
 from grounded import Model, Param
-from grounded.effects import Library, wrap
-from grounded.errors import GroundedError
 from grounded.accounts.commands import how_inputs_act, judge_signs
 from grounded.accounts.sound_trials import sound_trials
+from grounded.effects import Library, wrap
+from grounded.errors import GroundedError
 from grounded.models import arm, cart_pole
 from grounded.trial import Trial
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from grounded import Model, Param
+from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
-from grounded.instruments.preflight import preflight
 from grounded.models.car import model as CAR
 from grounded.trial import Trial
 

@@ -4,12 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-import grounded as gr
-from cli import grounded
-from facts import holding, holds
-from grounded import Model, Param
-from grounded.errors import GroundedError
 from grounded.instruments.predictions.mistaken import (
     ODD_FROM,
     Mistake,
@@ -19,7 +13,13 @@ from grounded.instruments.predictions.mistaken import (
     mended_by,
     mistaken,
 )
+
+import grounded as gr
+from cli import grounded
+from facts import holding, holds
+from grounded import Model, Param
 from grounded.accounts.motion import Ahead, Fit
+from grounded.errors import GroundedError
 from grounded.trial import Trial
 from ros_bags import thruster_bag
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
+from grounded.instruments.units.other_units import units_apart
 from test_swapped import PLANE, SLED, driven
 
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.preflight import preflight
-from grounded.instruments.units.other_units import units_apart
 from grounded.trial import Trial
 
 BEAM = Model(

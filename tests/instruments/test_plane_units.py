@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from grounded.instruments.units.plane_units import judge_positions, positions_off
 
 from grounded import GroundedError, Model, Param, Trial
-from grounded.effects import Library, wrap
 from grounded.accounts.motion import predicted
 from grounded.accounts.sound_trials import sound_trials
-from grounded.instruments.units.plane_units import judge_positions, positions_off
+from grounded.effects import Library, wrap
 
 DT = 0.02
 

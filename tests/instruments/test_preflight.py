@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.kinematics.relations import turned
+from grounded.instruments.kinematics.velocities import constant_of, dead_rates
+from grounded.instruments.preflight import preflight
 from scipy.interpolate import CubicSpline
 
 from grounded import Model, Param, Trial
+from grounded.accounts.kinematics import kinematic_rows
+from grounded.accounts.lag import at_samples, lag_between
 from grounded.diagnosis.diagnose import diagnose
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
-from grounded.instruments.kinematics.relations import turned
-from grounded.accounts.kinematics import kinematic_rows
-from grounded.instruments.kinematics.velocities import constant_of, dead_rates
-from grounded.accounts.lag import at_samples, lag_between
-from grounded.instruments.preflight import preflight
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.places import integrals

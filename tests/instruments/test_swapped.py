@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.kinematics.swapped import swapped_columns
+from grounded.instruments.preflight import preflight
 
 from facts import holding
 from grounded import Model, Param
 from grounded.errors import GroundedError
-from grounded.instruments.kinematics.swapped import swapped_columns
-from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 
 PLANE = Model(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
+from grounded.accounts.time_step import judge_time_step, too_long
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
-from grounded.accounts.time_step import judge_time_step, too_long
 from grounded.models.car import model as car
 
 DT = 0.02

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from grounded import Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Library
-from grounded.instruments.preflight import preflight
 from grounded.models.arm import model as arm
 
 DT, LATE, WHIRL = 0.02, 2, 10.0  # [s], steps, [N m]

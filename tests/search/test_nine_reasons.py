@@ -13,9 +13,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.instruments.units.odd_trial import all_in_degrees
 
 from grounded import Model
-from grounded.instruments.units.odd_trial import all_in_degrees
 from grounded.plant import Plant
 from grounded.search import first_policy as starts
 from grounded.search import making

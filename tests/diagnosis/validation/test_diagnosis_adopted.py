@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from cli import grounded
 from grounded import Model, Trial
@@ -24,7 +25,6 @@ from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library, LossFamily, RateFamily, memory_of, memory_start, wrap
 from grounded.errors import NextCommand
-from grounded.instruments.preflight import preflight
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.utility import Reward

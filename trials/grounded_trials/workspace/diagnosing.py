@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.accounts.finding import in_the_log
 from grounded.progress import duration
 from grounded.result import begun
 from grounded_trials.wording import count, rendered
@@ -26,11 +26,11 @@ from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
-    from grounded.accounts.finding import Finding
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
     from grounded.search.planner import Planner
@@ -280,13 +280,12 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
         GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
             an adopted delay of that sensor has no rows that show it.
     """
-    from grounded.accounts.kinematics import kinematic_rows
-    from grounded.instruments.units.mismatch import stop_at_folded
+    from grounded.accounts.sound_trials import stop_at_folded
 
     used, model = diagnosable(workspace), workspace.base_model
     names = named_trials(workspace, names, [trial.id for trial in used])
     some = [trial for trial in used if not names or trial.id in names]
-    stop_at_folded(model, some, kinematic_rows(model, range(model.n)))
+    stop_at_folded(model, some)
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
     return [
         _measured(trial, [name for name in guessed[trial.id].split(",") if name]) for trial in some

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.instruments.preflight import preflight
 
 from cli import grounded
 from facts import holds
 from grounded.accounts.inputs import beyond_limits
-from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
