@@ -347,7 +347,6 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     yield Fault("sound", "none", (), trials)
     # units
     angle, rate, length, speed = drawn("rad"), drawn("rad/s"), drawn("m"), drawn("m/s")
-    angles = [n for n in model.states if units[n] == "rad"]
     turning = [n for n in model.states if units[n] in ("rad", "rad/s")]
     lengths = [n for n in model.states if units[n] == "m"]
     speeds = [n for n in model.states if units[n] == "m/s"]

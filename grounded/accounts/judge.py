@@ -1,8 +1,8 @@
 """START HERE: tell how logs came about, by scoring the accounts of the table.
 
 Every account is scored by what it leaves unexplained: the kinematic rows of the trial as it would
-be otherwise (`kinematics`), and the motion that the model, calibrated on it, misses (`motion`), both
-in nats. No physics breaks a row, so an account of rows is told if it mends every row that it
+be otherwise (`kinematics`), and the motion that the model, calibrated on it, misses (`motion`), in
+nats. No physics breaks a row, so an account of rows is told if it mends every row that it
 touches; the motion then decides between accounts that mend the same rows. What rows can't show is
 told by the motion alone, and there "as logged" may use any gains and signs of its inputs, whereas
 an account must stay near the model's: a model that is only wrong gains nothing by a fault of a log.
@@ -33,7 +33,6 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
-KEYS = ("share", "varying", "rate")
 BETTER = 3.0  # factor by which a bad row's share must fall
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT = 0.03  # of a unit's factor in nats: how near the row's own ratio must be
@@ -114,22 +113,25 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
         # dead sensors first: as noise they would look like anything
         for one in _dead(model, mended, shown):
             told.append(one)
-            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+            mended = _without(one, mended)
         for one in _by_rows(model, mended, rows, shown):
             told.append(one)
-            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+            mended = _without(one, mended)
         lost = folded(model, mended, rows)
         left = _pooled([gaps(model, trial, rows) for trial in mended])
         for one in [] if lost else _by_motion(model, mended, rows, shown):
             told.append(one)
-            mended = [one.account.mended(t) if k in one.trials else t for k, t in enumerate(mended)]
+            mended = _without(one, mended)
     corrected = list(trials)
     for one in (one for one in told if one.certain):
-        corrected = [
-            one.account.mended(t) if k in one.trials else t for k, t in enumerate(corrected)
-        ]
+        corrected = _without(one, corrected)
     bad = {row: gap for row, gap in left.items() if gap.share > BAD}
     return Verdict(tuple(told), tuple(mended), tuple(corrected), tuple(rows), bad, lost)
+
+
+def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
+    """Return trials without a fault, where they have it."""
+    return [told.account.mended(t) if k in told.trials else t for k, t in enumerate(trials)]
 
 
 def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Told]:
@@ -226,7 +228,7 @@ def _best(
     shown: Sequence[int],
     usual: Array | None,
 ) -> tuple[Account, float, tuple[Account, ...]] | None:
-    """Return the account that mends the rows of trials best, its gain and those as good; or None."""
+    """Return the account that best mends the rows of trials, its gain and those as good."""
     bad = _bad(before)
     some = frozenset(k for row in bad for k in row.states)
     cost = dict[Account, float]()
@@ -267,7 +269,7 @@ def _of_bad(
         own = {k for row in rows if row.i in (plane.i, plane.j) for k in row.by}
         speeds = [k for k in sorted(own) if units[k] == "m/s"]
         columns = (plane.i, plane.j, plane.k, rate, *speeds)
-    return of_rows(model, some, columns)
+    return of_rows(model, some, frozenset(k for row in rows for k in row.states), columns)
 
 
 def _paces(model: Model, bad: Sequence[Row], before: Mapping[Row, Gap]) -> Iterator[Account]:
@@ -300,9 +302,8 @@ def _agrees(
     if row not in after:
         return False
     bad, left = before[row].share > BAD, after[row].share
-    if not left < (
-        min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
-    ):
+    most = min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
+    if not left < most:
         return False
     size = abs(np.log(abs(account.factor)))
     named = account.kind == "unit" and size > 0
@@ -329,12 +330,13 @@ def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
         for row, gap in one.items():
             found.setdefault(row, []).append(gap)
     return {
-        row: Gap(
-            *(float(np.sqrt(np.mean([getattr(g, key) ** 2 for g in some]))) for key in KEYS),
-            float(np.mean([gap.ratio for gap in some])),
-        )
+        row: Gap(*np.sqrt(np.mean(np.square([_numbers(gap) for gap in some]), axis=0)).tolist())
         for row, some in found.items()
     }
+
+
+def _numbers(gap: Gap) -> tuple[float, ...]:
+    return gap.share, gap.varying, gap.rate, gap.ratio
 
 
 # --- by motion ------------------------------------------------------------------------------------
@@ -419,9 +421,7 @@ def _each(
         mended = account.mended(trial)
         entered = [row for row in before if row.states & account.touched]
         after = gaps(model, mended, entered)
-        if any(
-            row not in after or after[row].share > max(MENDED, before[row].share) for row in entered
-        ):
+        if not all(r in after and after[r].share <= max(MENDED, before[r].share) for r in entered):
             continue  # the rows contradict it
         made = Ahead(model, mended, known, FEWER, horizon=seconds)
         if made.enough:

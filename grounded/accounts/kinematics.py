@@ -32,7 +32,7 @@ WINDOWS = 40  # windows of a piece over which a rate is sought dead
 
 @dataclass(frozen=True)
 class Row:
-    """The rate of state i depends on the states `by` alone; it is `c` times a single one, if set."""
+    """The rate of state i depends on the states `by` alone; with `c` set, c times a single one."""
 
     i: int
     by: tuple[int, ...]

@@ -161,7 +161,7 @@ class Ahead:
         return found
 
     def moved_by(self, j: int) -> float:
-        """Return which share of input j's effect on the motion the initial states don't foretell."""
+        """Return the share of input j's effect that the initial states don't foretell."""
         gains = np.vstack([np.ones(self.model.m), np.arange(self.model.m) != j])
         with_it, without = self.missed(gains, self.model.values, 0)
         by = with_it - without

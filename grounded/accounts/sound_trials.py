@@ -161,11 +161,11 @@ def stop_at_folded(
         name, ids = model.state_names[i], tuple(trials[k].id for k in some if trials[k].id)
         where = f"in trial{'s' * (len(ids) > 1)} {listed(ids)} " if ids else ""
         unit = model.states[name]
+        these = ("these trials", "their logs") if ids[1:] else ("it", "the log")
         raise GroundedError(
-            f"{where}{name} {is_folded(model, i)} when the log was ingested: multiply the scale in [log.state.{name}] by {1 / DEGREES:.8g} (a "
-            f"missing scale is 1) or write {unit} into the log, discard "
-            f"{'these trials' if ids[1:] else 'it'} and ingest {'their logs' if ids[1:] else 'the log'} "
-            "again",
+            f"{where}{name} {is_folded(model, i)} when the log was ingested: multiply the scale in "
+            f"[log.state.{name}] by {1 / DEGREES:.8g} (a missing scale is 1) or write {unit} into "
+            f"the log, discard {these[0]} and ingest {these[1]} again",
             then=NextCommand("discard", ids) if ids else None,
         )
 

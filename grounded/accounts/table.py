@@ -51,7 +51,7 @@ class Account:
         kind: unit, sign, exchange, dead, offset, axes or pace (of the time stamps).
         columns: those that are changed, or dead.
         factor: how many times too large they are; -1: of the other sign.
-        offset: what is added after that.
+        offset: what is added to the first of them after that.
         pairs: columns in each other's place.
         unit: in which the columns are, or "".
         price: what it costs before any log is seen [nats].
@@ -88,7 +88,8 @@ class Account:
         for pair in self.pairs:
             z[:, pair] = z[:, pair[::-1]]
         some = list(self.columns)
-        z[:, some] = np.nan if self.kind == "dead" else z[:, some] / self.factor + self.offset
+        z[:, some] = np.nan if self.kind == "dead" else z[:, some] / self.factor
+        z[:, some[:1]] += self.offset  # of the heading, which comes first
         if self.kind == "axes":  # speeds (the last two columns) are rotated by the first
             (psi, u, v), turned = self.columns, np.array(z)
             c, s = np.cos(trial.states[:, psi]), np.sin(trial.states[:, psi])
@@ -122,12 +123,15 @@ def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
     return {f"m{unit}": 1e3}
 
 
-def of_rows(model: Model, some: frozenset[int], plane: Sequence[int]) -> Iterator[Account]:
+def of_rows(
+    model: Model, some: frozenset[int], every: frozenset[int], plane: Sequence[int]
+) -> Iterator[Account]:
     """Yield the accounts of states that kinematic rows relate.
 
     Args:
         model: with the units.
         some: the states in rows that disagree.
+        every: the states in rows.
         plane: x, y, the heading, its rate if it is one of the states, and the speeds in m/s of a
             plane; empty without.
     """
@@ -137,13 +141,16 @@ def of_rows(model: Model, some: frozenset[int], plane: Sequence[int]) -> Iterato
         yield Account("sign", (k,), -1.0, price=0.0 if k in fast else 0.3)
         for unit, f in units_of(units[k]).items():
             yield from _either(Account("unit", (k,), f, unit=unit))
-    for name in dict.fromkeys(units):  # all of one unit, among them those that only others relate
-        same = tuple(k for k in range(model.n) if units[k] == name and k in some)
-        if len(same) > 1 and name in ("m", "m/s"):
+    for name in dict.fromkeys(units):
+        same = tuple(k for k in sorted(every) if units[k] == name)
+        if len(same) > 1 and name in ("m", "m/s") and some & {*same}:
             for unit, f in units_of(name).items():
                 yield from _either(Account("unit", same, f, unit=unit, price=0.5))
     for pair in combinations(sorted(some), 2):
         yield Account("exchange", pairs=(pair,), price=1.0)
+    for k in sorted(some):
+        for j in range(model.n, model.n + model.m):
+            yield Account("exchange", pairs=((k, j),), price=1.5)
     if len(plane) >= 3:
         psi, rate, *speeds = plane[2:] if len(plane) > 3 else (plane[2], -1)
         turning = (psi, rate) if rate >= 0 else (psi,)
@@ -192,7 +199,7 @@ def of_motion(model: Model, shown: Sequence[int], trials: Sequence[Trial]) -> It
         for group in dict.fromkeys(g for g in (lengths, *single) if g):
             for f in (1e3, 1e2, 1e-2, 1e-3):
                 unit = {1e3: "mm", 1e2: "cm", 1e-3: "km"}.get(f, "")
-                yield Account("unit", group, f, unit=unit, price=0.5 + 0.5 * (f < 1))
+                yield Account("unit", group, f, unit=unit, price=0.5 * (f < 1))
     # inputs in another unit: all that share theirs, or one
     for name in dict.fromkeys(sent):
         same = tuple(n + j for j, unit in enumerate(sent) if unit == name)

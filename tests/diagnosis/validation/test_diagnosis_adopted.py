@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from cli import grounded
 from grounded import Model, Trial

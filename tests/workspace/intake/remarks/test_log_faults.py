@@ -12,7 +12,7 @@ from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 from grounded_trials.workspace.intake.remarks.log_faults import _degrees
 from ros_bags import rover_bag
-from tests.instruments.test_mismatch import BOAT, folded, logged
+from tests.accounts.test_mismatch import BOAT, folded, logged
 
 CAR = Model(
     states={"psi": "rad", "qz": "1", "z": "m"},

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
-from grounded.instruments.units.other_units import units_apart
+from grounded.accounts.sound_trials import sound_trials as preflight
 from test_swapped import PLANE, SLED, driven
 
 from grounded import Model, Param

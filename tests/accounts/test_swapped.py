@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.kinematics.swapped import swapped_columns
-from grounded.instruments.preflight import preflight
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from facts import holding
 from grounded import Model, Param

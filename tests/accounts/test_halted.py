@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Trial
 from grounded.accounts.halted import halted

@@ -4,19 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.kinematics.relations import lag_of
-from grounded.instruments.kinematics.way import plane_of, stop_at_axes
-from grounded.instruments.predictions.mistaken import mistaken
-from grounded.instruments.preflight import preflight
+from grounded.accounts.ages import lag_of
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from facts import holding, holds
 from grounded import Model
-from grounded.accounts.kinematics import kinematic_rows, tied
+from grounded.accounts.kinematics import kinematic_rows
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.places import integrals
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.remarks.log_faults import way_faults
 
 DT = 0.1
 STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}

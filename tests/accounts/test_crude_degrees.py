@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
-from grounded.instruments.units.odd_trial import all_in_degrees
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Param, Trial
 from grounded.accounts.finding import DEGREES

@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Trial, diagnose
 from grounded.accounts.finding import (
     a_mean,
-    in_degrees,
     late_as_positions,
     late_effects,
     put_right,

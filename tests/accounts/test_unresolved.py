@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.preflight import preflight
+from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose

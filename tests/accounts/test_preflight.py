@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.instruments.kinematics.relations import turned
-from grounded.instruments.kinematics.velocities import constant_of, dead_rates
-from grounded.instruments.preflight import preflight
+from grounded.accounts.kinematics import turned
+from grounded.accounts.ages import bias_of as constant_of
+from grounded.accounts.sound_trials import sound_trials as preflight
 from scipy.interpolate import CubicSpline
 
 from grounded import Model, Param, Trial
