@@ -178,7 +178,7 @@ def _by_rows(
     sound = [trials[k] for k in groups.pop(frozenset(), [])]
     usual = None
     if sound:
-        usual = np.median([np.nanstd(trial.states, axis=0) for trial in sound], axis=0)
+        usual = np.median([_spread(trial, range(model.n)) for trial in sound], axis=0)
     found = dict[Account, list[tuple[int, Account, float, tuple[Account, ...]]]]()
     queue = list(groups.values())
     while queue:
@@ -315,8 +315,17 @@ def _strange(account: Account, mended: Trial, usual: Array | None) -> float:
     some = [k for k in account.touched if usual is not None and k < len(usual)]
     if usual is None or not some or account.kind == "pace":
         return 0.0
-    size = np.nanstd(mended.states[:, some], axis=0)
+    size = _spread(mended, some)
     return float(np.minimum(np.abs(np.log(size / usual[some])), NEAR).sum())
+
+
+def _spread(trial: Trial, some: Sequence[int]) -> Array:
+    """Return the standard deviation of some states (len(some),); about 0 without samples."""
+    x = trial.states[:, list(some)]
+    known = np.isfinite(x)
+    count = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, x, 0.0).sum(axis=0) / count
+    return np.asarray(np.sqrt((np.where(known, x - mean, 0.0) ** 2).sum(axis=0) / count) + 1e-300)
 
 
 def _nats(share: float) -> float:
@@ -395,7 +404,7 @@ def _by_motion(
 def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     """Return the trials that are predicted: some, and those of another size than the others."""
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
-    size = np.array([np.nanstd(t.states[:, list(shown)], axis=0) + 1e-300 for t in trials])
+    size = np.array([_spread(t, shown) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
     return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(FAR))[:TRIALS]})
 

@@ -62,7 +62,10 @@ def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
     for seconds in HORIZONS:
         steps = max(1, round(seconds / trial.dt))
         moved = trial.states[steps:, list(shown)] - trial.states[:-steps, list(shown)]
-        if len(moved) < LEAST or np.median(np.nanstd(moved, axis=0) / noise) > LOUD:
+        known = np.isfinite(moved).all(axis=0)
+        if len(moved) < LEAST or not known.any():
+            return seconds
+        if np.median((moved.std(axis=0) / noise)[known]) > LOUD:
             return seconds
     return HORIZONS[-1]
 

@@ -116,7 +116,8 @@ def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
     if unit in UNITS:
         return UNITS[unit]
     if unit == "1":
-        return {name: f for name, f in FULL.items() if OPENED * f < most < OVER * f}
+        full = [(name, f) for name, f in FULL.items() if OPENED * f < most < OVER * f]
+        return dict(full[:1])
     base = unit.partition("/")[0]
     if not base or " " in unit or "^" in unit or base[:1] in PREFIXES:
         return {f"thousandths of {unit}": 1e3}
