@@ -452,7 +452,7 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     gone = 40 * float(np.std(trials[0].states[:, model.state_names.index(name)])) + 5
 
     def drops(c: dict[str, Array]) -> None:
-        c[name][10::17] = gone
+        c[name][10::31] = gone
 
     yield Fault("drop-outs", "dropout", one(name), _set(trials, drops))
 
@@ -501,7 +501,7 @@ def _refused(model: Model, text: str) -> tuple[str, frozenset[str]]:
     kind = next((k for k, how in TEXTS.items() if re.search(how, text)), "other")
     names = "|".join(sorted([*model.states, *model.inputs], key=len, reverse=True))
     text = re.sub(rf"^(in )?(every )?trials? .*?(?=the columns|\b(?:{names})\b)", "", text)
-    found = re.findall(rf"(?<![\w.])(?:{names})(?!\w)", re.split(r"[:(]| shows", text)[0])
+    found = re.findall(rf"(?<![\w.])(?:{names})(?!\w)", re.split(r"[:(]| shows| stays", text)[0])
     if kind == "unit" and "as fast as" in text:
         found = re.findall(rf"says: ({names}) looks", text)
     return kind, frozenset(found)

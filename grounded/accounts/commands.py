@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials, unusable
-from grounded.accounts.motion import HORIZONS, Ahead, Fit
+from grounded.accounts.motion import HORIZONS, LEAST, Ahead, Fit, basis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -34,7 +34,9 @@ SURELY = 1.6  # [nats] the same in fewer than half of the trials: all have one c
 LIKE = 4.0  # factor within which an input must act as in the model
 LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
 STARTS = 120  # samples to predict from
+DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
+EVEN = 0.5  # of an input's effect: predictions that bend more are left out
 OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
 
@@ -197,37 +199,75 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
     some = _known(known, shown)
     if not some or not np.isfinite(known.inputs).all():
         return (UNKNOWN,) * model.m
+    found = list[tuple[Array, Array]]()
     with np.errstate(all="ignore"):
-        each = [
-            Ahead(model, known, some, STARTS, linear=True, horizon=seconds)
-            for seconds in (HORIZONS[0], HORIZONS[-1])
-        ]
-        return tuple(_acts([one for one in each if one.enough], j) for j in range(model.m))
+        for seconds in (HORIZONS[0], HORIZONS[-1]):
+            ahead = Ahead(model, known, some, STARTS, DELAYS, linear=True, horizon=seconds)
+            if ahead.enough:
+                found.append(_scores(ahead))
+    return tuple(_acts([(nats[j], shares[j]) for nats, shares in found]) for j in range(model.m))
 
 
-def _acts(each: Sequence[Ahead], j: int) -> Acts:
-    """Return how input j acts, if predictions of all lengths agree on it."""
-    found = []
-    for ahead in each:
-        m, at = ahead.model.m, np.arange(ahead.model.m) == j
-        forth, none, back = (np.where(at, sign, 1.0) for sign in (1.0, 0.0, -1.0))
-        if ahead.moved_by(j) < OWN:
-            return UNKNOWN  # it hardly moved on its own
-        fits = [ahead.best([gains], free=False) for gains in (forth, none, back)]
-        scores = [fit.score for fit in fits]
-        share = float(ahead.best([fits[int(np.argmin(scores))].gains * np.ones(m)]).gains[j])
-        found.append((scores, share))
-    if not found:
+def _scores(ahead: Ahead) -> tuple[Array, Array]:
+    """Return what is missed [nats] with each input forth, without and back (m, 3), and its share.
+
+    What an input does is all but linear in it, so that its share can be fitted; predictions for
+    which it is not are left out. The commands may act late. NaN for an input that hardly moves on
+    its own.
+    """
+    m = ahead.model.m
+    gains = np.vstack([np.ones(m), 1.0 - np.eye(m), 1.0 - 2.0 * np.eye(m)])
+    nats, shares = np.full((m, 3), np.nan), np.full(m, np.nan)
+    least = np.full(m, np.inf)
+    for late in ahead.delays:
+        off = ahead.missed(gains, ahead.model.values, late)
+        by = off[:1] - off[1 : m + 1]  # what each input does (m, N, k)
+        bent = off[:1] - off[m + 1 :] - 2 * by
+        size = np.square(by / ahead.least).sum(axis=(0, 2))
+        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= EVEN**2 * size
+        even &= np.isfinite(off).all(axis=(0, 2))
+        if even.sum() < LEAST:
+            continue
+        linear = basis(ahead.first[even][:, ahead.shown])
+        each = np.concatenate([off[:1], by])[:, even]
+        own = each - np.einsum("nc,xck->xnk", linear, np.einsum("nc,xnk->xck", linear, each))
+        moved = np.square((each - each.mean(axis=1, keepdims=True)) / ahead.least).sum(axis=(1, 2))
+        alone = np.sqrt(np.square(own / ahead.least).sum(axis=(1, 2)) / moved)[1:]
+        for j in np.flatnonzero(alone > OWN).tolist():
+            tried = [_left(ahead, own, j, share) for share in (1.0, 0.0, -1.0)]
+            nats[j] = np.fmin(nats[j], [score for score, _ in tried])
+            if (best := _left(ahead, own, j, None))[0] < least[j]:
+                least[j], shares[j] = best
+    return nats, shares
+
+
+def _left(ahead: Ahead, own: Array, j: int, share: float | None) -> tuple[float, float]:
+    """Return what is missed [nats] with a share of input j, None: the best one; and that share."""
+    free = [k for k in range(len(own) - 1) if k != j or share is None]
+    rest = own[0] + (0.0 if share is None else share - 1.0) * own[1 + j]
+    left, shares = rest, np.zeros(len(free))
+    for _ in range(3):  # weighted by what each state misses
+        size = ahead.size(left)
+        design = (own[1:][free] / size).reshape(len(free), rest.size).T
+        shares = np.linalg.lstsq(design, -(rest / size).ravel(), rcond=1e-6)[0]
+        left = rest + np.einsum("x,xnk->nk", shares, own[1:][free])
+    found = 1.0 + float(shares[free.index(j)]) if share is None else share
+    return float(np.log(ahead.size(left)).sum()), found
+
+
+def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
+    """Return how an input acts, if predictions of all lengths agree on it."""
+    if not each or not np.isfinite(each[0][0]).all():
         return UNKNOWN
-    share = found[0][1]
-    for sign, way in ((1, 0), (-1, 2)):
-        clear = all(
-            scores[way] < min(s for k, s in enumerate(scores) if k != way) - CLEAR
-            for scores, _ in found
-        )
-        if clear and all(SHARES[0] < sign * one < SHARES[1] for _, one in found):
-            return Acts(sign, share)
-    return Acts(0, share)
+    # over the shortest length it must lead, over longer ones do better than its reverse
+    (nats, share), *longer = each
+    way = int(nats.argmin())
+    lead = float(np.delete(nats, way).min() - nats[way])
+    agree = [n[2 - way] - n[way] > HINT for n, _ in longer if np.isfinite(n).all()]
+    sized = SHARES[0] < (1 - way) * share < SHARES[1]
+    unsure = way != 0 and not agree  # a reversal must show over both lengths, or plainly
+    clear = way != 1 and lead > HINT * (1 + unsure) and all(agree)
+    return Acts(1 - way if clear and sized else 0, float(share))
 
 
 def judge_signs(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:

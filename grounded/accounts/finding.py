@@ -217,5 +217,5 @@ def unusable(
         clauses,
         mend,
         in_program or clauses,
-        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
+        then=NextCommand("discard", tuple(names)) if trials[odd[0]].id else None,
     )

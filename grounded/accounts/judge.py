@@ -30,14 +30,15 @@ from grounded.accounts.motion import Ahead, Fit, horizon_of
 from grounded.accounts.table import Account, of_motion, of_rows
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.trial import Trial
 
 BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
 BETTER = 3.0  # factor by which a bad row's share must fall
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
-OF_A_UNIT = 0.03  # of a unit's factor in nats: how near the row's own ratio must be
+OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
-SNAPPED = np.deg2rad(3)  # offsets this near to a right angle are one
+SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
 NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
 CLEAR, HINT, HALF = 1.0, 0.4, 0.5  # [nats] by calibrated and plain predictions; share of one error
 LIKE = 4.0  # factor within which an input must act as in the model
@@ -75,7 +76,7 @@ class Told:
         if self.account.kind == "dead":
             return not self.whole
         if self.by_motion:
-            return self.account.unit == "deg"
+            return self.account.unit == "deg" or (self.account.kind == "unit" and not self.whole)
         return self.account.certain
 
 
@@ -109,6 +110,9 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
         shown: indices of the states with a sensor.
     """
     rows, mended, told = kinematic_rows(model, shown), list(trials), list[Told]()
+    known = {row.i for row in rows}  # a scale between two sensors may be uncertain
+    plain = (r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown})
+    rows += [Row(r.i, (r.j,), r.c) for r in plain if r.i not in known]
     with np.errstate(all="ignore"):
         # dead sensors first: as noise they would look like anything
         for one in _dead(model, mended, shown):
@@ -305,9 +309,9 @@ def _agrees(
     most = min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
     if not left < most:
         return False
-    size = abs(np.log(abs(account.factor)))
-    named = account.kind == "unit" and size > 0
-    return not named or abs(np.log(abs(after[row].ratio) + 1e-300)) < OF_A_UNIT * max(size, 0.5)
+    gross = abs(np.log(abs(account.factor))) > np.log(GROSSLY)
+    off = abs(np.log(max(after[row].ratio, 1e-9)))
+    return account.kind != "unit" or off < (OF_TEN if gross else OF_A_UNIT)
 
 
 def _strange(account: Account, mended: Trial, usual: Array | None) -> float:

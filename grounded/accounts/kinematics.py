@@ -65,15 +65,13 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     """Return the kinematic rows of a model whose states all have sensors.
 
     Args:
-        model: any; of a simulator that can't take a short step only the rows q' = c w are known.
+        model: any; a simulator that can't take a short step has no such rows.
         shown: indices of the states with a sensor.
     """
-    plain = [Row(r.i, (r.j,), r.c) for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
-    known = {row.i for row in plain}
-    model = places.direct(model)
+    model, found = places.direct(model), list[Row]()
     dt = places.probe(model, SHORT)
     if dt > SHORT:
-        return plain
+        return found
     # rates that no input and no uncertain parameter changes, and that double with all velocities
     x, u = places.within_limits(model, 8)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
@@ -89,12 +87,12 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
             moved = (model.system.step(x, u, values, dt) - x) / dt
             fixed &= np.ptp(moved - rates, axis=0) < size
     fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
-    for i in shown:
+    for i in (i for i in shown if i < model.n):
         slope = np.abs(slopes[:, i]).max(axis=0)
         by = tuple(int(j) for j in np.flatnonzero(slope > SMALL * slope.max()))
-        if i not in known and i < model.n and fixed[i] and i not in by and {*by} <= {*shown}:
-            plain.append(Row(i, by))
-    return plain
+        if fixed[i] and i not in by and {*by} <= {*shown}:
+            found.append(Row(i, by))
+    return found
 
 
 def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:

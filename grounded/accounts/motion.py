@@ -163,15 +163,6 @@ class Ahead:
         found[self.shown] = off.std(axis=0)
         return found
 
-    def moved_by(self, j: int) -> float:
-        """Return the share of input j's effect that the initial states don't foretell."""
-        gains = np.vstack([np.ones(self.model.m), np.arange(self.model.m) != j])
-        with_it, without = self.missed(gains, self.model.values, 0)
-        by = with_it - without
-        own = by - self.left_out @ (self.left_out.T @ by)
-        size = float(((by - by.mean(axis=0)) ** 2 / self.least**2).sum())
-        return float(np.sqrt((own**2 / self.least**2).sum() / size)) if size > 0 else 0.0
-
     def whatever_commands_do(self) -> Ahead:
         """Return a copy that also removes errors linear in the past and present commands."""
         h, half = self.steps, max(1, self.steps // 2)

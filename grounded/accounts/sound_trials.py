@@ -139,6 +139,7 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
             yield Finding(names[k], text, "offset")
         else:
             kind = "degrees" if account.kind == "unit" else "sign"
+            kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
             yield put_right(names[k], text, kind, log, scale=account.factor)
 
 

@@ -141,12 +141,12 @@ def of_rows(
     for k in sorted(some):
         yield Account("sign", (k,), -1.0, price=0.0 if k in fast else 0.3)
         for unit, f in units_of(units[k]).items():
-            yield from _either(Account("unit", (k,), f, unit=unit))
+            yield from _either(Account("unit", (k,), f, unit=unit), model.n)
     for name in dict.fromkeys(units):
         same = tuple(k for k in sorted(every) if units[k] == name)
         if len(same) > 1 and name in ("m", "m/s") and some & {*same}:
             for unit, f in units_of(name).items():
-                yield from _either(Account("unit", same, f, unit=unit, price=0.5))
+                yield from _either(Account("unit", same, f, unit=unit, price=0.5), model.n)
     for pair in combinations(sorted(some), 2):
         yield Account("exchange", pairs=(pair,), price=1.0)
     for k in sorted(some):
@@ -164,12 +164,12 @@ def of_rows(
             yield Account("axes", (psi, *speeds), price=0.5)
 
 
-def _either(account: Account) -> Iterator[Account]:
+def _either(account: Account, states: int = 0) -> Iterator[Account]:
     """Yield a unit's account, and that of the opposite mistake, where powers of ten may be both."""
     yield account
     if account.factor in (1e3, 1e2, DEGREES):
         yield replace(account, factor=1 / account.factor, unit="", price=account.price + 0.5)
-    if account.factor == 1e3:
+    if account.factor == 1e3 and account.columns[0] < states:
         yield replace(account, factor=1e6, unit="", price=account.price + 1.0)
         yield replace(account, factor=1e-6, unit="", price=account.price + 1.5)
 
@@ -210,8 +210,10 @@ def of_motion(model: Model, shown: Sequence[int], trials: Sequence[Trial]) -> It
         )
         for group in dict.fromkeys((same, *((j,) for j in same))):
             for unit, f in units_of(name, most).items():
-                if name != "%" or most < OVER:
-                    yield Account("unit", group, f, unit=unit, price=0.3 * (group != same))
+                if name == "%" and most >= OVER:
+                    continue
+                account = Account("unit", group, f, unit=unit, price=0.3 * (group != same))
+                yield from _either(account) if f >= DEGREES and name != "1" else (account,)
     # signs: of a position with its velocity, of a state that no other relates
     for group in sorted((*pairs, *alone)):
         yield Account("sign", group, -1.0, price=0.5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.accounts.judge import Told
+from grounded.accounts.kinematics import turned
 from grounded.accounts.table import DEGREES, Account
 from grounded.model import Model
 from grounded.result import listed, with_unit
@@ -64,8 +65,8 @@ def _said(model: Model, told: Told, account: Account, *, robot: bool = False) ->
     if account.kind == "axes":
         psi, *speeds = names_of(model, account.columns)
         return (
-            f"{listed(speeds)} are in the axes of the positions, not in body axes, into which the "
-            f"model rotates them by {psi}"
+            f"{listed(speeds)} are in the axes of {listed(_plane(model))}, not in body axes, into "
+            f"which the model rotates them by {psi}"
         )
     if account.kind == "pace":
         how = "in milliseconds" if account.factor < 1 else "taken for milliseconds"
@@ -77,6 +78,11 @@ def _said(model: Model, told: Told, account: Account, *, robot: bool = False) ->
     unit = WORDS.get(account.unit, account.unit)
     unit = f" (in {unit}?)" * bool(unit)
     return f"{names} look{'s' * one} {size:.4g} times too {'large' if large else 'small'}{unit}"
+
+
+def _plane(model: Model) -> list[str]:
+    plane = turned(model)
+    return names_of(model, (plane.i, plane.j)) if plane else []
 
 
 def _evidence(model: Model, told: Told) -> str:

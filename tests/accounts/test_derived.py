@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Trial, diagnose
 from grounded.accounts.finding import (
@@ -13,6 +12,7 @@ from grounded.accounts.finding import (
     late_effects,
     put_right,
 )
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
@@ -162,8 +162,3 @@ def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted
     assert both["sensor_delay:v"]["d"] == pytest.approx(0.05)
     (line,) = instrument_lines([own, *seen, late])
     assert "0.02 s later" in line and "mean over" in line and "another 0.03 s" in line
-
-
-def test_a_rate_is_in_degrees_a_second():
-    assert in_degrees("w", "rad/s").finding == "is in degrees a second, not in rad/s"
-    assert in_degrees("q", "rad").finding == "is in degrees, not in rad"

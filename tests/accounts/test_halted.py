@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Trial
 from grounded.accounts.halted import halted
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded_trials import Workspace
 from tests.workspace.intake.recognising.test_mistaken_logs import CONFIG, MODEL, TARGET
 from workspaces import make

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from grounded import Model, Param
 from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.models.car import model as CAR
@@ -288,9 +288,7 @@ def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
 @pytest.mark.parametrize("alone", [0, 1])
 def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypatch):
     """Half of its delay is left along and across; noise may hide that, each by itself tells."""
-    monkeypatch.setattr(
-        "grounded.instruments.kinematics.late_position._left", lambda *_, **__: [(0.0, 0.0)]
-    )
+    monkeypatch.setattr("grounded.accounts.ages._left", lambda *_, **__: [(0.0, 0.0)])
     assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
     found = preflight(BOAT, logged(BOAT, positions_late(0.15, (alone,))))
     assert not delayed(found.findings)
@@ -300,7 +298,7 @@ def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypa
 def test_a_delay_that_a_constant_drift_makes_as_well_is_none(monkeypatch):
     """A blind case: a car that drifted by 0.3 m/s along its way was given sensors 57 ms late."""
     found = {False: (0.0, 0.013), True: (0.03, 0.013)}  # [s], after the shift and before it
-    name = "grounded.instruments.kinematics.late_position._left"
+    name = "grounded.accounts.ages._left"
     monkeypatch.setattr(name, lambda ways, steps, *_, **__: [found[steps == 0]])
     assert not delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
     found[True] = (0.15, 0.013)
@@ -345,7 +343,7 @@ def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
     def left(ways, steps, dt, *, apart):
         return [(0.033 * (steps == 0), 0.006)] if not apart else late_along_and_across
 
-    monkeypatch.setattr("grounded.instruments.kinematics.late_position._left", left)
+    monkeypatch.setattr("grounded.accounts.ages._left", left)
     rng, t = np.random.default_rng(5), np.arange(200) * 0.05
     u = np.column_stack([0.6 * np.sin(t), 0.6 + 0.25 * np.sin(0.5 * t)])
     x = [np.zeros(6)]

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 from scipy.ndimage import gaussian_filter1d
 
 from grounded import Model, Param
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
 from grounded.effects.family import Scales

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from facts import holding
 from grounded.accounts.lag import alike
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError
 from grounded.fit import fit

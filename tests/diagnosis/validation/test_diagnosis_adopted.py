@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from cli import grounded
 from grounded import Model, Trial
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.search import HypothesisSearch

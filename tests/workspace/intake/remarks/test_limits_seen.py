@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded.accounts.sound_trials import sound_trials as preflight
 
 from cli import grounded
 from facts import holds
 from grounded.accounts.inputs import beyond_limits
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
