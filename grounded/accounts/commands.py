@@ -257,16 +257,19 @@ def _left(ahead: Ahead, own: Array, j: int, share: float | None) -> tuple[float,
 
 def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
     """Return how an input acts, if predictions of all lengths agree on it."""
-    if not each or not np.isfinite(each[0][0]).all():
+    known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
+    if not known:
         return UNKNOWN
-    # over the shortest length it must lead, over longer ones do better than its reverse
-    (nats, share), *longer = each
+    # over the length that tells most it must lead, over the others do better than its reverse
+    leads = [
+        float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]
+    ]
+    nats, share = known[int(np.argmax(leads))]
     way = int(nats.argmin())
-    lead = float(np.delete(nats, way).min() - nats[way])
-    agree = [n[2 - way] - n[way] > HINT for n, _ in longer if np.isfinite(n).all()]
+    agree = [float(one[2 - way] - one[way]) for one, _ in known]
+    reversal = way == 2 and (len(known) < 2 or min(agree) < HINT)
     sized = SHARES[0] < (1 - way) * share < SHARES[1]
-    unsure = way != 0 and not agree  # a reversal must show over both lengths, or plainly
-    clear = way != 1 and lead > HINT * (1 + unsure) and all(agree)
+    clear = way != 1 and max(leads) > HINT and min(agree) > 0 and not reversal
     return Acts(1 - way if clear and sized else 0, float(share))
 
 
