@@ -36,7 +36,7 @@ from grounded.trial import Trial
 BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
 BETTER = 3.0  # factor by which a bad row's share must fall
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
-OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
+OF_A_UNIT, GROSSLY, OF_TEN = 0.02, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
 NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
@@ -242,7 +242,8 @@ def _best(
             continue
         entered = [r for r in before if r.states & account.touched or account.kind == "pace"]
         after = _pooled([gaps(model, one, entered) for one in mended])
-        if all(_agrees(row, before, after, account) for row in entered):
+        agree = all(_agrees(row, before, after) for row in entered)
+        if agree and _of_this_size(account, after):
             gained = sum(_nats(after[row].share) - _nats(before[row].share) for row in entered)
             cost[account] = gained + account.price + _strange(account, mended[0], usual)
     if not cost:
@@ -299,19 +300,20 @@ def _fitted(
     return account, mended
 
 
-def _agrees(
-    row: Row, before: Mapping[Row, Gap], after: Mapping[Row, Gap], account: Account
-) -> bool:
+def _agrees(row: Row, before: Mapping[Row, Gap], after: Mapping[Row, Gap]) -> bool:
     """Check whether a row that an account touches is mended, or stays good."""
     if row not in after:
         return False
     bad, left = before[row].share > BAD, after[row].share
     most = min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
-    if not left < most:
-        return False
+    return bool(left < most)
+
+
+def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
+    """Check whether each row is right in size, where an account names a unit."""
     gross = abs(np.log(abs(account.factor))) > np.log(GROSSLY)
-    off = abs(np.log(max(after[row].ratio, 1e-9)))
-    return account.kind != "unit" or off < (OF_TEN if gross else OF_A_UNIT)
+    off = [abs(np.log(max(gap.ratio, 1e-9))) for gap in after.values()]
+    return account.kind != "unit" or bool(max(off) < (OF_TEN if gross else OF_A_UNIT))
 
 
 def _strange(account: Account, mended: Trial, usual: Array | None) -> float:

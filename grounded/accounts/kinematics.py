@@ -123,7 +123,7 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
         each = per_step(model, trial, some)
         moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
         longest = max((len(x) for x in moved), default=0)
-        steps = max(1, min(round(STRETCH / trial.dt), longest // LEAST))
+        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // LEAST))
         while usable := [k for k, x in enumerate(moved) if len(x) > LEAST * steps]:
             far, told = (
                 np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable])
@@ -280,7 +280,7 @@ def dead(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[in
             said = np.concatenate([[0.0], np.cumsum(one.c * piece[:-1, 1] * trial.dt)])
             a, b = (s[k:] - s[:-k] for s in (way, said))
             noise = float(white_noise(way[:, None])[0])
-            if a.std() < 3 * noise or np.ptp(way) < 20 * noise:
+            if not (a.std() > 3 * noise and np.ptp(way) > 20 * noise):
                 continue
             late = round(0.5 / trial.dt)
             if b.std() > QUIET * a.std() or _alike(a, b, late) > SHAPE:

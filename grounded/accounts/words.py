@@ -163,5 +163,5 @@ def mend(model: Model, told: Told) -> str:
             "or in the model, if the log is right"
         )
     also = ", and [limits] if they were taken from the log" * (account.columns[0] >= model.n)
-    by = f"{1 / account.factor:.6g}"
+    by = f"{1 / account.factor:.8g}"
     return f"Multiply the scale in {tables} by {by} (a missing scale is 1){also}"

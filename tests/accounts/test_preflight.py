@@ -313,7 +313,7 @@ def test_a_velocity_that_shows_nothing_in_one_log_becomes_missing_there():
 
 
 def test_a_velocity_that_no_log_shows_stops_the_diagnosis():
-    with pytest.raises(GroundedError, match=r"w stays at 0\.25 .*\[log\.state\.w\]"):
+    with pytest.raises(GroundedError, match=r"w .*0\.25 .*\[log\.state\.w\]"):
         preflight(ARM, arm(dead))
 
 
@@ -325,7 +325,7 @@ def of_another_axis(x):
 
 def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
     """Seen: a damping of 1e136 1/s explained it."""
-    with pytest.raises(GroundedError, match=r"w shows only noise .*\[log\.state\.w\]"):
+    with pytest.raises(GroundedError, match=r"w shows .*noise .*\[log\.state\.w\]"):
         preflight(ARM, arm(of_another_axis))
     trials = arm()
     trials[1] = replace(trials[1], states=of_another_axis(trials[1].states))

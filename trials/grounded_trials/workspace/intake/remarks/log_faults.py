@@ -7,12 +7,14 @@ correction, in [log] or in the program that wrote the trial, or on the robot.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.model import Model
+from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import ranges
@@ -129,7 +131,7 @@ def _fault(workspace: Folder, known: Trial, told: Told) -> Fault:
     else:
         said, how = clause(model, told, log=False), mend(model, told)
     sent = tuple(n for n in names_of(model, account.columns) if n in model.inputs)
-    should = "write it in the model's unit" * (account.kind == "unit")
+    should = f"write {_units(model, names_of(model, account.columns))}" * (account.kind == "unit")
     return Fault(said, how, should, sent, abs(account.factor), kind=account.kind)
 
 
@@ -244,3 +246,9 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
         return []
     mend = early.mend([model.state_names[i] for i in shown])
     return [Fault(early.said(model), mend, "stamp both by one clock", kind="clock")]
+
+
+def _units(model: Model, names: Sequence[str]) -> str:
+    """Return the model's units of some columns."""
+    every = {**model.states, **model.inputs}
+    return listed(dict.fromkeys(every[name] for name in names))
