@@ -36,7 +36,7 @@ from grounded.trial import Trial
 BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
 BETTER = 3.0  # factor by which a bad row's share must fall
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
-OF_A_UNIT, GROSSLY, OF_TEN = 0.02, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
+OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
 NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
@@ -310,10 +310,12 @@ def _agrees(row: Row, before: Mapping[Row, Gap], after: Mapping[Row, Gap]) -> bo
 
 
 def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
-    """Check whether each row is right in size, where an account names a unit."""
+    """Check whether all rows together are right in size, where an account names a unit."""
     gross = abs(np.log(abs(account.factor))) > np.log(GROSSLY)
-    off = [abs(np.log(max(gap.ratio, 1e-9))) for gap in after.values()]
-    return account.kind != "unit" or bool(max(off) < (OF_TEN if gross else OF_A_UNIT))
+    power = sum(gap.power for gap in after.values())
+    ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
+    off = abs(np.log(max(ratio, 1e-9)))
+    return account.kind != "unit" or bool(off < (OF_TEN if gross else OF_A_UNIT))
 
 
 def _strange(account: Account, mended: Trial, usual: Array | None) -> float:
@@ -351,7 +353,7 @@ def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
 
 
 def _numbers(gap: Gap) -> tuple[float, ...]:
-    return gap.share, gap.varying, gap.rate, gap.ratio
+    return gap.share, gap.varying, gap.rate, gap.ratio, gap.power
 
 
 # --- by motion ------------------------------------------------------------------------------------

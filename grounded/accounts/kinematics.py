@@ -25,6 +25,7 @@ STRETCH = 0.3  # [s] shortest stretch
 LEAST = 8  # stretches that a trial must hold
 NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
 SMALL = 1e-4  # of a rate, or of its largest derivative: treated as zero
+STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
 DEGREES = 180 / np.pi
 QUIET, SHAPE = 0.1, 0.5  # of a dead rate: its share of the motion, and correlation with it
 WINDOWS = 40  # windows of a piece over which a rate is sought dead
@@ -52,13 +53,15 @@ class Gap:
         share: rms of the difference, relative to how far the state (or others of its unit) moves.
         varying: the same without a constant difference.
         rate: rms of the difference per time [unit/s].
-        ratio: measured displacement over the predicted one, by regression.
+        ratio: measured displacement over the predicted one, by regression beside a drift.
+        power: variance of the predicted displacement, which weighs the ratio.
     """
 
     share: float
     varying: float
     rate: float
     ratio: float
+    power: float
 
 
 def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
@@ -151,13 +154,16 @@ def _over(
     """
     units = list(model.states.values())
     moved, said, off = _size(far), _size(told), _size(far - told)
-    varying, both = np.std(far - told, axis=0), (far * told).mean(axis=0)
+    varying, power = np.std(far - told, axis=0), told.var(axis=0)
+    steady = power < STEADY * said**2  # at a constant velocity a drift is no drift
+    power = np.where(steady, said**2, power)
+    both = (far * (told - ~steady * told.mean(axis=0))).mean(axis=0)
     for row in rows:
         i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
         size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))
         if size > 0 and noise[i] < NOISE * size:
-            ratio = float(both[i] / max(said[i] ** 2, 1e-300))
-            yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio)
+            ratio = float(both[i] / max(power[i], 1e-300))
+            yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio, power[i])
 
 
 def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:

@@ -183,7 +183,7 @@ def test_speeds_and_positions_in_another_unit_are_named_with_their_scale(unit, f
         assert not any(other in str(stopped.value) for other in others)
 
 
-@pytest.mark.parametrize("factor", [0.7, 1.08, 1.3, 1.88, 2.05, 2.4, 3.0, 3.45, 1 / 1.943844])
+@pytest.mark.parametrize("factor", [0.7, 1.08, 1.3, 2.05, 2.4, 3.0, 3.45, 1 / 1.943844])
 def test_a_slip_or_a_scale_of_another_size_is_no_unit(factor):
     for trial in logged(times(factor, "u", "v"), 4):
         assert not {f.kind for f in preflight(BOAT, [trial]).findings} - {"mismatch"}
