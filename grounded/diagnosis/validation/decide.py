@@ -145,7 +145,27 @@ class Options:
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
                 self.fits[own] = fit
+        # what a set is without the causes that a guard refuses may be likely, too
+        for own in list(self.fits):
+            rest: frozenset[str] | None = own
+            for cause in self.option(own).refused:
+                rest = None if rest is None else self._fitted_without(rest, cause)
         return [self.option(own) for own in list(self.fits)]
+
+    def _fitted_without(self, causes_: frozenset[str], cause: str) -> frozenset[str] | None:
+        """Fit a set without one cause, if it was not; return its causes, None if that fails."""
+        own, fit, search = causes_ - {cause}, self.fits[causes_], self.search
+        if own not in self.fits:
+            h = fit.hypothesis
+            free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
+            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not any(f.noise.structure == fit.noise.structure for f in same):
+                search.refined([(free, fit.noise, fit.track)], REFIT)
+                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not same:
+                return None
+            self.fits[own] = max(same, key=search.score)
+        return own
 
     def option(self, own: frozenset[str]) -> Option:
         """Return a set of causes as an option, with those that a guard refuses."""
@@ -196,17 +216,10 @@ class Options:
         taken is the likeliest under any noise: a cause gets no credit for what the rest can do
         under another noise. None if that can't be filtered, or if a guard refuses the cause.
         """
-        own, fit, search = option.causes - {cause}, self.fits[option.causes], self.search
-        if own not in self.fits:
-            h = fit.hypothesis
-            free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
-            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not any(f.noise.structure == fit.noise.structure for f in same):
-                search.refined([(free, fit.noise, fit.track)], REFIT)
-                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not same:
-                return None
-            self.fits[own] = max(same, key=search.score)
+        fit, search = self.fits[option.causes], self.search
+        own = self._fitted_without(option.causes, cause)
+        if own is None:
+            return None
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
         loose = cause != CALIBRATION and one_group(search, fit, less, cause)
