@@ -131,6 +131,7 @@ class Options:
         self.search, self.ruler = search, ruler
         self.fits: dict[frozenset[str], Fitted] = {frozenset(): search.exact_null()}
         self._known: dict[frozenset[str], Option] = {}
+        self._sizeless: dict[frozenset[str], list[str]] = {}
 
     def hopeful(self) -> list[Option]:
         """Return the likeliest sets of each size, with and without free parameters."""
@@ -142,14 +143,11 @@ class Options:
             )
             if not np.isfinite(self.search.score(fit)) or own in self.fits:
                 continue
+            if no_limits(self.search.data, h):  # the log refutes it, whatever its evidence
+                continue
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
                 self.fits[own] = fit
-        # what a set is without the causes that a guard refuses may be likely, too
-        for own in list(self.fits):
-            rest: frozenset[str] | None = own
-            for cause in self.option(own).refused:
-                rest = None if rest is None else self._fitted_without(rest, cause)
         return [self.option(own) for own in list(self.fits)]
 
     def _fitted_without(self, causes_: frozenset[str], cause: str) -> frozenset[str] | None:
@@ -168,23 +166,27 @@ class Options:
         return own
 
     def option(self, own: frozenset[str]) -> Option:
-        """Return a set of causes as an option, with those that a guard refuses."""
+        """Return a set of causes as an option."""
         if own not in self._known:
             fit, search = self.fits[own], self.search
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            refused = {*self._of_no_size(fit, self.alone(fit)[0])}
-            refused |= {*no_limits(search.data, fit.hypothesis)}
-            errors, score = self.ruler.errors(fit), search.score(fit)
-            self._known[own] = Option(own, score, errors, order, frozenset(refused))
+            self._known[own] = Option(own, search.score(fit), self.ruler.errors(fit), order)
         return self._known[own]
 
     def alone(self, fit: Fitted) -> tuple[Array, Array]:
         """Return the standard deviations and half-widths of a fit's values, by that fit alone."""
         data, worth = self.search.data, self.search.tempering.factor
         return standard_deviations(self.search.predictor, fit, data.folds, worth)
+
+    def _vague(self, own: frozenset[str]) -> list[str]:
+        """Return the effects of a set that have no size by its own fit."""
+        if own not in self._sizeless:
+            fit = self.fits[own]
+            self._sizeless[own] = self._of_no_size(fit, self.alone(fit)[0])
+        return self._sizeless[own]
 
     def vague(self, option: Option) -> list[str]:
         """Return the effects without a size if all likely fits of the same effects are asked."""
@@ -218,7 +220,7 @@ class Options:
         """
         fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
-        if own is None:
+        if own is None or cause in self._vague(option.causes):
             return None
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
