@@ -143,7 +143,7 @@ class Options:
             )
             if not np.isfinite(self.search.score(fit)) or own in self.fits:
                 continue
-            if no_limits(self.search.data, h):  # the log refutes it, whatever its evidence
+            if no_limits(self.search.data, fit.hypothesis):  # the log refutes it, whatever its evidence
                 continue
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
