@@ -137,14 +137,12 @@ class Options:
         """Return the likeliest sets of each size, with and without free parameters."""
         count = dict[tuple[int, bool], int]()
         for fit in sorted(self.search.fits.values(), key=self.search.score, reverse=True):
-            own, kind = (
-                frozenset(causes(fit)),
-                (len(fit.hypothesis.names), fit.hypothesis.spread > 0),
-            )
+            own, h = frozenset(causes(fit)), fit.hypothesis
             if not np.isfinite(self.search.score(fit)) or own in self.fits:
                 continue
-            if no_limits(self.search.data, fit.hypothesis):  # the log refutes it, whatever its evidence
+            if no_limits(self.search.data, h):  # the log refutes it, whatever its evidence
                 continue
+            kind = len(h.names), h.spread > 0
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
                 self.fits[own] = fit
