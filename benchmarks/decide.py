@@ -50,7 +50,7 @@ def fitted(case):
     known = {one.causes: one for one in options.hopeful()}
     less = {}
     for one in list(known.values()):
-        for cause in one.causes - one.refused:
+        for cause in one.causes:
             if (rest := options.less(one, cause)) is not None:
                 less[one.causes, cause] = rest
     label = of_crude(case.label, case.model)

@@ -237,6 +237,8 @@ def _run() -> tuple[int, str]:
     except SystemExit as error:
         if sys.stdout not in (stdout, sys.stderr):  # click found a closed pipe
             raise BrokenPipeError from None
+        if "_GROUNDED_COMPLETE" in os.environ:  # click ends the program once it has completed words
+            raise
         return 1, f"error: something that grounded called ended the program ({error.code})"
     except Exception as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class

@@ -239,8 +239,8 @@ def diagnose(
                 again = decision.gap and leader and leader not in left_out and not left_out
                 if again:
                     left_out.add(leader)
-                    regrown(search, leader, most)
-                elif most < limit:
+                    regrown(search, leader, max(len(before.hypothesis.names), PAIR))
+                elif most < limit and (options.max_effects or len(before.hypothesis.names) >= most):
                     most += 1
                     grown(search, search.chosen(most), most)
                 else:
@@ -284,6 +284,7 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
     return delay_again(effect, known, float(late.min()))
 
 
+PAIR = 2  # effects at least that are sought without the leader
 MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
 # The least share of a diagnosis that was done when it scanned for the k-th time or reached a stage,
 # in nine blind cases of four systems (7 s in the mean).

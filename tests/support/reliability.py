@@ -228,6 +228,7 @@ def concurrent(processes: int = 24, contents: int = 12) -> Outcome:
 
 ADD = """
 import os, sys
+import filelock  # before the user changes, who may read no library
 from grounded.errors import GroundedError
 from grounded_trials.store.store import Store
 if len(sys.argv) > 3:

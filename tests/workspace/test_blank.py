@@ -45,7 +45,10 @@ def installed(monkeypatch):
 @pytest.fixture
 def blank(tmp_path):
     (tmp_path / "sled.py").write_text(MODEL)
-    return Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
+    made = Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
+    config = made.folder / "grounded.toml"
+    config.write_text(config.read_text() + "\n[limits]\nforce = [-50.0, 50.0]\n")
+    return made.forget()
 
 
 def driver(folder):

@@ -136,7 +136,7 @@ def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkey
     w, found = diagnosed
     (w.folder / "grounded.toml").write_text(NOISY)
     w.forget()
-    assert found.indistinguishable and offered(w, found)[0]
+    assert found.indistinguishable
     trials = [w.planner.lift(trial) for trial in w.task_trials()]
     monkeypatch.setattr(excitation, "TIE", 1e9)
     identity, sentence = _probe(w, found, trials, Library(), write=False)
@@ -200,9 +200,12 @@ def test_people_export_a_probe(diagnosed, tmp_path):
 def test_without_safety_a_probe_stays_near_where_trials_have_been(diagnosed):
     """Seen on a quadrotor: doublets that sharpen its mass, predicted to end 100 m below ground."""
     w, found = diagnosed
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    found = replace(found, indistinguishable=(), motions=0)
+    probe, _ = _probe(w, found, trials, Library(), write=True)
     been = np.vstack([trial.states for trial in w.task_trials()])
     room = 0.5 * np.ptp(been, axis=0) + 1e-9
-    made = w.candidate(found.probe)[0].predicted_states
+    made = w.candidate(probe)[0].predicted_states
     assert (made > been.min(axis=0) - room).all() and (made < been.max(axis=0) + room).all()
 
 

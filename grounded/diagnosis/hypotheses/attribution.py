@@ -297,9 +297,8 @@ def regrown(search: HypothesisSearch, leader: str, most: int) -> None:
     left: each further effect fits what that one leaves.
     """
     other = search.lacking(leader)
-    singles = other.of_size(1)
-    if singles:
-        grown(other, _explore(other, 1), most)
+    if singles := other.of_size(1):
+        grown(other, singles[0], most)
         search.keep(list(other.fits.values()))
 
 

@@ -41,14 +41,12 @@ class Option:
         evidence: log evidence, priced and tempered [nats].
         errors: held-out errors.
         order: of its causes: 0 a parameter, 1 a mechanism, 2 without a mechanism, summed up.
-        refused: causes that a guard refuses, whatever they gain.
     """
 
     causes: frozenset[str]
     evidence: float
     errors: Errors
     order: int = 0
-    refused: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,8 @@ class Rule:
     Args:
         options: the fitted sets, of each at most one, with the set without any cause.
         gain: compares the errors of two options.
-        less: returns a set without one cause, fitted if it was not; None if it can't be.
+        less: returns a set without one cause, fitted if it was not; None if it can't be, or if a
+            guard refuses the cause.
         held_out: False if nothing could be held out; then evidence alone decides.
     """
 
@@ -120,8 +119,6 @@ class Rule:
 
     def _needed(self, option: Option, cause: str) -> bool:
         """Check whether a set is likelier and predicts better with one of its causes."""
-        if cause in option.refused:
-            return False
         less = self.less(option, cause)
         if less is None or option.evidence - less.evidence < CLAIM:
             return False

@@ -131,40 +131,60 @@ class Options:
         self.search, self.ruler = search, ruler
         self.fits: dict[frozenset[str], Fitted] = {frozenset(): search.exact_null()}
         self._known: dict[frozenset[str], Option] = {}
+        self._sizeless: dict[frozenset[str], list[str]] = {}
 
     def hopeful(self) -> list[Option]:
         """Return the likeliest sets of each size, with and without free parameters."""
         count = dict[tuple[int, bool], int]()
         for fit in sorted(self.search.fits.values(), key=self.search.score, reverse=True):
-            own, kind = (
-                frozenset(causes(fit)),
-                (len(fit.hypothesis.names), fit.hypothesis.spread > 0),
-            )
+            own, h = frozenset(causes(fit)), fit.hypothesis
             if not np.isfinite(self.search.score(fit)) or own in self.fits:
                 continue
+            if no_limits(self.search.data, h):  # the log refutes it, whatever its evidence
+                continue
+            kind = len(h.names), h.spread > 0
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
                 self.fits[own] = fit
         return [self.option(own) for own in list(self.fits)]
 
+    def _fitted_without(self, causes_: frozenset[str], cause: str) -> frozenset[str] | None:
+        """Fit a set without one cause, if it was not; return its causes, None if that fails."""
+        own, fit, search = causes_ - {cause}, self.fits[causes_], self.search
+        if own not in self.fits:
+            h = fit.hypothesis
+            free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
+            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not any(f.noise.structure == fit.noise.structure for f in same):
+                search.refined([(free, fit.noise, fit.track)], REFIT)
+                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
+            if not same:
+                return None
+            self.fits[own] = max(same, key=search.score)
+        return own
+
     def option(self, own: frozenset[str]) -> Option:
-        """Return a set of causes as an option, with those that a guard refuses."""
+        """Return a set of causes as an option."""
         if own not in self._known:
             fit, search = self.fits[own], self.search
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            refused = {*self._of_no_size(fit, self.alone(fit)[0])}
-            refused |= {*no_limits(search.data, fit.hypothesis)}
-            errors, score = self.ruler.errors(fit), search.score(fit)
-            self._known[own] = Option(own, score, errors, order, frozenset(refused))
+            self._known[own] = Option(own, search.score(fit), self.ruler.errors(fit), order)
         return self._known[own]
 
     def alone(self, fit: Fitted) -> tuple[Array, Array]:
         """Return the standard deviations and half-widths of a fit's values, by that fit alone."""
         data, worth = self.search.data, self.search.tempering.factor
         return standard_deviations(self.search.predictor, fit, data.folds, worth)
+
+    def _vague(self, own: frozenset[str]) -> list[str]:
+        """Return the effects of a set that have no size by its own fit."""
+        if own not in self._sizeless:
+            fit = self.fits[own]
+            self._sizeless[own] = self._of_no_size(fit, self.alone(fit)[0])
+        return self._sizeless[own]
 
     def vague(self, option: Option) -> list[str]:
         """Return the effects without a size if all likely fits of the same effects are asked."""
@@ -196,17 +216,10 @@ class Options:
         taken is the likeliest under any noise: a cause gets no credit for what the rest can do
         under another noise. None if that can't be filtered, or if a guard refuses the cause.
         """
-        own, fit, search = option.causes - {cause}, self.fits[option.causes], self.search
-        if own not in self.fits:
-            h = fit.hypothesis
-            free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
-            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not any(f.noise.structure == fit.noise.structure for f in same):
-                search.refined([(free, fit.noise, fit.track)], REFIT)
-                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not same:
-                return None
-            self.fits[own] = max(same, key=search.score)
+        fit, search = self.fits[option.causes], self.search
+        own = self._fitted_without(option.causes, cause)
+        if own is None or cause in self._vague(option.causes):
+            return None
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
         loose = cause != CALIBRATION and one_group(search, fit, less, cause)

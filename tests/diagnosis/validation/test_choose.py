@@ -10,12 +10,12 @@ TRIALS = 6
 COMPARE = Comparison([0], np.full((2, 1), 1e-6), np.arange(TRIALS))
 
 
-def option(causes, nats, rms, order=0, refused=(), scatter=0.0):
+def option(causes, nats, rms, order=0, scatter=0.0):
     """A set of causes with an rms error, of each trial or differing by `scatter` of it."""
     apart = 1 + scatter * np.cos(np.arange(TRIALS) * 2.5)
     total = np.tile((np.array(rms) * apart) ** 2, (2, 1))[..., None]
     errors = Errors(total, np.ones_like(total))
-    return Option(frozenset(causes.split()), nats, errors, order, frozenset(refused))
+    return Option(frozenset(causes.split()), nats, errors, order)
 
 
 def chosen(*options, held_out=True):
@@ -39,7 +39,6 @@ DRAG, BIAS = option("drag", 80.0, 0.3), option("bias", 30.0, 0.8)
         ([NONE, option("drag", 2.0, 0.3)], ""),  # predicts well by chance
         ([NONE, option("drag", 80.0, 1.0)], ""),  # likely, and of no use
         ([NONE, option("drag", 80.0, [0.1, 1, 1, 1, 1, 1])], ""),  # in one trial only
-        ([NONE, option("drag", 80.0, 0.3, refused=["drag"])], ""),
         ([NONE, DRAG, BIAS, option("bias drag", 110.0, 0.1)], "bias drag"),
         ([NONE, DRAG, BIAS, option("bias drag", 81.0, 0.1)], "drag"),  # one is not needed
         ([NONE, DRAG, BIAS, option("bias drag", 110.0, 0.299)], "drag"),  # as good without
