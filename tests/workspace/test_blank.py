@@ -45,10 +45,16 @@ def installed(monkeypatch):
 @pytest.fixture
 def blank(tmp_path):
     (tmp_path / "sled.py").write_text(MODEL)
-    made = Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
-    config = made.folder / "grounded.toml"
-    config.write_text(config.read_text() + "\n[limits]\nforce = [-50.0, 50.0]\n")
-    return made.forget()
+    return Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
+
+
+def limited(workspace):
+    """State a limit of the input, without which nothing is handed to a robot."""
+    config = workspace.folder / "grounded.toml"
+    text, stated = config.read_text(), "force = [-50.0, 50.0]"
+    config.write_text(re.sub(r"(?m)^(\[limits\].*)$", rf"\1\n{stated}", text))
+    workspace.forget()
+    return workspace
 
 
 def driver(folder):
@@ -59,7 +65,7 @@ def driver(folder):
 
 
 def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(blank, tmp_path, monkeypatch):
-    proposed = blank.propose()
+    proposed = limited(blank).propose()
     drive = driver(blank.folder)
     state, sent = np.array([0.0, 0.0]), []  # target.csv says where it starts
     monkeypatch.setattr(drive.time, "sleep", lambda seconds: None)
@@ -322,7 +328,7 @@ def test_what_is_missing_in_the_robots_program_is_named(blank):
 
 
 def test_a_candidate_as_proposed_runs_like_its_export(blank, tmp_path):
-    candidate = blank.propose()
+    candidate = limited(blank).propose()
     as_proposed = load(candidate.file, states=("x", "v"), inputs=("force",))
     as_exported = load(blank.export("c0001", tmp_path / "c0001.npz").file)
     for t, s in ((0.0, [1.0, 0.2]), (0.05, [0.9, 0.1]), (99.0, [0.0, 0.0])):
