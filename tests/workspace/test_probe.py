@@ -131,21 +131,6 @@ def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
     )
 
 
-def test_a_trial_that_hardly_tells_a_tie_apart_is_not_run_next(diagnosed, monkeypatch):
-    """A trial that was to bring 0.1 nats was what `next:` named."""
-    w, found = diagnosed
-    (w.folder / "grounded.toml").write_text(NOISY)
-    w.forget()
-    found = replace(found, indistinguishable=(("parameter:mass", "slew_limit:v"),))
-    trials = [w.planner.lift(trial) for trial in w.task_trials()]
-    monkeypatch.setattr(excitation, "TIE", 1e9)
-    identity, sentence = _probe(w, found, trials, Library(), write=False)
-    assert identity == "" and re.search(
-        r"informative enough: the most informative, .*, is expected", sentence
-    )
-    assert offered(w, found)[0]  # who asks for it
-
-
 def test_where_no_run_tells_a_tie_apart_the_claimed_effect_is_to_be_adopted(diagnosed, monkeypatch):
     """ "No probe can distinguish ..." stood under "Next trial", and nothing followed."""
     w, found = diagnosed

@@ -120,7 +120,7 @@ class Rule:
     def _needed(self, option: Option, cause: str) -> bool:
         """Check whether a set is likelier and predicts better with one of its causes."""
         less = self.less(option, cause)
-        if less is None or option.evidence - less.evidence < CLAIM:
+        if less is None or not option.evidence - less.evidence >= CLAIM:  # also of no evidence
             return False
         more = self.gain(less.errors, option.errors)
         matters = more.mean >= SHARE * max(self.gained(option), 0.0)

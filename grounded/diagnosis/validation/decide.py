@@ -140,13 +140,21 @@ class Options:
             own, h = frozenset(causes(fit)), fit.hypothesis
             if not np.isfinite(self.search.score(fit)) or own in self.fits:
                 continue
-            if no_limits(self.search.data, h):  # the log refutes it, whatever its evidence
-                continue
             kind = len(h.names), h.spread > 0
             count[kind] = count.get(kind, 0) + 1
             if count[kind] <= MEASURED:
                 self.fits[own] = fit
-        return [self.option(own) for own in list(self.fits)]
+        # the likeliest without what the log refutes, and with exact parameters
+        for own in [own for own in self.fits if own]:
+            rest: frozenset[str] | None = own
+            for cause in self._refuted(own):
+                rest = self._fitted_without(rest, cause) if rest else None
+            if rest and CALIBRATION in rest:
+                self._fitted_without(rest, CALIBRATION)
+        return [self.option(own) for own in list(self.fits) if not self._refuted(own)]
+
+    def _refuted(self, own: frozenset[str]) -> list[str]:
+        return no_limits(self.search.data, self.fits[own].hypothesis)
 
     def _fitted_without(self, causes_: frozenset[str], cause: str) -> frozenset[str] | None:
         """Fit a set without one cause, if it was not; return its causes, None if that fails."""
