@@ -199,8 +199,10 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
     if str(data.get("format", "")) != FORMAT:
         raise ValueError(f"{path} is not a candidate exported by `grounded export --format npz`")
     try:
-        found: dict[str, Any] = {name: np.array(data[name], float) for name in NUMBERS}
-        found.update({name: np.array(data[name], float) for name in FEEDBACK if name in data})
+        present = [name for name in (*NUMBERS, *FEEDBACK) if name in NUMBERS or name in data]
+        if any(np.iscomplexobj(data[name]) for name in present):
+            raise ValueError("complex numbers")
+        found: dict[str, Any] = {name: np.array(data[name], float) for name in present}
         found["dt"] = float(data["dt"])
         for name, kind in (("state_names", str), ("input_names", str), ("depths", int)):
             found[name] = tuple(map(kind, data[name]))

@@ -24,6 +24,8 @@ from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
 from small_tasks import pushed_cart
 
+worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
+
 
 def axis(gain):
     return Model(
@@ -63,6 +65,7 @@ def task(model, steps=200):
     )
 
 
+@worse
 @pytest.mark.slow
 def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     """A gain of 1.0 that is 1.5: adopted as 1.502, its last 0.13 % are above the noise."""
