@@ -322,8 +322,8 @@ def _array(archive: ZipFile, part: Any, kinds: str, most: int) -> Any:
         count = 1
         for side in shape:
             count *= side
-        if count > most or (count and dtype.kind not in kinds):
-            raise ValueError(f"{part.filename} has {count} values of type {dtype}")
+        if max(count, *shape, 0) > most or (count and dtype.kind not in kinds):
+            raise ValueError(f"{part.filename} has the shape {shape} and type {dtype}")
         data = stream.read(part.file_size)  # to its end, so that the checksum is compared
     return np.ndarray(shape, dtype, data, order="F" if fortran else "C")
 

@@ -26,9 +26,9 @@ from grounded_cli.console.workspace_option import in_workspace, next_line, open_
 from grounded_trials.wording import percent, with_unit
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.engine import Engine
-    from grounded.instruments.finding import Finding
 
 REGIONS = 3  # named in the details
 

@@ -27,6 +27,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded.accounts.finding import SENSOR_DELAY, late_as_positions
+from grounded.accounts.lag import whole_steps
+from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -58,9 +61,6 @@ from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, type_of
 from grounded.frozen import positive, whole_number
-from grounded.instruments.finding import SENSOR_DELAY, late_as_positions
-from grounded.instruments.lag import whole_steps
-from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.share import share_of

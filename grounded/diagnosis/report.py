@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from grounded.accounts.finding import Finding, late_effects
 from grounded.diagnosis.error_report import (
     BRIEF,
     Combination,
@@ -27,7 +28,6 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.ruler_words import objection
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.instruments.finding import Finding, late_effects
 from grounded.result import Document, number
 
 if TYPE_CHECKING:

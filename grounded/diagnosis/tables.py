@@ -13,8 +13,8 @@ from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
-    from grounded.instruments.finding import Finding
 
 Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from grounded.accounts.finding import Finding, in_the_log
 from grounded.diagnosis.cause_words import (
     GIVEN,
     OWN,
@@ -52,7 +53,6 @@ from grounded.diagnosis.ruler_words import (
     worsened,
 )
 from grounded.errors import GroundedError
-from grounded.instruments.finding import Finding, in_the_log
 from grounded.model import Model
 from grounded.result import begun, listed, number, percent, with_unit
 

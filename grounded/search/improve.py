@@ -185,8 +185,8 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     Sensor errors found in the trials are corrected first. The fitted values are rejected if they
     predict held-out time worse than the model's own values.
     """
+    from grounded.accounts.sound_trials import sound_trials
     from grounded.fit import fit
-    from grounded.instruments.sound_trials import sound_trials
 
     names = task.model.state_names
     whole = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]

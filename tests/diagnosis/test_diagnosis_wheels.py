@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from grounded import Model, Param
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
 from grounded.effects.family import Scales
-from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 
 DT, FINE = 0.05, 10  # [s] control step; steps of the simulation in one

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from grounded.accounts.sound_trials import sound_trials
 from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
 from grounded.estimate import of_function, of_states, record_of
 from grounded.fit import fit
 from grounded.fit.filtered import behind_filters
-from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model, Param
 from grounded.rollout import simulate
 from grounded.search.improve import refitted

@@ -9,10 +9,10 @@ import numpy as np
 
 from cli import grounded
 from facts import holds
+from grounded.accounts.finding import put_right
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
-from grounded.instruments.finding import put_right
 from grounded_trials.report.diagnosis_notes import note_lines, pattern_line
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure

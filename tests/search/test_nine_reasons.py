@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from grounded import Model
-from grounded.instruments.units.odd_trial import all_in_degrees
+from grounded.accounts.judge import judge
 from grounded.plant import Plant
 from grounded.search import first_policy as starts
 from grounded.search import making
@@ -115,10 +115,11 @@ def test_what_no_model_predicts_is_in_no_other_unit(late_arm, seed):
     spun = np.cumsum(rng.normal(size=calm.states.shape), axis=0) * [0.3, 1.0, 10.0, 60.0]
     wild = replace(calm, states=spun)
     for trials in ([wild, calm], [wild], [wild, wild, calm]):
-        assert all_in_degrees(task.model, trials, range(4)) == []
+        told = judge(task.model, trials, range(4)).told
+        assert not any(one.account.kind == "unit" for one in told)
     turned = replace(calm, states=np.rad2deg(calm.states))
-    found = all_in_degrees(task.model, [turned], range(4))
-    assert [odd.states for odd in found] == [(0, 1, 2, 3)]
+    found = judge(task.model, [turned], range(4)).told
+    assert [one.account.columns for one in found] == [(0, 1, 2, 3)]
 
 
 def test_an_unstable_loop_gets_gentler_gains(late_arm):

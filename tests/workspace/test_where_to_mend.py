@@ -10,9 +10,9 @@ import pytest
 
 from cli import grounded
 from facts import holding, holds
+from grounded.accounts.finding import Finding
 from grounded.diagnosis.tables import instrument_lines
 from grounded.errors import GroundedError
-from grounded.instruments.finding import Finding
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from facts import holding
+from grounded.accounts.lag import alike
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError
 from grounded.fit import fit
-from grounded.instruments.lag import alike
-from grounded.instruments.preflight import preflight
 from grounded.model import Model, Param
 from grounded.trial import Trial
 from grounded_trials import Workspace

@@ -23,11 +23,11 @@ from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
-    from grounded.instruments.finding import Finding
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted, Undone

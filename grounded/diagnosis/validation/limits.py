@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.accounts.finding import Finding
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
@@ -33,7 +34,6 @@ from grounded.effects import (
 from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
 from grounded.frozen import Array
-from grounded.instruments.finding import Finding
 from grounded.model import Model, Param
 from grounded.places import LITTLE, integrals, told_by
 from grounded.result import listed

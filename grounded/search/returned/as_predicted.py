@@ -98,8 +98,8 @@ def odd_columns(
 
 def _moves_better(model: Model, trial: Trial, mended: Trial) -> bool:
     """Return whether the model predicts a trial's motion clearly better without a fault."""
-    from grounded.instruments.predictions.mistaken import CLEAR, STARTS
-    from grounded.instruments.predictions.short_runs import Ahead
+    from grounded.accounts.judge import CLEAR, STARTS
+    from grounded.accounts.motion import Ahead
 
     before, after = (Ahead(model, one, range(model.n), STARTS) for one in (trial, mended))
     if not before.enough or not after.enough:

@@ -14,8 +14,8 @@ from itertools import combinations
 
 import numpy as np
 
-from grounded.instruments.predictions.mistaken import Mistake
-from grounded.instruments.predictions.short_runs import Ahead, Fit
+from grounded.accounts.motion import Ahead, Fit
+from grounded.accounts.table import Account
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 
@@ -69,14 +69,15 @@ def exchanged(planner: Planner, trial: Trial, before: Sequence[Trial]) -> Exchan
     if not as_sent:
         return None
     for pair in pairs:
-        other = fits(planner, Mistake(inputs=pair).mended(trial))
+        other = fits(planner, _exchange(planner, pair).mended(trial))
         if other and (gain := score(other) - score(as_sent)) < least:
             least, best = gain, (pair, other)
     if best is None:
         return None
     (i, j), other = best
     known = [
-        (one.id, score(fits(planner, one)), Mistake(inputs=(i, j)).mended(one)) for one in before
+        (one.id, score(fits(planner, one)), _exchange(planner, (i, j)).mended(one))
+        for one in before
     ]
     told = [(name, plain - score(fits(planner, turned))) for name, plain, turned in known]
     if any(gain > 0 for _, gain in told):
@@ -86,6 +87,11 @@ def exchanged(planner: Planner, trial: Trial, before: Sequence[Trial]) -> Exchan
     names = trial.input_names
     shown = tuple(name for name, gain in told if gain < -SURE)
     return Exchanged((names[i], names[j]), trial.state_names[k], float(1 / shares[k]), shown)
+
+
+def _exchange(planner: Planner, pair: tuple[int, int]) -> Account:
+    n = planner.task.model.n
+    return Account("exchange", pairs=((n + pair[0], n + pair[1]),))
 
 
 def fits(planner: Planner, trial: Trial, *, as_it_is: bool = False) -> list[Fit]:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.instruments.predictions.input_signs import Acts, how_inputs_act
-from grounded.instruments.predictions.short_runs import Ahead
+from grounded.accounts.commands import Acts, how_inputs_act
+from grounded.accounts.motion import Ahead
 from grounded.search.planner import Planner
 from grounded.search.returned.as_predicted import multiplied
 from grounded.trial import Trial
@@ -82,7 +82,7 @@ def beside_friction(planner: Planner, trial: Trial) -> Reversed | None:
     wrong = {name: one for name, one in acts.items() if one.sign < 0}
     if not wrong:
         return None
-    name = min(wrong, key=lambda one: wrong[one].share / wrong[one].error)
+    name = min(wrong, key=lambda one: abs(wrong[one].share + 1))
     share = f"{-100 * wrong[name].share:.0f} %"
     return Reversed(name, f"{name} {TURNED}, with {share} of its modelled effect")
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.accounts.finding import UnusableTrials, in_the_log
+from grounded.accounts.sound_trials import sound_trials
 from grounded.errors import GroundedError
-from grounded.instruments.finding import UnusableTrials, in_the_log
-from grounded.instruments.sound_trials import sound_trials
 from grounded.model import Model
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.accounts.inputs import limits_of, span
 from grounded.frozen import Array
-from grounded.instruments.inputs import limits_of, span
 from grounded.policy import Policy, z_difference
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate

@@ -10,6 +10,7 @@ import pytest
 
 from cli import grounded
 from grounded import Model, Trial
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
@@ -24,7 +25,6 @@ from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library, LossFamily, RateFamily, memory_of, memory_start, wrap
 from grounded.errors import NextCommand
-from grounded.instruments.preflight import preflight
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.utility import Reward

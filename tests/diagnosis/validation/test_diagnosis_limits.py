@@ -8,6 +8,7 @@ from test_diagnosis_unmeasured import swings
 
 from facts import holds
 from grounded import GroundedError, Model, Param, Trial
+from grounded.accounts.finding import Finding
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -22,7 +23,6 @@ from grounded.diagnosis.validation.limits import (
 )
 from grounded.effects import Library
 from grounded.effects.wrap import wrap
-from grounded.instruments.finding import Finding
 from grounded.models.pendulum import model as pendulum
 
 

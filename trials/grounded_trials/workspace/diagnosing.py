@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.report import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.instruments.finding import in_the_log
 from grounded.progress import duration
 from grounded.result import begun
 from grounded.share import Share, share_of
@@ -27,11 +27,11 @@ from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array
-    from grounded.instruments.finding import Finding
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
     from grounded.search.planner import Planner
@@ -243,7 +243,7 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
     """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
-    from grounded.instruments.sound_trials import sound_trials
+    from grounded.accounts.sound_trials import sound_trials
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
@@ -255,7 +255,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
-    from grounded.instruments.kinematics.rows import unheld
+    from grounded.accounts.kinematics import unheld
 
     return unheld(workspace.planner.task.model, _chosen(workspace, trials).trials)
 
@@ -284,13 +284,12 @@ def _chosen(workspace: Folder, names: Sequence[str]) -> Share:
         GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
             an adopted delay of that sensor has no rows that show it.
     """
-    from grounded.instruments.kinematics.rows import kinematic_rows
-    from grounded.instruments.units.mismatch import stop_at_folded
+    from grounded.accounts.sound_trials import stop_at_folded
 
     used, model = diagnosable(workspace), workspace.base_model
     names = named_trials(workspace, names, [trial.id for trial in used])
     share = share_of([trial for trial in used if not names or trial.id in names])
-    stop_at_folded(model, share.trials, kinematic_rows(model, range(model.n)))
+    stop_at_folded(model, share.trials)
     guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
     measured = [
         _measured(trial, [name for name in guessed[trial.id].split(",") if name])

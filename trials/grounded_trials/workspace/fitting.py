@@ -26,9 +26,9 @@ from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
 if TYPE_CHECKING:
+    from grounded.accounts.finding import Finding
     from grounded.engine import Engine
     from grounded.fit import Fit
-    from grounded.instruments.finding import Finding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -205,9 +205,9 @@ def fit_trials(
     Returns:
         The fit, and the findings about the instruments.
     """
+    from grounded.accounts.sound_trials import sound_trials
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
-    from grounded.instruments.sound_trials import sound_trials
     from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
     planner = workspace.planner

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded.accounts.table import DEGREES
 from grounded.errors import GroundedError, nearest, type_of
 from grounded.frozen import Array, numbers
-from grounded.instruments.finding import DEGREES
 from grounded.model import Model
 from grounded.places import role
 from grounded.task import MAX_HORIZON

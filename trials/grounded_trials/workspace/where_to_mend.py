@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.instruments.finding import AS_LATE, SENSOR_DELAY, Finding, late_effects
+from grounded.accounts.finding import AS_LATE, SENSOR_DELAY, Finding, late_effects
 from grounded.places import heading, position
 from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
@@ -177,7 +177,7 @@ def _at_limits(
 
     The log itself reaches these limits by construction, and so do other manual drives.
     """
-    from grounded.instruments.inputs import judge_limits
+    from grounded.accounts.inputs import judge_limits
 
     if not seen_in(workspace.config):
         return findings

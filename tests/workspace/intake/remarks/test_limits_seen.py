@@ -7,8 +7,8 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.instruments.inputs import beyond_limits
-from grounded.instruments.preflight import preflight
+from grounded.accounts.inputs import beyond_limits
+from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial

@@ -1,5 +1,7 @@
 """Angles that [log] reads from one number of a quaternion, and commands in degrees."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,9 +12,9 @@ from grounded_trials import Workspace
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
-from grounded_trials.workspace.intake.remarks.log_faults import _degrees
+from grounded_trials.workspace.intake.remarks.log_faults import column_faults
 from ros_bags import rover_bag
-from tests.instruments.test_mismatch import BOAT, folded, logged
+from tests.accounts.test_mismatch import BOAT, folded, logged
 
 CAR = Model(
     states={"psi": "rad", "qz": "1", "z": "m"},
@@ -75,7 +77,7 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
         x.append(boat.system.step(x[-1][None], u[None], boat.values, 0.1)[0])
     y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
     trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
-    (fault,) = _degrees(boat, trial)
+    (fault,) = column_faults(SimpleNamespace(base_model=boat), trial)
     assert (fault.inputs, fault.factor) == (("rudder",), pytest.approx(57.29578))
     assert fault.said.startswith("rudder ")
     assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program
@@ -84,7 +86,7 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
 def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
     """Stored as -59.67, "what the search improves on", it was called an odd run at most."""
     sound, odd = (logged(BOAT, *fault)[0] for fault in ((), (folded,)))
-    assert not _degrees(BOAT, sound)
-    (fault,) = _degrees(BOAT, odd)
+    assert not column_faults(SimpleNamespace(base_model=BOAT), sound)
+    (fault,) = column_faults(SimpleNamespace(base_model=BOAT), odd)
     assert holds(fault.said, "psi", "degrees", "unwrapped")
     assert holds(fault.mend, "[log.state.psi]", "0.017453293")

@@ -15,9 +15,9 @@ from itertools import islice, permutations, product
 
 import numpy as np
 
+from grounded.accounts.judge import CLEAR, HALF
+from grounded.accounts.motion import Ahead
 from grounded.frozen import Array
-from grounded.instruments.predictions.mistaken import CLEAR, HALF
-from grounded.instruments.predictions.short_runs import Ahead
 from grounded.model import Model
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_guess import Guess

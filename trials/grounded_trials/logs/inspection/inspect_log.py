@@ -361,7 +361,7 @@ def _noise(values: Floats) -> float:
     noise = float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
     if not (np.diff(values) == 0).mean() > REPEATS:
         return noise
-    from grounded.instruments.single import quantum
+    from grounded.accounts.signals import quantum
 
     return max(noise, STEP * quantum([values]))
 

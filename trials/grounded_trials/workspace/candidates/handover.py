@@ -397,7 +397,7 @@ class Check:
 
     def _too_long(self) -> Iterator[str]:
         """Yield that the integrator's steps are too long for the model, if they are."""
-        from grounded.instruments.predictions.time_step import too_long
+        from grounded.accounts.time_step import too_long
 
         made, model = self.candidate, self.workspace.base_model
         states, inputs = made.predicted_states[:-1], made.predicted_inputs

@@ -37,14 +37,14 @@ from grounded_trials.workspace.intake.locating.run_start import TRIED, Recording
 from grounded_trials.workspace.user_files.config import FILE
 
 if TYPE_CHECKING:
-    from grounded.instruments.predictions.mistaken import Mistake
+    from grounded.accounts.table import Account
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 WORSE = 2.0  # factor by which a log must follow a policy worse than with two columns exchanged
 CLEARLY = 0.5  # [nats] by which an exchange must bring a log nearer to the prediction than a unit
 PACES = (2.0, 0.5)  # rates of a recording that are tried
 
-Proven = Callable[["Mistake"], Sequence[str]]  # trials, read by the same [log], without a fault
+Proven = Callable[["Account"], Sequence[str]]  # trials, read by the same [log], without a fault
 
 
 def pace_of(log: Recording, task: Task, own: Candidate) -> float | None:
@@ -193,14 +193,15 @@ def _in_other_column(
     program passed them to the policy, or on to the motors, in each other's place. (With both [log]
     and the wires exchanged a log looks the same, unless [log] read earlier trials well.)
     """
-    from grounded.instruments.predictions.mistaken import Mistake, contradicted
+    from grounded.accounts.judge import contradicted
+    from grounded.accounts.table import Account
 
     (a, b), model = found.pair, task.model
     of = "state" if a in model.state_names else "input"
     tables = f"[log.{of}.{a}] and [log.{of}.{b}]"
+    every = (*model.state_names, *model.input_names)
     names = model.state_names if of == "state" else model.input_names
-    pair = (names.index(a), names.index(b))
-    fault = Mistake(states=(pair,)) if of == "state" else Mistake(inputs=pair)
+    fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
     run, right = log.trial_from(found.begins), proven(fault)
     show = f"{ranges(right)}, read in the same way, show{'s' * (len(right) == 1)} no exchange"
     if run is None or not contradicted(model, run.until(run.known_steps), range(model.n), fault):

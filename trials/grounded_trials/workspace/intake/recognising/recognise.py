@@ -74,13 +74,12 @@ from grounded_trials.workspace.intake.recognising.read_otherwise import (
 )
 from grounded_trials.workspace.intake.remarks.control_loop import old_samples
 from grounded_trials.workspace.intake.remarks.log_faults import (
-    dead_sensors,
-    mistaken_in,
+    column_faults,
     without,
 )
 
 if TYPE_CHECKING:
-    from grounded.instruments.predictions.mistaken import Mistake
+    from grounded.accounts.table import Account
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
@@ -162,7 +161,7 @@ def recognised(
     rival = next((one for one in (*earlier, *candidates) if one.id == other), None)
     unstored = replace(read.trial, id="")
 
-    def proven(fault: Mistake) -> list[str]:
+    def proven(fault: Account) -> list[str]:
         return without(workspace, unstored, fault)
 
     @cache  # it takes seconds
@@ -277,8 +276,7 @@ def recognised(
     known = replace(read.trial, id="").until(read.trial.known_steps)
     odd, hides = [], exchange  # by its commands, which tell a log's fault from the robot's
     if not (seen.silent or exchange):  # without them the model can't tell what moves the robot
-        odd += [*mistaken_in(workspace, known)]
-        odd += [*dead_sensors(workspace.base_model, whole)]
+        odd += column_faults(workspace, known)
     named = [*(misread(read.log) if read.log and not exchange else ())]
     named += [one.told(known, own=read.own) for one in odd]
     if not (named or other or seen.silent or hides):

@@ -1,19 +1,20 @@
-"""Detect columns that are not what their names say: other units, signs, places or clocks.
+"""Tell columns that are not what their names say: other units, signs, places or clocks.
 
-The next plan is based on the log, so the operator has to know before the next run. Each fault is
-reported with its correction, in [log] or in the program that wrote the trial.
+The next plan is based on the log, so the operator has to know before the next run. Which account
+tells how the log came about is judged by `grounded.accounts.judge`; here each is reported with its
+correction, in [log] or in the program that wrote the trial, or on the robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.result import listed
 from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
@@ -22,7 +23,8 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.read_before import paths_of, read_by
 
 if TYPE_CHECKING:
-    from grounded.instruments.predictions.mistaken import Mistake
+    from grounded.accounts.judge import Told
+    from grounded.accounts.table import Account
 
 # multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
 TURNS, WIDER = 5.0, 2.0
@@ -38,6 +40,7 @@ class Fault:
         mend: what to change in [log], an imperative; "" if `said` includes it.
         program: what the program that writes trials should do instead; "" if `said` includes it.
         robot: why the robot is at fault and not the log, and what to undo on it: sentences.
+        kind: that of the account: unit, sign, exchange, dead, offset, axes, pace or clock.
         inputs: the inputs that are in another unit.
         factor: how many times too large these are, below 1 too small.
     """
@@ -48,6 +51,7 @@ class Fault:
     inputs: tuple[str, ...] = ()
     factor: float = 1.0
     robot: str = ""
+    kind: str = ""
 
     def told(self, trial: Trial, *, own: bool) -> str:
         """Return the warning; `own` is for a trial that was written by grounded, not a log."""
@@ -74,17 +78,63 @@ def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
         trial: the trial, with gaps bridged; of a long one its first steps are looked at.
     """
     trial = trial.until(STEPS)
-    model, known = workspace.base_model, trial.until(trial.known_steps)
-    if exchanged := _by_model(workspace, known):
-        return exchanged  # other faults may only be a consequence
-    found = [*_exchanged(workspace, known), *dead_sensors(model, trial), *_thousands(model, known)]
-    found += [*way_faults(model, known), *positions_faults(model, known)]
-    said = {fault.said for fault in found}
-    degrees = [one for one in _degrees(model, known) if one.said not in said]
-    found += degrees or _beyond_safety(workspace.task, trial)
+    known = trial.until(trial.known_steps)
+    found = column_faults(workspace, known)
+    if not any(told.kind == "unit" for told in found):
+        found += _beyond_safety(workspace.task, trial)
     found += _clocks_apart(workspace, trial)
-    found += mistaken_in(workspace, known)
     return tuple(_with_limits(workspace.task, known, one) for one in found)
+
+
+def column_faults(workspace: Folder, known: Trial) -> list[Fault]:
+    """Return the faults of columns: units, signs, places, dead sensors.
+
+    Args:
+        workspace: the workspace with the model.
+        known: the trial up to its last known step.
+    """
+    from grounded.accounts.judge import judge
+    from grounded.accounts.words import is_folded, table
+
+    model = workspace.base_model
+    verdict = judge(model, [replace(known, id="")], range(model.n)) if known.steps > 1 else None
+    if verdict is None:
+        return []
+    found = [_fault(workspace, known, told) for told in verdict.told]
+    lost = [
+        Fault(
+            f"{model.state_names[i]} {is_folded(model, i)}",
+            f"Multiply the scale in {table(model, i)} by {np.pi / 180:.8g} (a missing scale is 1)",
+            f"write {model.states[model.state_names[i]]}",
+            kind="unit",
+        )
+        for i in verdict.folded
+    ]
+    return [*lost, *found]
+
+
+def _fault(workspace: Folder, known: Trial, told: Told) -> Fault:
+    """Return one account as a fault, of the log or of the robot."""
+    from grounded.accounts.words import clause, mend, names_of, remedy, table
+
+    model, account = workspace.base_model, told.account
+    if account.kind == "exchange" and (robot := _on_the_robot(workspace, known, account)):
+        return Fault(clause(model, told, robot=True), robot=robot, kind="exchange")
+    if account.kind in ("dead", "offset") or (told.certain and told.by_motion is None):
+        names = names_of(model, account.columns)
+        each = [remedy(model, told, k, "") for k in account.columns]
+        said = "; ".join(f"{name} {text}" for name, (text, _) in zip(names, each, strict=True))
+        logs = zip(account.columns, (log for _, log in each), strict=True)
+        how = "; ".join(f"Set {log} in {table(model, k)}" for k, log in logs if log)
+        if account.kind == "unit":
+            how = mend(model, told)
+        elif account.kind == "dead":
+            said, how = f"{said}: is its sensor on?", "If it is, look for its column in [log]"
+    else:
+        said, how = clause(model, told, log=False), mend(model, told)
+    sent = tuple(n for n in names_of(model, account.columns) if n in model.inputs)
+    should = f"write {_units(model, names_of(model, account.columns))}" * (account.kind == "unit")
+    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind)
 
 
 def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
@@ -107,47 +157,14 @@ def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
     return replace(fault, mend=f"{fault.mend}; [limits] {unit}: write {', '.join(right)} there")
 
 
-def _exchanged(workspace: Folder, known: Trial) -> Iterator[Fault]:
-    from grounded.instruments.kinematics.swapped import MIRRORED, exchanged, swapped_columns
-    from grounded.instruments.predictions.mistaken import Mistake
-    from grounded.places import integrals
-
-    model, mapping = workspace.base_model, workspace.log_mapping
-    if pair := swapped_columns(model, known, relations=integrals(model)):
-        names = pair.removesuffix(MIRRORED).split(" and ")
-        one, *more = (k for k, n in enumerate(model.state_names) if n in names)
-        fault = Mistake(states=((one, more[0]),)) if more else None  # else one is an input
-        robot = _on_the_robot(workspace, known, fault) if fault else ""
-        mend = "Exchange their paths in [log]"
-        if pair.endswith(MIRRORED) and mapping:
-            odd = [n for n in names if n in mapping.states and mapping.states[n].scale < 0]
-            mend += f", and make the scale in [log.state.{odd[0]}] positive" if odd else ""
-        yield Fault(exchanged(pair), "" if robot else mend, robot=robot)
-
-
-def _by_model(workspace: Folder, known: Trial) -> tuple[Fault, ...]:
-    """Return a fault for two exchanged states that only the model reveals."""
-    from grounded.instruments.kinematics.swapped import swapped_columns
-    from grounded.instruments.predictions.exchanged_states import exchanged_states
-    from grounded.instruments.predictions.mistaken import SWAP_BACK, described
-
-    model = workspace.base_model
-    if swapped_columns(model, known):
-        return ()
-    if (told := exchanged_states(model, known, range(model.n))) is None:
-        return ()
-    robot = _on_the_robot(workspace, known, told.mistake)
-    said = described(model, told, robot=bool(robot))
-    return (Fault(said, "" if robot else SWAP_BACK, robot=robot),)
-
-
-def _on_the_robot(workspace: Folder, trial: Trial, fault: Mistake) -> str:
+def _on_the_robot(workspace: Folder, trial: Trial, fault: Account) -> str:
     """Return why an exchange is not the log's, and what to undo on the robot; "" if it may be.
 
     It is not if other trials that [log] read in the same way show none, or if the commands are
     those of the candidate only as they are logged: the program then had the same columns.
     """
-    parts = ("wires", "sends or logs") if fault.inputs else ("sensors", "reads or logs")
+    inputs = min(fault.touched) >= workspace.base_model.n
+    parts = ("wires", "sends or logs") if inputs else ("sensors", "reads or logs")
     where = "the robot's {}, or what its program {},".format(*parts)
     if right := without(workspace, trial, fault):
         show = "shows" if len(right) == 1 else "show"
@@ -160,14 +177,14 @@ def _on_the_robot(workspace: Folder, trial: Trial, fault: Mistake) -> str:
     )
 
 
-def without(workspace: Folder, trial: Trial, fault: Mistake) -> list[str]:
+def without(workspace: Folder, trial: Trial, fault: Account) -> list[str]:
     """Return the other trials that were read in the same way and contradict an exchange."""
-    from grounded.instruments.predictions.mistaken import contradicted
+    from grounded.accounts.judge import contradicted
+    from grounded.accounts.words import names_of
     from grounded_trials.workspace.last_diagnosis import diagnosable
 
     model, mapping = workspace.base_model, workspace.log_mapping
-    names = [model.input_names[j] for j in fault.inputs]
-    names += [model.state_names[i] for pair in fault.states for i in pair]
+    names = names_of(model, sorted(fault.touched))
     metas = {one.stored.id: one.meta for one in workspace.whole_trials()}
     metas |= {one.stored.id: one.meta for one in workspace.aside_trials()}
     now = read_by(mapping) if mapping else {}
@@ -182,7 +199,7 @@ def without(workspace: Folder, trial: Trial, fault: Mistake) -> list[str]:
     ]
 
 
-def _as_sent(workspace: Folder, trial: Trial, fault: Mistake) -> bool:
+def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
     """Return whether a run's commands are its candidate's, and would not be without an exchange."""
     from grounded.search.returned.who_drove import follows, latest
 
@@ -192,92 +209,6 @@ def _as_sent(workspace: Folder, trial: Trial, fault: Mistake) -> bool:
     run = trial.until(policy.horizon)
     logged, mended = (follows(policy, one, late) for one in (run, fault.mended(run)))
     return logged is not None and logged.alike and not (mended is not None and mended.alike)
-
-
-def dead_sensors(model: Model, trial: Trial) -> list[Fault]:
-    """Return faults for velocities that do not follow the motion of their positions."""
-    from grounded.instruments.kinematics.velocities import dead_rates
-
-    return [
-        Fault(
-            f"{model.state_names[one.relation.j]} {one.told(model)}: is its sensor on?",
-            "If it is, look for its column in [log]",
-        )
-        for one in dead_rates(model, trial)
-    ]
-
-
-def _thousands(model: Model, known: Trial) -> list[Fault]:
-    """Return faults for positions or velocities that are too large by powers of a thousand."""
-    from grounded.instruments.units.other_units import MEND, units_apart
-
-    with np.errstate(all="ignore"):
-        apart = units_apart(model, known, range(model.n)) if known.steps > 1 else []
-    return [Fault(one, MEND) for one in apart]
-
-
-def way_faults(model: Model, known: Trial) -> list[Fault]:
-    """Return faults of heading and speeds found from the path: other axes, a compass, knots."""
-    from grounded.instruments.finding import UnusableTrials
-    from grounded.instruments.kinematics.rows import kinematic_rows, tied
-    from grounded.instruments.kinematics.way import judge_way
-
-    rows = tied(kinematic_rows(model, range(model.n)))
-    try:
-        with np.errstate(all="ignore"):
-            odd = list(judge_way(model, [replace(known, id="")], rows))
-    except UnusableTrials as error:
-        return [Fault(error.clauses, error.mend)]
-    return [
-        Fault(f"{one.signal} {one.finding}", f"Set {one.log} in [log.state.{one.signal}]")
-        for one in odd
-    ]
-
-
-def positions_faults(model: Model, known: Trial) -> list[Fault]:
-    """Return a fault for positions that move a power of ten as far as the commands say."""
-    from grounded.instruments.units.plane_units import positions_off
-
-    off = positions_off(model, known, range(model.n))
-    return [Fault(off.described, off.mend, "write positions in the model's unit")] if off else []
-
-
-def _degrees(model: Model, known: Trial) -> list[Fault]:
-    """Return faults for angles in degrees that a diagnosis would correct, or refuse."""
-    from grounded.instruments.finding import DEGREES
-    from grounded.instruments.kinematics.rows import kinematic_rows
-    from grounded.instruments.preflight import preflight
-    from grounded.instruments.units.mismatch import folded
-
-    if lost := folded(model, [known], kinematic_rows(model, range(model.n))):
-        names = [model.state_names[one.state] for one in lost]
-        return [
-            Fault(
-                f"{name} {one.told(model)}",
-                f"Multiply the scale in [log.state.{name}] by {1 / DEGREES:.8g} (a missing scale "
-                "is 1)",
-                f"write {model.states[name]}",
-            )
-            for name, one in zip(names, lost, strict=True)
-        ]
-    try:
-        findings = preflight(model, [replace(known, id="")]).findings
-    except GroundedError:  # the diagnosis reports it
-        return []
-    units = {**model.states, **model.inputs}
-    return [
-        Fault(
-            f"{one.signal} {one.finding}",
-            f"Multiply the scale in [log.{'state' if one.signal in model.states else 'input'}."
-            f"{one.signal}] by {one.log.split(' = ')[1]} (a "
-            "missing scale is 1)",
-            f"write {units[one.signal]}",
-            (one.signal,) if one.signal in model.inputs else (),
-            one.scale,
-        )
-        for one in findings
-        if one.kind == "degrees" and one.log
-    ]
 
 
 def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
@@ -296,6 +227,7 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
                     f"degrees? Then it would be {np.deg2rad(most):.3g} rad",
                     f"Set scale = {np.pi / 180:.8g} in [log.state.{name}] if so",
                     "write rad",
+                    kind="unit",
                 )
             )
     return found
@@ -303,43 +235,22 @@ def _beyond_safety(task: Task, trial: Trial) -> list[Fault]:
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Fault]:
     """Return a fault if measured states respond to commands before they are sent."""
-    from grounded.instruments.predictions.clocks import answers_early, one_clock, too_soon
+    from grounded.accounts.commands import answers_early
 
-    model, table = workspace.base_model, workspace.config.estimate
+    model, estimates = workspace.base_model, workspace.config.estimate
     measured: Collection[str] = model.state_names
-    if table.names():
+    if estimates.names():
         from grounded_trials.workspace.intake.opening.estimating import read_estimate
 
-        measured = read_estimate(table, model).measured
+        measured = read_estimate(estimates, model).measured
     shown = [i for i, name in enumerate(model.state_names) if name in measured]
     if (early := answers_early(model, trial, shown)) is None:
         return []
-    mend = one_clock(model, shown, early)
-    return [Fault(too_soon(model, early), mend, "stamp both by one clock")]
+    mend = early.mend([model.state_names[i] for i in shown])
+    return [Fault(early.said(model), mend, "stamp both by one clock", kind="clock")]
 
 
-def mistaken_in(workspace: Folder, known: Trial) -> list[Fault]:
-    """Return a fault if the model explains the log better with exchanged columns or other units."""
-    from grounded.instruments.predictions.mistaken import as_logged, described, mended_by, mistaken
-    from grounded.instruments.preflight import preflight
-
-    model = workspace.base_model
-    told = mistaken(model, [known], range(model.n))
-    if told is not None:
-        try:
-            looked = preflight(model, [known])
-        except GroundedError:  # another instrument fault: it may look like a sign error
-            told = None if told.mistake.turned else told
-        else:
-            told = mistaken(model, looked.trials, range(model.n))
-            told = told and as_logged(model, told, looked.findings)
-    if told is None:
-        return []
-    swap = told.mistake.swap and not told.mistake.turned
-    if swap and (robot := _on_the_robot(workspace, known, told.mistake)):
-        return [Fault(described(model, told, robot=True), robot=robot)]
-    scaled = () if told.mistake.swap else told.mistake.inputs
-    names = tuple(model.input_names[j] for j in scaled)
-    should = "write inputs in the model's unit" * bool(names)
-    factor = told.mistake.factor
-    return [Fault(described(model, told), mended_by(model, told), should, names, factor)]
+def _units(model: Model, names: Sequence[str]) -> str:
+    """Return the model's units of some columns."""
+    every = {**model.states, **model.inputs}
+    return listed(dict.fromkeys(every[name] for name in names))

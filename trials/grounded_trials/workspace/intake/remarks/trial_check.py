@@ -140,7 +140,7 @@ def _still(trial: Trial) -> list[str]:
 
 def _halted(workspace: Folder, trial: Trial) -> list[str]:
     """Return a warning if the robot stood still in data under commands that had moved it before."""
-    from grounded.instruments.halted import halted
+    from grounded.accounts.halted import halted
 
     if (stood := halted(workspace.base_model, trial)) is None:
         return []
@@ -156,7 +156,7 @@ def _halted(workspace: Folder, trial: Trial) -> list[str]:
 
 def _beyond(workspace: Folder, trial: Trial, scaled: Sequence[str]) -> list[str]:
     """Return warnings if logged inputs exceed [limits] that were taken from another log."""
-    from grounded.instruments.inputs import beyond_limits, in_percent, limits_of, span
+    from grounded.accounts.inputs import beyond_limits, in_percent, limits_of, span
 
     task, mapping = workspace.task, workspace.log_mapping
     past = np.any(beyond_limits(task, trial.inputs), axis=0)

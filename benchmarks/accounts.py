@@ -1,0 +1,580 @@
+"""Put faults into logs of robots, and see which story is told of how each log came about.
+
+    python -m benchmarks.accounts [--seeds 0,1,2] [--robots car,arm] [--faults NAME,...] [--all]
+
+Five robots (car, arm, drone, boat, rover) are simulated with other parameters than their crude
+model's, by seed mostly with an effect that it lacks, and with noise. Each fault is put into the log
+of two runs, or of one of them, and `sound_trials` judges both. Printed are each true fault with
+what was named (right: the kind and the signals; part: the kind, with other signals, or tied with
+another story; silent: nothing; wrong: another kind), and how many honest runs were refused. With
+`--all` every case has a line. Seeds are even for building, odd for measuring.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded import Model, Param
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.trial import Trial
+
+DEGREES, RPM = 180 / np.pi, 30 / np.pi
+Derivative = Callable[..., dict[str, Array]]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A crude model, what it lacks, and how the robot is driven.
+
+    Args:
+        model: the crude model.
+        lacks: adds an unmodelled effect of a size to the derivative.
+        noise: standard deviation of each state's sensor.
+        reach: largest input of each kind.
+        dt: control interval [s].
+        rest: start of a run, None: zero.
+        held: a feedback (states, inputs wanted) -> inputs, for a robot that would fall.
+    """
+
+    model: Model
+    lacks: Callable[..., dict[str, Array]]
+    noise: Sequence[float]
+    reach: Sequence[tuple[float, float]]
+    dt: float
+    start: Sequence[float]
+    held: Callable[[Array, Array], Array] | None = None
+
+
+def _car() -> Robot:
+    def rates(s, a, p):  # type: ignore[no-untyped-def]
+        return {
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.v * np.tan(a.steering) / p.L,
+            "v": p.k * a.throttle - p.d * s.v,
+        }
+
+    model = Model(
+        states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"},
+        inputs={"throttle": "1", "steering": "rad"},
+        params={
+            "L": Param(0.3, "m", 0.15, 0.6),
+            "k": Param(4.0, "m/s^2", 1.0, 12.0),
+            "d": Param(0.8, "1/s", 0.1, 3.0),
+        },
+        derivative=rates,
+        angles=("psi",),
+        roles={"position": ("x", "y"), "heading": "psi", "speed": "v"},
+    )
+
+    def lacks(s, a, size):  # type: ignore[no-untyped-def]
+        grip = 1 / (1 + size * np.abs(s.v * np.tan(a.steering)))
+        turn = s.v * np.tan(a.steering) / 0.3
+        return {"v": -size * s.v * np.abs(s.v), "psi": (grip - 1) * turn}
+
+    reach = ((0.1, 0.9), (-0.35, 0.35))
+    return Robot(model, lacks, (0.004, 0.004, 0.005, 0.02), reach, 0.05, (0, 0, 0, 0.5))
+
+
+def _arm() -> Robot:
+    def rates(s, a, p):  # type: ignore[no-untyped-def]
+        g1, g2 = 9.81 * np.sin(s.q1), 9.81 * np.sin(s.q1 + s.q2)
+        return {
+            "q1": s.w1,
+            "q2": s.w2,
+            "w1": (a.tau1 - p.d * s.w1 - p.m * 0.3 * g1 - p.m * 0.1 * g2) / (0.2 * p.m),
+            "w2": (a.tau2 - p.d * s.w2 - p.m * 0.1 * g2) / (0.06 * p.m),
+        }
+
+    model = Model(
+        states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+        inputs={"tau1": "N m", "tau2": "N m"},
+        params={"m": Param(1.0, "kg", 0.4, 2.5), "d": Param(0.15, "N m s", 0.01, 0.8)},
+        derivative=rates,
+    )
+
+    def lacks(s, a, size):  # type: ignore[no-untyped-def]
+        return {
+            "w1": -4 * size * np.tanh(s.w1 / 0.05),
+            "w2": -5 * size * np.tanh(s.w2 / 0.05),
+        }
+
+    reach = ((-2.5, 2.5), (-0.9, 0.9))
+    return Robot(model, lacks, (0.002, 0.002, 0.02, 0.02), reach, 0.02, (0, 0, 0, 0))
+
+
+def _drone() -> Robot:
+    def rates(s, a, p):  # type: ignore[no-untyped-def]
+        return {
+            "x": s.vx,
+            "z": s.vz,
+            "th": s.w,
+            "vx": -a.thrust / p.m * np.sin(s.th) - p.d * s.vx,
+            "vz": a.thrust / p.m * np.cos(s.th) - 9.81 - p.d * s.vz,
+            "w": a.torque / p.J,
+        }
+
+    model = Model(
+        states={"x": "m", "z": "m", "th": "rad", "vx": "m/s", "vz": "m/s", "w": "rad/s"},
+        inputs={"thrust": "N", "torque": "N m"},
+        params={
+            "m": Param(0.5, "kg", 0.3, 0.8),
+            "J": Param(0.006, "kg m^2", 0.002, 0.02),
+            "d": Param(0.1, "1/s", 0.0, 1.0),
+        },
+        derivative=rates,
+        roles={"position": ("x", "z")},
+    )
+
+    def lacks(s, a, size):  # type: ignore[no-untyped-def]
+        return {"vx": -size * s.vx * np.abs(s.vx), "w": -6 * size * s.w}
+
+    def held(x: Array, want: Array) -> Array:
+        lean = np.clip(0.25 * (x[0] - want[1]) + 0.3 * x[3], -0.5, 0.5)
+        up = 0.5 * (9.81 + 4 * (want[0] - x[1]) - 3 * x[4]) / np.cos(np.clip(x[2], -0.9, 0.9))
+        return np.array(
+            [np.clip(up, 1, 9), np.clip(0.006 * (60 * (lean - x[2]) - 14 * x[5]), -1, 1)]
+        )
+
+    noise = (0.005, 0.005, 0.004, 0.02, 0.02, 0.02)
+    return Robot(model, lacks, noise, ((-1.0, 1.0), (-1.5, 1.5)), 0.02, (0,) * 6, held)
+
+
+def _boat() -> Robot:
+    def rates(s, a, p):  # type: ignore[no-untyped-def]
+        return {
+            "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
+            "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
+            "psi": s.r,
+            "u": (a.left + a.right) / p.m - p.du * s.u,
+            "v": -p.dv * s.v - 0.3 * s.u * s.r,
+            "r": 0.3 * (a.right - a.left) / p.J - p.dr * s.r,
+        }
+
+    model = Model(
+        states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"},
+        inputs={"left": "N", "right": "N"},
+        params={
+            "m": Param(20.0, "kg", 8.0, 50.0),
+            "J": Param(2.0, "kg m^2", 0.5, 8.0),
+            "du": Param(0.5, "1/s", 0.05, 2.0),
+            "dv": Param(1.0, "1/s", 0.1, 5.0),
+            "dr": Param(1.0, "1/s", 0.1, 5.0),
+        },
+        derivative=rates,
+        angles=("psi",),
+        roles={"position": ("x", "y"), "heading": "psi", "speed": "u"},
+    )
+
+    def lacks(s, a, size):  # type: ignore[no-untyped-def]
+        return {"u": -size * s.u * np.abs(s.u), "r": -4 * size * s.r * np.abs(s.r)}
+
+    noise = (0.02, 0.02, 0.01, 0.02, 0.02, 0.015)
+    return Robot(model, lacks, noise, ((-4.0, 15.0), (-4.0, 15.0)), 0.1, (0, 0, 0, 0.3, 0, 0))
+
+
+def _rover() -> Robot:
+    def rates(s, a, p):  # type: ignore[no-untyped-def]
+        v, w = p.R * (s.wr + s.wl) / 2, p.R * (s.wr - s.wl) / p.B
+        return {
+            "x": v * np.cos(s.psi),
+            "y": v * np.sin(s.psi),
+            "psi": w,
+            "wl": (p.k * a.left - s.wl) / p.tau,
+            "wr": (p.k * a.right - s.wr) / p.tau,
+        }
+
+    model = Model(
+        states={"x": "m", "y": "m", "psi": "rad", "wl": "rad/s", "wr": "rad/s"},
+        inputs={"left": "%", "right": "%"},
+        params={
+            "R": Param(0.1, "m", 0.05, 0.2),
+            "B": Param(0.4, "m", 0.2, 0.8),
+            "k": Param(0.12, "rad/s", 0.04, 0.4),
+            "tau": Param(0.25, "s", 0.05, 1.0),
+        },
+        derivative=rates,
+        angles=("psi",),
+        roles={"position": ("x", "y"), "heading": "psi"},
+    )
+
+    def lacks(s, a, size):  # type: ignore[no-untyped-def]
+        return {
+            "wl": -8 * size * np.tanh(s.wl / 0.5),
+            "wr": -8 * size * np.tanh(s.wr / 0.5),
+            "psi": -size * 0.25 * (s.wr - s.wl),
+        }
+
+    noise = (0.004, 0.004, 0.006, 0.1, 0.1)
+    return Robot(model, lacks, noise, ((-60.0, 95.0), (-60.0, 95.0)), 0.05, (0, 0, 0, 2, 2))
+
+
+ROBOTS = {"car": _car, "arm": _arm, "drone": _drone, "boat": _boat, "rover": _rover}
+
+
+def driven(robot: Robot, rng: np.random.Generator, count: int = 2) -> list[Trial]:
+    """Return trials of the real robot, which differs from its crude model by seed."""
+    model = robot.model
+    real = dict(zip(model.params, model.values, strict=True))
+    for name, one in model.params.items():
+        real[name] = float(np.clip(real[name] * np.exp(0.2 * rng.normal()), one.low, one.high))
+    values, size = np.array(list(real.values())), 0.4 * rng.random() * (rng.random() < 0.75)
+    late, noise = int(rng.integers(0, 3)), np.array(robot.noise) * np.exp(0.5 * rng.normal())
+    if robot.held:
+        late = 0
+    trials = []
+    for _ in range(count):
+        H = round(rng.uniform(6, 12) / robot.dt)
+        wanted, x = _excited(robot, rng, H), np.array(robot.start, float)
+        states, inputs = [x], []
+        for k in range(H):
+            a = wanted[max(k - late, 0)]
+            if robot.held:
+                a = robot.held(x + noise * rng.normal(size=model.n), a)
+            for _ in range(5):
+                x = _step(robot, x, a, values, size, robot.dt / 5)
+            states.append(x)
+            inputs.append(a if robot.held else wanted[k])
+        logged = np.array(states) + noise * rng.normal(size=(H + 1, model.n))
+        trials.append(
+            Trial(
+                states=logged,
+                inputs=np.array(inputs),
+                dt=robot.dt,
+                state_names=model.state_names,
+                input_names=model.input_names,
+            )
+        )
+    return trials
+
+
+def _step(robot: Robot, x: Array, a: Array, values: Array, size: float, dt: float) -> Array:
+    after = robot.model.system.step(x[None], a[None], values, dt)[0]
+    if size:
+        s = _Named(robot.model.state_names, x)
+        for name, rate in robot.lacks(s, _Named(robot.model.input_names, a), size).items():
+            after[robot.model.state_names.index(name)] += dt * rate
+    return np.asarray(after)
+
+
+class _Named:
+    def __init__(self, names: Sequence[str], values: Array) -> None:
+        self.__dict__.update(zip(names, values, strict=True))
+
+
+def _excited(robot: Robot, rng: np.random.Generator, H: int) -> Array:
+    """Return inputs (H, m): sines and steps within the reach."""
+    t, found = robot.dt * np.arange(H), []
+    for low, high in robot.reach:
+        rates, phases = rng.uniform(0.15, 0.9, 2), rng.uniform(0, 6.3, 2)
+        wave = np.sin(6.28 * rates[:, None] * t + phases[:, None]).sum(axis=0) / 2
+        steps = np.repeat(rng.uniform(-1, 1, H // 20 + 1), 20)[:H]
+        mixed = np.clip(0.7 * wave + 0.5 * steps, -1, 1)
+        found.append(low + (high - low) * (mixed + 1) / 2)
+    return np.array(found).T
+
+
+# --- faults -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What was done to the trials: its kind, and the signals that may be named for it."""
+
+    name: str
+    kind: str
+    signals: tuple[frozenset[str], ...]
+    trials: list[Trial]
+
+
+def _set(trials: Sequence[Trial], change: Callable[[dict[str, Array]], None]) -> list[Trial]:
+    """Return the trials with a change made to their columns by name."""
+    found = []
+    for trial in trials:
+        columns = {n: np.array(trial.states[:, i]) for i, n in enumerate(trial.state_names)}
+        columns |= {n: np.array(trial.inputs[:, j]) for j, n in enumerate(trial.input_names)}
+        change(columns)
+        states = np.stack([columns[n] for n in trial.state_names], axis=1)
+        inputs = np.stack([columns[n][: trial.steps] for n in trial.input_names], axis=1)
+        found.append(replace(trial, states=states, inputs=inputs))
+    return found
+
+
+def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Iterator[Fault]:
+    """Yield the faults that a robot's log can have; which signal has it is drawn."""
+    model, dt = robot.model, robot.dt
+    units = {**model.states, **model.inputs}
+
+    def drawn(*some: str) -> str | None:
+        names = [n for n in model.states if units[n] in some]
+        return str(rng.choice(names)) if names else None
+
+    def one(*names: str) -> tuple[frozenset[str], ...]:
+        return (frozenset(names),)
+
+    def times(names: Sequence[str], by: float, some: list[Trial] = trials) -> list[Trial]:
+        def change(c: dict[str, Array]) -> None:
+            for n in names:
+                c[n] *= by
+
+        return _set(some, change)
+
+    def shifted(names: Sequence[str], steps: float) -> list[Trial]:
+        def change(c: dict[str, Array]) -> None:
+            for n in names:
+                at = np.arange(len(c[n]))
+                c[n] = np.interp(at - steps, at, c[n])
+
+        return _set(trials, change)
+
+    def exchanged(a: str, b: str) -> Callable[[dict[str, Array]], None]:
+        def change(c: dict[str, Array]) -> None:
+            length = min(len(c[a]), len(c[b]))
+            c[a], c[b] = (
+                np.concatenate([c[y][:length], c[x][length:]]) for x, y in ((a, b), (b, a))
+            )
+
+        return change
+
+    yield Fault("sound", "none", (), trials)
+    # units
+    angle, rate, length, speed = drawn("rad"), drawn("rad/s"), drawn("m"), drawn("m/s")
+    turning = [n for n in model.states if units[n] in ("rad", "rad/s")]
+    lengths = [n for n in model.states if units[n] == "m"]
+    speeds = [n for n in model.states if units[n] == "m/s"]
+    yield Fault("angle in degrees", "unit", one(str(angle)), times([str(angle)], DEGREES))
+    yield Fault("all angles in degrees", "unit", one(*turning), times(turning, DEGREES))
+    first = [*times([str(angle)], DEGREES, trials[:1]), *trials[1:]]
+    yield Fault("angle of one trial in degrees", "unit", one(str(angle)), first)
+    if rate:
+        yield Fault("rate in degrees", "unit", one(rate), times([rate], DEGREES))
+        yield Fault("rate in rpm", "unit", one(rate), times([rate], RPM))
+        yield Fault("sign of a rate", "sign", one(rate), times([rate], -1.0))
+        scaled = float(rng.choice([0.75, 1.3]))
+        yield Fault("scale of a rate", "scale", one(rate), times([rate], scaled))
+        noise = max(robot.noise)
+        dead = _set(trials, lambda c: c.update({rate: noise * rng.normal(size=len(c[rate]))}))
+        yield Fault("dead rate (noise)", "dead", one(rate), dead)
+        none = _set(trials, lambda c: c.update({rate: np.full(len(c[rate]), 0.0)}))
+        yield Fault("dead rate (zero)", "dead", one(rate), none)
+        first = [dead[0], *trials[1:]]
+        yield Fault("dead rate of one trial", "dead", one(rate), first)
+        late = float(rng.uniform(0.06, 0.15)) / dt
+        yield Fault("late rate", "late", one(rate), shifted([rate], late))
+    if length:
+        yield Fault("position in mm", "unit", one(length), times([length], 1e3))
+        yield Fault("positions in mm", "unit", one(*lengths), times(lengths, 1e3))
+        feet = (frozenset(lengths),)
+        yield Fault("positions in feet", "unit", feet, times(lengths, 3.28084))
+        yield Fault(
+            "positions exchanged",
+            "exchange",
+            one(*lengths[:2]),
+            _set(trials, exchanged(*lengths[:2])),
+        )
+        yield Fault("sign of a position", "sign", one(length), times([length], -1.0))
+        late = float(rng.uniform(0.12, 0.25)) / dt
+        yield Fault("late positions", "late", one(*lengths), shifted(lengths, late))
+    if speed:
+        yield Fault("speeds in km/h", "unit", one(*speeds), times(speeds, 3.6))
+        yield Fault("speeds in knots", "unit", one(*speeds), times(speeds, 1.943844))
+        yield Fault(
+            "all lengths in mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3)
+        )
+    if length and angle and "heading" in model.roles:
+        yield Fault(
+            "position and heading exchanged",
+            "exchange",
+            one(length, angle),
+            _set(trials, exchanged(length, angle)),
+        )
+        turn = float(rng.choice([np.pi / 2, -0.7, 1.2]))
+        off = _set(trials, lambda c: c.update({angle: c[angle] + turn}))
+        yield Fault("heading with an offset", "offset", one(angle), off)
+        others = {n for n in model.states if n == "r"}
+        compass = _set(trials, lambda c: c.update({angle: np.pi / 2 - c[angle]}))
+        yield Fault("compass heading", "sign", one(angle), compass)
+        both = _set(compass, lambda c: c.update({n: -c[n] for n in others}))
+        if others:
+            yield Fault("compass and gyro", "sign", one(angle, *others), both)
+        yield Fault("sign of the heading", "sign", one(angle), times([angle], -1.0))
+    pairs = [
+        (q, w)
+        for q, w in (("q1", "w1"), ("th", "w"), ("x", "vx"), ("psi", "r"))
+        if {q, w} <= {*units}
+    ]
+    for q, w in pairs[:1]:
+        yield Fault(
+            "position and velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w))
+        )
+    for q, w in [one for one in pairs if one[0] in ("q1", "th")][:1]:
+        yield Fault("sign of a joint", "sign", one(q, w), times([q, w], -1.0))
+    if "q2" in units:
+        swap = _set(_set(trials, exchanged("q1", "q2")), exchanged("w1", "w2"))
+        both = (frozenset({"q1", "q2", "w1", "w2"}), frozenset({"tau1", "tau2"}))
+        yield Fault("joints exchanged", "exchange", both, swap)
+    # commands
+    a, b = model.input_names[:2]
+    yield Fault("commands exchanged", "exchange", one(a, b), _set(trials, exchanged(a, b)))
+    factors = {"rad": DEGREES, "%": 0.01, "N": 1000.0, "N m": 1000.0, "1": 100.0}
+    same = [n for n in model.inputs if units[n] == units[b]]
+    yield Fault("commands in another unit", "unit", one(*same), times(same, factors[units[b]]))
+    first = [*times([b], -1.0, trials[:1]), *trials[1:]]
+    if not robot.held:
+        yield Fault("command of one trial reversed", "sign", one(b), first)
+    early = max(2, round(0.25 / dt))
+    moved = [
+        replace(t, states=t.states[early:], inputs=t.inputs[: t.steps - early]) for t in trials
+    ]
+    yield Fault("states early", "clock", one(*model.states), moved)
+    # samples
+    name = str(rng.choice(model.state_names))
+    every = int(rng.integers(3, 6))
+    hold = _set(
+        trials, lambda c: c.update({name: np.repeat(c[name][::every], every)[: len(c[name])]})
+    )
+    yield Fault("held values", "held", one(name), hold)
+
+    def sticks(c: dict[str, Array]) -> None:
+        for at in range(30, len(c[name]) - 30, 60):
+            c[name][at : at + 20] = c[name][at]
+
+    yield Fault("stuck at times", "stuck", one(name), _set(trials, sticks))
+
+    gone = 40 * float(np.std(trials[0].states[:, model.state_names.index(name)])) + 5
+
+    def drops(c: dict[str, Array]) -> None:
+        c[name][10::31] = gone
+
+    yield Fault("drop-outs", "dropout", one(name), _set(trials, drops))
+
+
+# --- what was named -----------------------------------------------------------------------------
+
+KINDS = {
+    "degrees": "unit",
+    "delay": "late",
+    "lag": "late",
+    "scale": "scale",
+    "mismatch": "mismatch",
+}
+QUIET = {"saturated", "beyond", "constant", "copy", "quantised", "missing", "smoothed", "time step"}
+TEXTS = {
+    "exchange": r"exchanged",
+    "sign": r"opposite sign|sign looks|other way round",
+    "clock": r"before .* command|stamps",
+    "unit": r"degrees|times too|in knots|in km/h|in mph|in ft/s|in feet",
+    "axes": r"in the axes of",
+    "dead": r"shows? no motion|shows? only noise|sensor is off",
+}
+
+
+def named(model: Model, trials: Sequence[Trial]) -> tuple[list[tuple[str, frozenset[str]]], bool]:
+    """Return kinds and signals of what `sound_trials` names, and whether it refused."""
+    from grounded.accounts.sound_trials import sound_trials
+
+    try:
+        found = sound_trials(model, trials).findings
+    except GroundedError as error:
+        return [_refused(model, str(error))], True
+    every: dict[str, set[str]] = defaultdict(set)
+    for finding in found:
+        if finding.kind not in QUIET:
+            kind = KINDS.get(finding.kind, finding.kind)
+            if finding.kind == "stuck" and not re.search("jumps", finding.finding):
+                kind = "dead"
+            every[kind] |= {*finding.signal.split("+")}
+    return [(kind, frozenset(some)) for kind, some in every.items()], False
+
+
+def _refused(model: Model, text: str) -> tuple[str, frozenset[str]]:
+    """Return kind and signals of a refusal, from what it says before its remedy and evidence."""
+    text = re.split(r"\. (?:Correct|Multiply|Put|Check|Rotate|Reverse|Subtract|Was)", text)[0]
+    kind = next((k for k, how in TEXTS.items() if re.search(how, text)), "other")
+    names = "|".join(sorted([*model.states, *model.inputs], key=len, reverse=True))
+    text = re.sub(rf"^(in )?(every )?trials? .*?(?=the columns|\b(?:{names})\b)", "", text)
+    found = re.findall(rf"(?<![\w.])(?:{names})(?!\w)", re.split(r"[:(]| shows| stays", text)[0])
+    if kind == "unit" and "as fast as" in text:
+        found = re.findall(rf"says: ({names}) looks", text)
+    return kind, frozenset(found)
+
+
+def verdict(fault: Fault, found: Sequence[tuple[str, frozenset[str]]]) -> str:
+    """Return right, part, silent or wrong."""
+    if fault.kind == "none":
+        return "right" if not found else "wrong"
+    same = [signals for kind, signals in found if kind == fault.kind]
+    others = [kind for kind, _ in found if kind != fault.kind]
+    if any(signals in fault.signals for signals in same) or (same and fault.kind == "clock"):
+        return "part" if set(others) - {"late", "scale", "offset"} else "right"
+    if same:
+        touches = any(signals & expected for signals in same for expected in fault.signals)
+        return "part" if touches else "wrong"
+    return "wrong" if found else "silent"
+
+
+def main() -> None:
+    """Print the matrix."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", default="0,2,4")
+    parser.add_argument("--robots", default=",".join(ROBOTS))
+    parser.add_argument("--faults", default="")
+    parser.add_argument("--honest", type=int, default=20, help="honest runs of each robot")
+    parser.add_argument("--all", action="store_true")
+    args = parser.parse_args()
+    seeds, began = [int(s) for s in args.seeds.split(",")], time.process_time()
+    table, names = defaultdict[str, Counter[str]](Counter), defaultdict[str, Counter[str]](Counter)
+    cases = 0
+    for which in args.robots.split(","):
+        robot = ROBOTS[which]()
+        for seed in seeds:
+            rng = np.random.default_rng([seed, [*ROBOTS].index(which)])
+            for fault in faults(robot, driven(robot, rng), rng):
+                if args.faults and fault.name not in args.faults.split(","):
+                    continue
+                found, refused = named(robot.model, fault.trials)
+                kind, cases = verdict(fault, found), cases + 1
+                table[fault.name][kind] += 1
+                for one, _ in found or [("-", frozenset())]:
+                    names[fault.name][one] += 1
+                if args.all:
+                    told = "; ".join(f"{k} {'+'.join(sorted(s))}" for k, s in found)
+                    print(
+                        f"{kind:7}{which:6}{seed:3} {fault.name:32} {'refused' * refused:8}{told}",
+                        flush=True,
+                    )
+    print(f"\n{'true fault':34}{'right':>6}{'part':>6}{'silent':>7}{'wrong':>6}   named")
+    total = Counter[str]()
+    for name, row in table.items():
+        total += row
+        said = ", ".join(f"{k} {n}" for k, n in names[name].most_common(4))
+        print(f"{name:34}{row['right']:6}{row['part']:6}{row['silent']:7}{row['wrong']:6}   {said}")
+    every = sum(total.values())
+    print(
+        f"{'all':34}{total['right']:6}{total['part']:6}{total['silent']:7}{total['wrong']:6}   "
+        f"{100 * total['right'] / max(every, 1):.1f} % right"
+    )
+    used = time.process_time() - began
+    print(f"{cases} cases, {used / max(cases, 1):.2f} s CPU each")
+    refusals = told = runs = 0
+    for which in args.robots.split(",") if args.honest else ():
+        robot = ROBOTS[which]()
+        for k in range(args.honest):
+            rng = np.random.default_rng([seeds[0], 77, k, [*ROBOTS].index(which)])
+            found, refused = named(robot.model, driven(robot, rng, 1 + k % 3))
+            runs, refusals, told = runs + 1, refusals + refused, told + bool(found)
+            if found and args.all:
+                print("honest", which, k, "refused" * refused, found, flush=True)
+    print(f"honest: {refusals} of {runs} refused, a story told of {told}")
+
+
+if __name__ == "__main__":
+    main()

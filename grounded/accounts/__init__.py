@@ -1,0 +1,15 @@
+"""How a log came about: which story of its sensors and commands explains it best.
+
+Read `sound_trials` first, which asks all of it in one call, then `judge`.
+
+table         the accounts: units, signs, exchanges, offsets, dead sensors, stamps
+kinematics    what positions, velocities and headings imply of each other
+motion        what the model predicts, calibrated on the log
+judge         scores each account by both, tells the best, corrects or refuses
+words         what is said of an account, and what to do about it
+ages          late and filtered sensors, velocities computed from positions, biases; by `lag`
+commands      clocks that differ, inputs that act in reverse; `inputs` copies and limits
+signals       samples of one sensor; `halted` a robot that stood still
+time_step     models and motions that are too fast for the steps
+finding       one fault of a sensor or command, and the corrected trials
+"""

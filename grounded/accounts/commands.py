@@ -1,0 +1,310 @@
+"""What commands and motion show of each other: clocks that differ, inputs that act in reverse.
+
+States that respond before their command is sent are on another clock, since no physics does that.
+Under feedback commands follow the states, so later commands help to predict; and a model with too
+much friction or lag is slower than the robot. So the later commands must act about as the model
+says, and leave much smaller errors than the commands up to then can: through the model with gains,
+delays and quicker actuators, or through any law that is linear in them.
+
+How an input acts is judged by size. With everything linear in the states projected out (friction,
+springs and the feedback itself are), predictions are made with the input as it is, reversed and
+without effect. A reversed motor acts with a share near -1; a throttle that hardly moves on its own
+may have any share, and tells nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.accounts.finding import UnusableTrials, unusable
+from grounded.accounts.motion import HORIZONS, LEAST, Ahead, Fit, basis
+from grounded.errors import NextCommand
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.places import integrals
+from grounded.result import listed
+from grounded.trial import Trial
+
+EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
+HINT, CLEAR, HALF = 0.5, 0.8, 0.5  # [nats] uncalibrated, calibrated; share of one error
+SURELY = 1.6  # [nats] the same in fewer than half of the trials: all have one clock, mostly
+LIKE = 4.0  # factor within which an input must act as in the model
+LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
+STARTS = 120  # samples to predict from
+DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
+SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
+EVEN = 0.5  # of an input's effect: predictions that bend more are left out
+OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
+
+
+@dataclass(frozen=True)
+class Early:
+    """By how much the states of a trial respond too early, and the evidence.
+
+    Args:
+        seconds: the shift, to about one step.
+        state: the state whose prediction improves most with the later commands.
+        logged: its rms error a quarter of a second ahead with the log as it is, in its unit.
+        mended: the same with the later commands.
+        gain: by how much the later commands reduce all errors [nats].
+    """
+
+    seconds: float
+    state: int
+    logged: float
+    mended: float
+    gain: float
+
+    def said(self, model: Model) -> str:
+        """One clause: what is wrong, and the evidence."""
+        name, sent = model.state_names[self.state], list(model.input_names)
+        unit = model.states[name]
+        return (
+            f"{name} moves about {self.seconds:.3g} s before {listed(sent)} "
+            f"command{'s' * (len(sent) == 1)} it: the clocks of states and commands differ (with "
+            f"commands from that much later, the model's error of {name} 0.25 s ahead is "
+            f"{self.mended:.2g} instead of {self.logged:.2g}{'' if unit == '1' else f' {unit}'})"
+        )
+
+    def mend(self, names: Sequence[str]) -> str:
+        """Return the instruction that corrects the clocks of the states with these names."""
+        tables = listed(f"[log.state.{name}]" for name in names)
+        return (
+            f"Subtract {self.seconds:.3g} s from delay_s in {tables} (delay_s = "
+            f"-{self.seconds:.3g} if it has none), or correct the commands' time stamps"
+        )
+
+
+def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
+    """Raise an error if states respond to commands before they are sent.
+
+    Args:
+        model: however crude.
+        trials: of its states and inputs.
+        shown: indices of the states with a sensor.
+
+    Raises:
+        UnusableTrials: naming the state, the seconds and the correction.
+    """
+    each = {k: answers_early(model, one, shown) for k, one in enumerate(trials)}
+    few = 2 * sum(early is not None for early in each.values()) < len(each)  # a swing that sticks
+    found = {k: e for k, e in each.items() if e and (not few or e.gain > SURELY)}
+    if found:
+        early = next(iter(found.values()))
+        names = [model.state_names[i] for i in _known(trials[min(found)], shown)]
+        raise unusable(trials, list(found), early.said(model), early.mend(names))
+
+
+def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | None:
+    """Return by how much the states of a trial lead its commands; None if they do not.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: indices of the states with a sensor.
+    """
+    trial = trial.until(trial.known_steps)
+    reach = min(round(REACH_S / trial.dt), trial.steps // 4)
+    least, every = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
+    if reach <= least or not np.isfinite(trial.inputs).all():
+        return None
+    seen = _known(trial, shown)
+    trial, known = _with_differences(model, trial, seen)
+    ones, steps = np.ones(model.m), trial.steps - reach
+
+    def later(k: int, sent: Array = trial.inputs, delays: tuple[float, ...] = (0.0,)) -> Ahead:
+        moved = replace(trial, states=trial.states[: steps + 1], inputs=sent[k : k + steps])
+        return Ahead(model, moved, known, STARTS, delays, linear=True)
+
+    def as_told(ahead: Ahead) -> Fit:
+        free = ahead.best([ones])
+        near = ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all()
+        return free if near else ahead.best([ones], free=False)
+
+    with np.errstate(all="ignore"):
+        logged = later(0, delays=(0.0, 0.05, 0.1, 0.2))
+        if not logged.enough:
+            return None
+        # the shift that the model as it is likes best, then its neighbours, calibrated
+        moved = {k: later(k).plain(ones).score for k in range(least, reach + 1, every)}
+        about = min(moved, key=lambda k: moved[k])
+        if moved[about] > logged.plain(ones).score - HINT:
+            return None
+        near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
+        fits = {k: as_told(later(k)) for k in near}
+        k = min(fits, key=lambda k: fits[k].score)
+        if fits[k].score > logged.still().score - CLEAR:
+            return None  # the commands explain nothing
+        # all that past and present commands can do
+        slope = np.diff(trial.inputs, axis=0, prepend=trial.inputs[:1]) / trial.dt
+        before = min(
+            logged.best([ones, 0.0 * ones]),
+            logged.whatever_commands_do().best([ones]),
+            *(later(0, trial.inputs + lead * slope).best([ones]) for lead in LEADS),
+            key=lambda fit: fit.score,
+        )
+    parts = fits[k].rms / before.rms
+    if before.score - fits[k].score < CLEAR or parts.min() > HALF:
+        return None
+    state = min(seen, key=lambda i: float(parts[i]))
+    errors = float(before.rms[state]), float(fits[k].rms[state])
+    return Early(k * trial.dt, state, *errors, gain=before.score - fits[k].score)
+
+
+def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
+    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+
+
+def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Trial, list[int]]:
+    """Fill in unmeasured velocities by central differences of their positions."""
+    states, w = np.array(trial.states), max(1, round(0.04 / trial.dt))
+    found = list(known)
+    for one in integrals(model):
+        if one.exact and one.i in known and one.j not in found and trial.steps > 2 * w:
+            x = states[:, one.i]
+            states[:, one.j] = np.nan
+            states[w:-w, one.j] = (x[2 * w :] - x[: -2 * w]) / (2 * w * trial.dt * one.c)
+            found.append(one.j)
+    return replace(trial, states=states), sorted(found)
+
+
+@dataclass(frozen=True)
+class Acts:
+    """How an input acts in a trial.
+
+    Args:
+        sign: 1 as in the model, -1 the other way round, 0 if the trial does not show it.
+        share: its effect as a share of the modelled one, below 0 the other way round.
+    """
+
+    sign: int
+    share: float
+
+
+UNKNOWN = Acts(0, float("nan"))
+
+
+def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Acts, ...]:
+    """Return how each input acts in a trial.
+
+    Args:
+        model: however crude, with the effects adopted.
+        trial: of its states and inputs; only its part without gaps is used.
+        shown: indices of the states with a sensor.
+    """
+    known = trial.until(max(trial.known_steps, 0))
+    some = _known(known, shown)
+    if not some or not np.isfinite(known.inputs).all():
+        return (UNKNOWN,) * model.m
+    found = list[tuple[Array, Array]]()
+    with np.errstate(all="ignore"):
+        for seconds in (HORIZONS[0], HORIZONS[-1]):
+            ahead = Ahead(model, known, some, STARTS, DELAYS, linear=True, horizon=seconds)
+            if ahead.enough:
+                found.append(_scores(ahead))
+    return tuple(_acts([(nats[j], shares[j]) for nats, shares in found]) for j in range(model.m))
+
+
+def _scores(ahead: Ahead) -> tuple[Array, Array]:
+    """Return what is missed [nats] with each input forth, without and back (m, 3), and its share.
+
+    What an input does is all but linear in it, so that its share can be fitted; predictions for
+    which it is not are left out. The commands may act late. NaN for an input that hardly moves on
+    its own.
+    """
+    m = ahead.model.m
+    gains = np.vstack([np.ones(m), 1.0 - np.eye(m), 1.0 - 2.0 * np.eye(m)])
+    nats, shares = np.full((m, 3), np.nan), np.full(m, np.nan)
+    least = np.full(m, np.inf)
+    for late in ahead.delays:
+        off = ahead.missed(gains, ahead.model.values, late)
+        by = off[:1] - off[1 : m + 1]  # what each input does (m, N, k)
+        bent = off[:1] - off[m + 1 :] - 2 * by
+        size = np.square(by / ahead.least).sum(axis=(0, 2))
+        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= EVEN**2 * size
+        even &= np.isfinite(off).all(axis=(0, 2))
+        if even.sum() < LEAST:
+            continue
+        linear = basis(ahead.first[even][:, ahead.shown])
+        each = np.concatenate([off[:1], by])[:, even]
+        own = each - np.einsum("nc,xck->xnk", linear, np.einsum("nc,xnk->xck", linear, each))
+        moved = np.square((each - each.mean(axis=1, keepdims=True)) / ahead.least).sum(axis=(1, 2))
+        alone = np.sqrt(np.square(own / ahead.least).sum(axis=(1, 2)) / moved)[1:]
+        for j in np.flatnonzero(alone > OWN).tolist():
+            tried = [_left(ahead, own, j, share) for share in (1.0, 0.0, -1.0)]
+            nats[j] = np.fmin(nats[j], [score for score, _ in tried])
+            if (best := _left(ahead, own, j, None))[0] < least[j]:
+                least[j], shares[j] = best
+    return nats, shares
+
+
+def _left(ahead: Ahead, own: Array, j: int, share: float | None) -> tuple[float, float]:
+    """Return what is missed [nats] with a share of input j, None: the best one; and that share."""
+    free = [k for k in range(len(own) - 1) if k != j or share is None]
+    rest = own[0] + (0.0 if share is None else share - 1.0) * own[1 + j]
+    left, shares = rest, np.zeros(len(free))
+    for _ in range(3):  # weighted by what each state misses
+        size = ahead.size(left)
+        design = (own[1:][free] / size).reshape(len(free), rest.size).T
+        shares = np.linalg.lstsq(design, -(rest / size).ravel(), rcond=1e-6)[0]
+        left = rest + np.einsum("x,xnk->nk", shares, own[1:][free])
+    found = 1.0 + float(shares[free.index(j)]) if share is None else share
+    return float(np.log(ahead.size(left)).sum()), found
+
+
+def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
+    """Return how an input acts, if predictions of all lengths agree on it."""
+    known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
+    if not known:
+        return UNKNOWN
+    # over the length that tells most it must lead, over the others do better than its reverse
+    leads = [
+        float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]
+    ]
+    nats, share = known[int(np.argmax(leads))]
+    way = int(nats.argmin())
+    agree = [float(one[2 - way] - one[way]) for one, _ in known]
+    reversal = way == 2 and (len(known) < 2 or min(agree) < HINT)
+    sized = SHARES[0] < (1 - way) * share < SHARES[1]
+    clear = way != 1 and max(leads) > HINT and min(agree) > 0 and not reversal
+    return Acts(1 - way if clear and sized else 0, float(share))
+
+
+def judge_signs(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
+    """Raise an error if an input acts the other way round in some trials than in others.
+
+    Args:
+        model: however crude, with the effects adopted.
+        trials: already corrected for other faults.
+        shown: indices of the states with a sensor.
+
+    Raises:
+        UnusableTrials: naming the trials and the input, and what to do.
+    """
+    if len(trials) < 2:
+        return
+    acts = [how_inputs_act(model, trial, shown) for trial in trials]
+    for name, every in zip(model.input_names, zip(*acts, strict=True), strict=True):
+        right, wrong = ([k for k, one in enumerate(every) if one.sign == s] for s in (1, -1))
+        if not (right and wrong):
+            continue
+        # the fewer are wrong, and of equally many those that contradict the model
+        odd, rest = (wrong, right) if len(wrong) <= len(right) else (right, wrong)
+        ids, others = ([trials[k].id or f"number {k + 1}" for k in some] for some in (odd, rest))
+        said = (
+            f"{name} acts the other way round than in {listed(others)}"
+            f"{' and in the model' if odd is wrong else ', though as in the model'} "
+            f"({100 * every[odd[0]].share:.0f} % of its modelled effect, in {others[0]} "
+            f"{100 * every[rest[0]].share:.0f} %): no model explains both"
+        )
+        these = "this trial" if len(odd) == 1 else "these trials"
+        mend = (
+            f"Was a motor wired otherwise, or a sign switched? Then discard {these}, mend it and "
+            "run again. If only the log has the other sign, correct the log and ingest it again"
+        )
+        where = f"in trial{'s' * (len(odd) > 1)} {listed(ids)}"
+        then = NextCommand("discard", tuple(ids)) if trials[0].id else None
+        raise UnusableTrials(f"{where} {said}. {mend}", said, mend, said, then)

@@ -1,0 +1,221 @@
+"""Finding: one fault of a sensor or command, with the values needed to correct it.
+
+`Preflight` holds all findings with the corrected trials; `UnusableTrials` is raised if they can't
+be corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Document
+from grounded.trial import Trial
+
+RPM = 9.549296585513721  # revolutions per minute in one radian per second
+LEFT_OUT = "left out of the diagnosis: it tells nothing more than"  # the log of its position
+SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
+AS_LATE = "is in one message with, and so as late as,"  # the signal that shows the delay
+ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
+
+
+@dataclass(frozen=True, eq=False)
+class Finding(Document):
+    """A fault of one signal, and whether the trials were corrected for it.
+
+    Args:
+        signal: a state or an input, or several joined by "+".
+        finding: one clause that continues a sentence after the signal's name.
+        kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
+            missing, quantised, saturated, beyond (its limits), constant, copy, mismatch (with
+            others), unresolved (too fast for the model's time step) or time step (of the
+            integrator, which is too long for the model).
+        delay_s: delay of the signal [s].
+        std_s: standard deviation of the delay [s].
+        scale: measured value over true value.
+        share: share of the samples affected, 0 to 1.
+        corrected: whether the trials were corrected before the physics was identified.
+        log: key and value for the signal's [log] table that correct the logs as well.
+        advice: what to change in the log itself, where no key of [log] corrects it.
+        source: the position from which a velocity was computed.
+    """
+
+    signal: str
+    finding: str
+    kind: str = ""
+    delay_s: float = 0.0
+    std_s: float = field(default=float("nan"), metadata={"brief": True})
+    scale: float = 1.0
+    share: float = field(default=float("nan"), metadata={"brief": True})
+    corrected: bool = False
+    log: str = field(default="", metadata={"brief": True})
+    advice: str = field(default="", metadata={"brief": True})
+    source: str = field(default="", metadata={"brief": True})
+
+
+def put_right(
+    name: str,
+    text: str,
+    kind: str,
+    log: str,
+    *,
+    delay_s: float = 0.0,
+    std_s: float = float("nan"),
+    scale: float = 1.0,
+) -> Finding:
+    """Return a finding for which the trials were corrected."""
+    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
+
+
+def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
+    """Return the time constants of corrected sensor filters by state [s]."""
+    return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
+
+
+def in_the_log(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the corrected findings of degrees and signs: the logs themselves are still wrong."""
+    return [one for one in findings if one.corrected and one.kind in ("degrees", "sign")]
+
+
+def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
+    """Return the sensor filters and delays that were found and corrected, as effects by name.
+
+    The physics was identified without them, but a feedback controller sees the delayed signals.
+    """
+    found = dict[str, dict[str, float]]()
+    for one in findings:
+        if one.corrected and one.kind == "lag" and one.delay_s > 0 and not one.log:
+            found[f"sensor_lag:{one.signal}"] = {"tau": one.delay_s}
+        elif one.corrected and one.kind == "delay" and one.delay_s > 0:
+            name = f"{SENSOR_DELAY}{one.signal}"
+            found[name] = {"d": found.get(name, {"d": 0.0})["d"] + one.delay_s}
+    return found
+
+
+def late_as_positions(
+    findings: Iterable[Finding], delays: Mapping[str, float], known: Container[str]
+) -> Iterator[Finding]:
+    """Yield a finding for each velocity that is computed from a position whose sensor is late.
+
+    It is late by as much, too: what the sensors show of it is only how far behind its position it
+    is.
+
+    Args:
+        findings: those of all sensors.
+        delays: delays of sensors that the physics shows [s], by effect: `sensor_delay:x`.
+        known: names of effects that the model has already.
+    """
+    for one in findings:
+        late = {
+            name: delay
+            for name, delay in delays.items()
+            if one.source in (states := name.removeprefix(SENSOR_DELAY).split("+"))
+            if one.signal not in states
+        }
+        if late and sum(late.values()) > 0 and f"{SENSOR_DELAY}{one.signal}" not in known:
+            d, position = sum(late.values()), one.source
+            text = f"is older by another {d:.3g} s, by which the log of {position} itself is late"
+            yield Finding(one.signal, text, "delay", d, corrected=True, source=position)
+
+
+def a_mean(name: str, position: str, over: float) -> Finding:
+    """Return the finding of a velocity that is a difference of its position over a time [s]."""
+    text = f"is a mean over {over:.2g} s, as from differences of {position}; {LEFT_OUT} {position}"
+    return Finding(name, text, "smoothed", corrected=True, source=position)
+
+
+def derived_from(position: str, age: float) -> str:
+    """Return what is said of a velocity that a filter computes from its position."""
+    return (
+        f"is a filtered derivative of {position}, {age:.2g} s behind it on average; "
+        f"{LEFT_OUT} {position}"
+    )
+
+
+def scaled(name: str, position: str, size: float, unit: str) -> Finding:
+    """Return the finding of a velocity that is `size` times the rate of its position."""
+    text = f"shows {100 * size:.3g} % of the rate of {position}"
+    if unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
+        text = f"{text}, 2 pi / 60 times it: it was probably converted from rpm by mistake"
+    else:
+        text = f"{text}; either may be wrong"
+    return Finding(name, text, "scale", scale=size)
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """The findings of all checks, and the corrected trials."""
+
+    findings: tuple[Finding, ...]
+    trials: tuple[Trial, ...]
+    in_step: frozenset[str] = frozenset()  # states whose sensors are seen to be synchronous
+    refuted: frozenset[str] = frozenset()  # effects ruled out because two sensors agree
+
+    @property
+    def filters(self) -> dict[str, float]:
+        """Time constants of filtering sensors by state [s]."""
+        return filters_of(self.findings)
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """States whose sensors add nothing to others."""
+        return frozenset(f.signal for f in self.findings if f.kind == "smoothed")
+
+    @property
+    def settled(self) -> frozenset[str]:
+        """Names of the sensor effects that are already corrected or ruled out."""
+        mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
+        return self.refuted | frozenset(
+            f"{family}:{name}"
+            for name in self.in_step | mended
+            for family in ("sensor_delay", "sensor_lag")
+        )
+
+
+class UnusableTrials(GroundedError):
+    """Raised for trials that must be corrected.
+
+    Args:
+        message: the whole message.
+        clauses: only what is wrong with them.
+        mend: what to do before their logs are ingested again.
+        in_program: only what is wrong with them, for a program that has no [log].
+        then: the command that discards them.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        clauses: str,
+        mend: str,
+        in_program: str,
+        then: NextCommand | None = None,
+    ) -> None:
+        super().__init__(message, then)
+        self.clauses, self.mend, self.in_program = clauses, mend, in_program
+
+
+def unusable(
+    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str, in_program: str = ""
+) -> UnusableTrials:
+    """Return the error that some trials must be corrected and ingested again, with its command.
+
+    Args:
+        trials: all of them.
+        odd: indices of those affected.
+        clauses: what is wrong with them.
+        mend: what to do before the log is ingested again.
+        in_program: the clauses for a program, if they name keys of [log].
+    """
+    names = [trials[k].id or f"number {k + 1}" for k in odd]
+    one, every = len(odd) == 1, len(odd) == len(trials) > 1
+    where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
+    return UnusableTrials(
+        f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
+        "ingest the log again",
+        clauses,
+        mend,
+        in_program or clauses,
+        then=NextCommand("discard", tuple(names)) if trials[odd[0]].id else None,
+    )

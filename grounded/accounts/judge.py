@@ -1,0 +1,473 @@
+"""START HERE: tell how logs came about, by scoring the accounts of the table.
+
+Every account is scored by what it leaves unexplained: the kinematic rows of the trial as it would
+be otherwise (`kinematics`), and the motion that the model, calibrated on it, misses (`motion`), in
+nats. No physics breaks a row, so an account of rows is told if it mends every row that it
+touches; the motion then decides between accounts that mend the same rows. What rows can't show is
+told by the motion alone, and there "as logged" may use any gains and signs of its inputs, whereas
+an account must stay near the model's: a model that is only wrong gains nothing by a fault of a log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.accounts.kinematics import (
+    Gap,
+    Row,
+    Turned,
+    away,
+    dead,
+    folded,
+    gaps,
+    kinematic_rows,
+    turned,
+)
+from grounded.accounts.motion import Ahead, Fit, horizon_of
+from grounded.accounts.table import Account, of_motion, of_rows
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.places import integrals
+from grounded.trial import Trial
+
+BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
+BETTER = 3.0  # factor by which a bad row's share must fall
+ROUNDING = 0.01  # of a row's motion: smaller shares count as this
+OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
+TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
+SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
+NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
+CLEAR, HINT, HALF = 1.0, 0.4, 0.5  # [nats] by calibrated and plain predictions; share of one error
+LIKE = 4.0  # factor within which an input must act as in the model
+TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
+SHORTLIST = 8  # accounts for which the model is calibrated
+FAR = 20.0  # times as large as in other trials: a trial to be examined
+
+
+@dataclass(frozen=True)
+class Told:
+    """An account of some trials, and what shows it.
+
+    Args:
+        account: the story.
+        trials: indices of the trials that it concerns.
+        gain: by how much less is unexplained [nats].
+        others: accounts that explain the trials as well.
+        whole: whether it concerns all trials.
+        by_motion: the state that the model predicts best with it, its rms error as logged and
+            mended, and how far ahead [s]; None if kinematics show it.
+        moved: of a dead velocity: its position, its mean and how far the position moves.
+    """
+
+    account: Account
+    trials: tuple[int, ...]
+    gain: float
+    others: tuple[Account, ...] = ()
+    whole: bool = True
+    by_motion: tuple[int, float, float, float] | None = None
+    moved: tuple[int, float, float] | None = None
+
+    @property
+    def certain(self) -> bool:
+        """Whether trials are corrected, rather than refused."""
+        if self.account.kind == "dead":
+            return not self.whole
+        if self.by_motion:
+            return self.account.unit == "deg" or (self.account.kind == "unit" and not self.whole)
+        return self.account.certain
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is told of trials.
+
+    Args:
+        told: accounts in the order in which they were found.
+        trials: as they would be without any fault.
+        corrected: the same without what is certain alone.
+        rows: the kinematic rows.
+        open: the rows that no account explains, with their gaps.
+        folded: angles in degrees that were unwrapped as radians, with their trials.
+    """
+
+    told: tuple[Told, ...]
+    trials: tuple[Trial, ...]
+    corrected: tuple[Trial, ...]
+    rows: tuple[Row, ...]
+    open: Mapping[Row, Gap]
+    folded: Mapping[int, Sequence[int]]
+
+
+def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdict:
+    """Tell how trials came about.
+
+    Args:
+        model: however crude.
+        trials: of its states and inputs, of one time step.
+        shown: indices of the states with a sensor.
+    """
+    rows, mended, told = kinematic_rows(model, shown), list(trials), list[Told]()
+    known = {row.i for row in rows}  # a scale between two sensors may be uncertain
+    plain = (r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown})
+    rows += [Row(r.i, (r.j,), r.c) for r in plain if r.i not in known]
+    with np.errstate(all="ignore"):
+        # dead sensors first: as noise they would look like anything
+        for one in _dead(model, mended, shown):
+            told.append(one)
+            mended = _without(one, mended)
+        for one in _by_rows(model, mended, rows, shown):
+            told.append(one)
+            mended = _without(one, mended)
+        lost = folded(model, mended, rows)
+        left = _pooled([gaps(model, trial, rows) for trial in mended])
+        for one in [] if lost else _by_motion(model, mended, rows, shown):
+            told.append(one)
+            mended = _without(one, mended)
+    corrected = list(trials)
+    for one in (one for one in told if one.certain):
+        corrected = _without(one, corrected)
+    bad = {row: gap for row, gap in left.items() if gap.share > BAD}
+    return Verdict(tuple(told), tuple(mended), tuple(corrected), tuple(rows), bad, lost)
+
+
+def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
+    """Return trials without a fault, where they have it."""
+    return [told.account.mended(t) if k in told.trials else t for k, t in enumerate(trials)]
+
+
+def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Told]:
+    """Yield the velocities that show no motion."""
+    each = [dead(model, trial, shown) for trial in trials]
+    for j in sorted({j for one in each for j in one}):
+        some = tuple(k for k, one in enumerate(each) if j in one)
+        account = Account("dead", (j,))
+        yield Told(account, some, 0.0, whole=len(some) == len(trials), moved=each[some[0]][j])
+
+
+def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Account) -> bool:
+    """Check whether the model predicts a trial clearly better as logged than without a fault.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: indices of the states with a sensor.
+        account: the fault, of another trial.
+    """
+    known, ones = _known(trial, shown), np.ones(model.m)
+    seconds = horizon_of(trial, known)
+    logged, mended = (
+        Ahead(model, one, known, STARTS, horizon=seconds) for one in (trial, account.mended(trial))
+    )
+    if not (logged.enough and mended.enough) or not np.isfinite(trial.inputs).all():
+        return False
+    with np.errstate(all="ignore"):
+        return mended.plain(ones).missed - logged.plain(ones).missed > HINT
+
+
+# --- by rows --------------------------------------------------------------------------------------
+
+
+def _by_rows(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> list[Told]:
+    """Return the fewest accounts after which all rows agree, of trials with the same bad rows."""
+    plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
+    each = [gaps(model, trial, rows) for trial in trials]
+    groups = dict[frozenset[Row], list[int]]()
+    for k, one in enumerate(each):
+        groups.setdefault(frozenset(_bad(one)), []).append(k)
+    sound = [trials[k] for k in groups.pop(frozenset(), [])]
+    usual = None
+    if sound:
+        usual = np.median([_spread(trial, range(model.n)) for trial in sound], axis=0)
+    found = dict[Account, list[tuple[int, Account, float, tuple[Account, ...]]]]()
+    queue = list(groups.values())
+    while queue:
+        group = queue.pop()
+        some, before = [trials[k] for k in group], _pooled([each[k] for k in group])
+        story = list[tuple[Account, float, tuple[Account, ...]]]()
+        while bad := _bad(before):
+            best = _best(model, some, rows, before, plane, shown, usual)
+            if best is None or len(story) > len(bad) + len(rows):
+                break
+            story.append(best)
+            some = [best[0].mended(trial) for trial in some]
+            before = _pooled([gaps(model, trial, rows) for trial in some])
+        if not story and len(group) > 1:
+            queue += [[k] for k in group]  # each may have a fault of its own
+        for account, gain, others in story:
+            same = replace(account, offset=0.0)
+            found.setdefault(same, []).extend((k, account, gain, others) for k in group)
+    return [_together(some, len(trials), sound) for some in found.values()]
+
+
+def _together(
+    some: Sequence[tuple[int, Account, float, tuple[Account, ...]]],
+    count: int,
+    sound: Sequence[Trial],
+) -> Told:
+    """Return one account of several trials; an offset is their mean, or a right angle nearby."""
+    trials = tuple(dict.fromkeys(k for k, *_ in some))
+    _, account, gain, others = some[0]
+    if account.fitted:
+        turn = float(np.angle(np.mean([np.exp(1j * one.offset) for _, one, *_ in some])))
+        right = float(np.rint(turn / (np.pi / 2)) * np.pi / 2)
+        account = replace(account, offset=right if abs(turn - right) < SNAPPED else turn)
+    return Told(account, trials, gain, () if sound else others, len(trials) == count)
+
+
+def _bad(found: Mapping[Row, Gap]) -> list[Row]:
+    return [row for row, gap in found.items() if gap.share > BAD]
+
+
+def _best(
+    model: Model,
+    trials: Sequence[Trial],
+    rows: Sequence[Row],
+    before: Mapping[Row, Gap],
+    plane: Turned | None,
+    shown: Sequence[int],
+    usual: Array | None,
+) -> tuple[Account, float, tuple[Account, ...]] | None:
+    """Return the account that best mends the rows of trials, its gain and those as good."""
+    bad = _bad(before)
+    some = frozenset(k for row in bad for k in row.states)
+    cost = dict[Account, float]()
+    for account in [*_of_bad(model, some, rows, plane), *_paces(model, bad, before)]:
+        account, mended = _fitted(model, trials, account, rows, plane)
+        if account.fitted and abs(account.offset) < TURNED_AWAY:
+            continue
+        entered = [r for r in before if r.states & account.touched or account.kind == "pace"]
+        after = _pooled([gaps(model, one, entered) for one in mended])
+        agree = all(_agrees(row, before, after) for row in entered)
+        if agree and _of_this_size(account, after):
+            gained = sum(_nats(after[row].share) - _nats(before[row].share) for row in entered)
+            cost[account] = gained + account.price + _strange(account, mended[0], usual)
+    if not cost:
+        return None
+    # accounts that mend the same rows are told apart by the motion
+    least = min(cost.values())
+    near = [account for account in cost if cost[account] < least + NEAR]
+    if len(near) > 1:
+        ahead = horizon_of(trials[0], shown)
+        for account in near:
+            cost[account] += _unpredicted(model, account.mended(trials[0]), shown, ahead)
+    near.sort(key=lambda account: cost[account])
+    others = tuple(
+        one
+        for one in near[1:]
+        if cost[one] < cost[near[0]] + TIED and not one.touched > near[0].touched
+    )
+    return near[0], -least, others
+
+
+def _of_bad(
+    model: Model, some: frozenset[int], rows: Sequence[Row], plane: Turned | None
+) -> Iterator[Account]:
+    columns: tuple[int, ...] = ()
+    if plane is not None and {plane.i, plane.j} & some:
+        rate = next((row.by[0] for row in rows if row.i == plane.k and len(row.by) == 1), -1)
+        units = list(model.states.values())
+        own = {k for row in rows if row.i in (plane.i, plane.j) for k in row.by}
+        speeds = [k for k in sorted(own) if units[k] == "m/s"]
+        columns = (plane.i, plane.j, plane.k, rate, *speeds)
+    return of_rows(model, some, frozenset(k for row in rows for k in row.states), columns)
+
+
+def _paces(model: Model, bad: Sequence[Row], before: Mapping[Row, Gap]) -> Iterator[Account]:
+    """Yield that time stamps are in ms, or were taken for ms, if no row is sound."""
+    if len(bad) == len(before):
+        yield Account("pace", tuple(range(model.n)), 1e3, unit="ms", price=1.0)
+        yield Account("pace", tuple(range(model.n)), 1e-3, unit="ms", price=1.0)
+
+
+def _fitted(
+    model: Model,
+    trials: Sequence[Trial],
+    account: Account,
+    rows: Sequence[Row],
+    plane: Turned | None,
+) -> tuple[Account, list[Trial]]:
+    """Return an account with its offset estimated, and the trials without the fault."""
+    mended = [account.mended(trial) for trial in trials]
+    if account.fitted and plane is not None:
+        turn = away(model, mended, rows, plane)
+        account = replace(account, offset=turn)
+        mended = [account.mended(trial) for trial in trials]
+    return account, mended
+
+
+def _agrees(row: Row, before: Mapping[Row, Gap], after: Mapping[Row, Gap]) -> bool:
+    """Check whether a row that an account touches is mended, or stays good."""
+    if row not in after:
+        return False
+    bad, left = before[row].share > BAD, after[row].share
+    most = min(MENDED, before[row].share / BETTER) if bad else max(MENDED, before[row].share)
+    return bool(left < most)
+
+
+def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
+    """Check whether all rows together are right in size, where an account names a unit."""
+    gross = abs(np.log(abs(account.factor))) > np.log(GROSSLY)
+    power = sum(gap.power for gap in after.values())
+    ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
+    off = abs(np.log(max(ratio, 1e-9)))
+    return account.kind != "unit" or bool(off < (OF_TEN if gross else OF_A_UNIT))
+
+
+def _strange(account: Account, mended: Trial, usual: Array | None) -> float:
+    """Return how unlike other trials the columns of a trial are in size [nats]."""
+    some = [k for k in account.touched if usual is not None and k < len(usual)]
+    if usual is None or not some or account.kind == "pace":
+        return 0.0
+    size = _spread(mended, some)
+    return float(np.minimum(np.abs(np.log(size / usual[some])), NEAR).sum())
+
+
+def _spread(trial: Trial, some: Sequence[int]) -> Array:
+    """Return the standard deviation of some states (len(some),); about 0 without samples."""
+    x = trial.states[:, list(some)]
+    known = np.isfinite(x)
+    count = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, x, 0.0).sum(axis=0) / count
+    return np.asarray(np.sqrt((np.where(known, x - mean, 0.0) ** 2).sum(axis=0) / count) + 1e-300)
+
+
+def _nats(share: float) -> float:
+    return float(np.log(max(share, ROUNDING)))
+
+
+def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
+    """Return the gap of each row over several trials (rms)."""
+    found = dict[Row, list[Gap]]()
+    for one in every:
+        for row, gap in one.items():
+            found.setdefault(row, []).append(gap)
+    return {
+        row: Gap(*np.sqrt(np.mean(np.square([_numbers(gap) for gap in some]), axis=0)).tolist())
+        for row, some in found.items()
+    }
+
+
+def _numbers(gap: Gap) -> tuple[float, ...]:
+    return gap.share, gap.varying, gap.rate, gap.ratio, gap.power
+
+
+# --- by motion ------------------------------------------------------------------------------------
+
+
+def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
+    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+
+
+def _unpredicted(model: Model, trial: Trial, shown: Sequence[int], ahead: float) -> float:
+    """Return how much of a trial's motion the calibrated model misses [nats], at most 0."""
+    made = Ahead(model, trial, _known(trial, shown), FEWER, horizon=ahead)
+    if not made.enough or not np.isfinite(trial.inputs).all():
+        return 0.0
+    return made.best([np.ones(model.m)], free=False).missed
+
+
+def _by_motion(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> Iterator[Told]:
+    """Yield the account that predictions of some trials show and none contradicts, if any."""
+    some = _examined(trials, shown)
+    found = dict[Account, dict[int, tuple[Fit, Fit, float]]]()
+    against = dict[Account, set[int]]()
+    table = list(of_motion(model, shown, [trials[k] for k in some]))
+    for k in some:
+        for account, fits in _each(model, trials[k], rows, shown, table):
+            if fits is None:
+                against.setdefault(account, set()).add(k)
+            else:
+                found.setdefault(account, {})[k] = fits
+    # a trial in another unit may be one of many; columns are exchanged in all of a kind
+    whole = {
+        account: fits
+        for account, fits in found.items()
+        if not against.get(account) or account.kind == "unit"
+    }
+    if not whole:
+        return
+    most = max(map(len, whole.values()))
+    cost = {
+        account: float(np.mean([after.missed for _, after, _ in fits.values()])) + account.price
+        for account, fits in whole.items()
+        if len(fits) == most
+    }
+    best, *others = sorted(cost, key=lambda account: cost[account])
+    near = tuple(one for one in others if cost[one] < cost[best] + TIED and one.kind == best.kind)
+    before, after, ahead = next(iter(whole[best].values()))
+    i = int(np.argmin(after.share / before.share))
+    seen = (i, float(before.rms[i]), float(after.rms[i]), ahead)
+    gain = float(np.mean([b.missed - a.missed for b, a, _ in whole[best].values()]))
+    every = tuple(range(len(trials))) if not against.get(best) else tuple(whole[best])
+    yield Told(best, every, gain, near, len(every) == len(trials), seen)
+
+
+def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
+    """Return the trials that are predicted: some, and those of another size than the others."""
+    some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
+    size = np.array([_spread(t, shown) for t in trials])
+    apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
+    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(FAR))[:TRIALS]})
+
+
+def _each(
+    model: Model,
+    trial: Trial,
+    rows: Sequence[Row],
+    shown: Sequence[int],
+    table: Sequence[Account],
+) -> Iterator[tuple[Account, tuple[Fit, Fit, float] | None]]:
+    """Yield each account on which a trial is informative, with the fits as logged and mended.
+
+    None in place of the fits if the log is better as it is.
+    """
+    known, ones, seconds = _known(trial, shown), np.ones(model.m), horizon_of(trial, shown)
+    logged = Ahead(model, trial, known, FEWER, horizon=seconds)
+    if not logged.enough or not np.isfinite(trial.inputs).all():
+        return
+    before, gains = gaps(model, trial, rows), dict[Account, float]()
+    plain, ahead = logged.plain(ones).missed, dict[Account, Ahead]()
+    for account in table:
+        mended = account.mended(trial)
+        entered = [row for row in before if row.states & account.touched]
+        after = gaps(model, mended, entered)
+        if not all(r in after and after[r].share <= max(MENDED, before[r].share) for r in entered):
+            continue  # the rows contradict it
+        made = Ahead(model, mended, known, FEWER, horizon=seconds)
+        if made.enough:
+            ahead[account], gains[account] = made, plain - made.plain(ones).missed
+    for account in sorted(gains, key=lambda one: -gains[one])[:SHORTLIST]:
+        if gains[account] > HINT and (fits := _compared(model, logged, ahead[account], account)):
+            yield account, (*fits, seconds)
+    for account, gain in gains.items():
+        if gain < -HINT:
+            yield account, None
+
+
+def _compared(
+    model: Model, logged: Ahead, mended: Ahead, account: Account
+) -> tuple[Fit, Fit] | None:
+    """Return both calibrated fits; None if the account is not clearly better after calibration."""
+    ones, unit = np.ones(model.m), account.kind == "unit"
+    free = mended.best([ones])
+    sent = [k - model.n for k in account.touched if k >= model.n]
+    size = np.abs(np.log(np.maximum(free.gains[sent], 1e-9)))
+    if (size > (np.log(LIKE) if not unit else abs(np.log(account.factor)) / 3)).any():
+        return None  # the inputs act otherwise than in the model
+    after = mended.best([ones], free=False) if unit else free
+    if mended.still().missed - after.missed < CLEAR * (0.5 if unit else 1.0):
+        return None  # commands explain nothing
+    if unit:
+        before = logged.best([ones], free=False)
+    else:
+        signs = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
+        before = logged.best([ones, -ones, 0.0 * ones, *(signs if model.m > 1 else ())])
+    better = before.missed - after.missed > CLEAR + account.price
+    return (before, after) if better and (after.share < HALF * before.share).any() else None

@@ -1,0 +1,336 @@
+"""What positions, velocities and headings imply of each other, whatever the physics.
+
+The rate of some states consists of logged velocities, perhaps rotated by logged angles: q' = w,
+x' = u cos psi - v sin psi. No input or uncertain parameter enters such a row, except as a constant
+(a current). The displacement that a row predicts over stretches of a log is compared with that of
+its own sensor: the unexplained share is about 1 where a column is dead, in another unit, of the
+other sign or in another's place, and small in an honest log, however wrong the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded import places
+from grounded.frozen import Array, white_noise, wrapped
+from grounded.model import Model
+from grounded.places import integrals
+from grounded.trial import Trial, stretches
+
+SHORT = 1e-6  # [s] time step from which rates are computed
+STRETCH = 0.3  # [s] shortest stretch
+LEAST = 8  # stretches that a trial must hold
+NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
+SMALL = 1e-4  # of a rate, or of its largest derivative: treated as zero
+STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
+DEGREES = 180 / np.pi
+QUIET, SHAPE = 0.1, 0.5  # of a dead rate: its share of the motion, and correlation with it
+WINDOWS = 40  # windows of a piece over which a rate is sought dead
+
+
+@dataclass(frozen=True)
+class Row:
+    """The rate of state i depends on the states `by` alone; with `c` set, c times a single one."""
+
+    i: int
+    by: tuple[int, ...]
+    c: float = 0.0
+
+    @property
+    def states(self) -> frozenset[int]:
+        """All states that the row relates."""
+        return frozenset((self.i, *self.by))
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The difference between a row's prediction and its own sensor.
+
+    Args:
+        share: rms of the difference, relative to how far the state (or others of its unit) moves.
+        varying: the same without a constant difference.
+        rate: rms of the difference per time [unit/s].
+        ratio: measured displacement over the predicted one, by regression beside a drift.
+        power: variance of the predicted displacement, which weighs the ratio.
+    """
+
+    share: float
+    varying: float
+    rate: float
+    ratio: float
+    power: float
+
+
+def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
+    """Return the kinematic rows of a model whose states all have sensors.
+
+    Args:
+        model: any; a simulator that can't take a short step has no such rows.
+        shown: indices of the states with a sensor.
+    """
+    model, found = places.direct(model), list[Row]()
+    dt = places.probe(model, SHORT)
+    if dt > SHORT:
+        return found
+    # rates that no input and no uncertain parameter changes, and that double with all velocities
+    x, u = places.within_limits(model, 8)
+    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    slopes = (f_x - np.eye(model.n)) / dt
+    fast = np.array([unit.endswith("/s") for unit in model.states.values()])
+    rates, doubled = (_rates(model, z) for z in (x, np.where(fast, 2 * x, x)))
+    size = SMALL * np.abs(rates).max(axis=0)
+    fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
+    for k, one in enumerate(model.params.values()):
+        if one.uncertain:
+            values = np.array(model.values)
+            values[k] = 1.1 * values[k] + 0.01
+            moved = (model.system.step(x, u, values, dt) - x) / dt
+            fixed &= np.ptp(moved - rates, axis=0) < size
+    fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
+    for i in (i for i in shown if i < model.n):
+        slope = np.abs(slopes[:, i]).max(axis=0)
+        by = tuple(int(j) for j in np.flatnonzero(slope > SMALL * slope.max()))
+        if fixed[i] and i not in by and {*by} <= {*shown}:
+            found.append(Row(i, by))
+    return found
+
+
+def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the logged states that can't be checked against any other sensor.
+
+    Args:
+        model: whose kinematics relate sensors.
+        trials: of this model's states.
+    """
+    shown = [i for i in range(model.n) if any(np.isfinite(t.states[:, i]).any() for t in trials)]
+    held = {i for row in kinematic_rows(model, shown) for i in row.states}
+    held |= {i for one in integrals(model) if {one.i, one.j} <= {*shown} for i in (one.i, one.j)}
+    return tuple(model.state_names[i] for i in shown if i not in held)
+
+
+def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
+    """Return the gap of each row, over the stretch length at which it agrees best.
+
+    Args:
+        model: with these rows.
+        trial: with this model's states.
+        rows: of the model; those hidden by noise are missing from the result.
+    """
+    known = [row for row in rows if np.isfinite(trial.states[:, [*row.states]]).any(axis=0).all()]
+    found: dict[Row, Gap] = {}
+    # rows of states that are logged at the same samples are compared together
+    for some in (known,) if _together(trial, known) else ((row,) for row in known):
+        each = per_step(model, trial, some)
+        moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
+        longest = max((len(x) for x in moved), default=0)
+        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // LEAST))
+        while usable := [k for k, x in enumerate(moved) if len(x) > LEAST * steps]:
+            far, told = (
+                np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable])
+                for z in (moved, said)
+            )
+            noise = np.concatenate([np.diff(moved[k], axis=0, n=2) for k in usable])
+            for row, gap in _over(model, some, far, told, _size(noise) / 3, steps * trial.dt):
+                if row not in found or gap.share < found[row].share:
+                    found[row] = gap
+            steps *= 2
+    return found
+
+
+def _together(trial: Trial, rows: Sequence[Row]) -> bool:
+    known = np.isfinite(trial.states[:, sorted({i for row in rows for i in row.states})])
+    return bool((known.all(axis=1) == known.any(axis=1)).all())
+
+
+def _over(
+    model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
+) -> Iterator[tuple[Row, Gap]]:
+    """Yield the gap of each row over stretches of one length [s].
+
+    It is relative to the motion of all states of the same unit: a row's own may hardly move.
+    """
+    units = list(model.states.values())
+    moved, said, off = _size(far), _size(told), _size(far - told)
+    varying, power = np.std(far - told, axis=0), told.var(axis=0)
+    steady = power < STEADY * said**2  # at a constant velocity a drift is no drift
+    power = np.where(steady, said**2, power)
+    both = (far * (told - ~steady * told.mean(axis=0))).mean(axis=0)
+    for row in rows:
+        i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
+        size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))
+        if size > 0 and noise[i] < NOISE * size:
+            ratio = float(both[i] / max(power[i], 1e-300))
+            yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio, power[i])
+
+
+def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:
+    """Return for each piece the displacements per step: measured, and predicted by the rows.
+
+    Args:
+        model: with these rows.
+        trial: with this model's states; a piece has no gaps in the states that the rows relate.
+        rows: of the model.
+
+    Returns:
+        Two arrays (T - 1, n) per piece; only the columns of the rows' states are meaningful.
+    """
+    some, found = sorted({i for row in rows for i in row.states}), []
+    for piece in pieces([trial], some) if rows else ():
+        x = np.zeros((len(piece), model.n))
+        x[:, some] = piece
+        moved = wrapped(np.diff(x, axis=0), model.angle_mask)
+        found.append((moved, _told(model, rows, x) * trial.dt))
+    return found
+
+
+def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
+    """Return the rates over each step by the rows (T - 1, n); 0 for other states."""
+    found = np.zeros((len(x) - 1, model.n))
+    for row in rows:
+        alone = np.full_like(x, 0.5)  # other states must not act, however large
+        alone[:, row.by] = x[:, row.by]
+        rate = row.c * x[:, row.by[0]] if row.c else _rates(model, alone)[:, row.i]
+        found[:, row.i] = 0.5 * (rate[1:] + rate[:-1])
+    return found
+
+
+def _rates(model: Model, x: Array) -> Array:
+    """Return the modelled rates (T, n) at states (T, n), for a fixed input."""
+    u = np.full((len(x), model.m), 0.5)
+    return np.asarray((model.system.step(x, u, model.values, SHORT) - x) / SHORT)
+
+
+def _size(x: Array) -> Array:
+    return np.asarray(np.sqrt((x**2).mean(axis=0)))
+
+
+def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
+    """Yield the stretches (T, columns) of the states that have no gaps."""
+    for trial in trials:
+        some = trial.states[:, list(columns)]
+        good = np.isfinite(some).all(axis=1)
+        yield from (some[a:b] for a, b in stretches(np.asarray(good)) if b - a > 4)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The rates of states i and j rotate with heading k; their size depends on states `speed`."""
+
+    i: int
+    j: int
+    k: int
+    speed: tuple[int, ...]
+
+
+def turned(model: Model) -> Turned | None:
+    """Return the plane in which a model moves; None if it has none."""
+    (x, u), n = places.samples(model, 8), model.n
+    short = places.probe(model, SHORT)
+    f_x, f_u = model.system.linearise(x, u, model.values, short)
+    rates = (model.system.step(x, u, model.values, short) - x) / short
+    slopes = (f_x - np.eye(n)) / short
+    free = [i for i in range(n) if np.abs(f_u[:, i]).max() < 1e-9 and np.abs(rates[:, i]).max() > 0]
+    for i in free:
+        for j in free:
+            for k in range(n):
+                if k in (i, j) or i == j:
+                    continue
+                if _near(slopes[:, i, k], -rates[:, j]) and _near(slopes[:, j, k], rates[:, i]):
+                    along = (rates[:, [i, j], None] * slopes[:, [i, j]]).sum(axis=1)
+                    size = np.abs(along).max(axis=0) > 1e-6
+                    return Turned(i, j, k, tuple(int(s) for s in np.flatnonzero(size) if s != k))
+    return None
+
+
+def _near(a: Array, b: Array) -> bool:
+    return bool(np.abs(a - b).max() < 1e-3 * max(float(np.abs(b).max()), 1e-9))
+
+
+def away(model: Model, trials: Sequence[Trial], rows: Sequence[Row], plane: Turned) -> float:
+    """Return the constant angle [rad] by which a heading must grow for positions to follow it."""
+    both, total = [row for row in rows if row.i in (plane.i, plane.j)], 0j
+    for trial in trials:
+        for moved, said in per_step(model, trial, both):
+            m, s = (one[:, plane.i] + 1j * one[:, plane.j] for one in (moved, said))
+            total += complex((m * s.conj()).sum())
+    return float(np.angle(total))
+
+
+def dead(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[int, float, float]]:
+    """Return the velocities of a trial that show a constant, or noise alone, while all moves.
+
+    A wrong unit or sign would keep the correlation with the motion of the position.
+
+    Args:
+        model: however crude; used only for which state is the rate of which.
+        trial: with this model's states.
+        shown: indices of the states with a sensor.
+
+    Returns:
+        By velocity: its position, the velocity's mean, and how far the position moves.
+    """
+    found, sound = dict[int, tuple[int, float, float]](), set[int]()
+    for one in integrals(model):
+        angle = [model.angle_mask[one.i]]
+        turns = list(model.states.values())[one.i] == "rad"
+        for piece in pieces([trial], (one.i, one.j)) if {one.i, one.j} <= {*shown} else ():
+            if (k := len(piece) // WINDOWS) < 1 or not (one.exact or np.ptp(piece[:, 1]) == 0):
+                continue
+            moved = wrapped(np.diff(piece[:, :1], axis=0), angle)
+            if turns and np.abs(moved).max() > np.pi / 2:  # degrees, or too few samples a turn
+                continue
+            way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
+            said = np.concatenate([[0.0], np.cumsum(one.c * piece[:-1, 1] * trial.dt)])
+            a, b = (s[k:] - s[:-k] for s in (way, said))
+            noise = float(white_noise(way[:, None])[0])
+            if not (a.std() > 3 * noise and np.ptp(way) > 20 * noise):
+                continue
+            late = round(0.5 / trial.dt)
+            if b.std() > QUIET * a.std() or _alike(a, b, late) > SHAPE:
+                sound.add(one.j)
+            else:
+                found[one.j] = (one.i, float(piece[:, 1].mean()), float(np.ptp(way)))
+    return {j: told for j, told in found.items() if j not in sound}
+
+
+def _alike(a: Array, b: Array, most: int) -> float:
+    """Return the largest correlation of two signals, either delayed by up to `most` samples."""
+    best, most = 0.0, min(most, len(a) // 2)
+    for late in range(-most, most + 1):
+        x, y = (a[late:], b[: len(b) - late]) if late >= 0 else (a[:late], b[-late:])
+        if spread := float(x.std() * y.std()):
+            best = max(best, abs(float(((x - x.mean()) * (y - y.mean())).mean())) / spread)
+    return best
+
+
+def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> dict[int, list[int]]:
+    """Return the angles in degrees that were unwrapped as radians, with the trials.
+
+    Resampled as radians, 350 degrees become 350 - 56 x 2 pi: steps of more than pi degrees are
+    lost, and dividing the trial by 57.3 does not restore them. But for whole turns, such an angle
+    turns 57.3 times as far as its row says.
+
+    Args:
+        model: however crude.
+        trials: of this model's states.
+        rows: its kinematic rows.
+    """
+    found = dict[int, list[int]]()
+    for row in (row for row in rows if model.angle_mask[row.i]):
+        for k, trial in enumerate(trials):
+            steps = per_step(model, trial, [row])
+            moved, said = (
+                np.concatenate([[0.0], *(z[n][:, row.i] for z in steps)]) for n in (0, 1)
+            )
+            off, plain = (
+                float(np.sqrt((wrapped((moved - by * said)[:, None], [True]) ** 2).mean()))
+                for by in (DEGREES, 1.0)
+            )
+            fast = (np.abs(DEGREES * said) > np.pi).mean() > 0.01
+            fast &= bool(np.nanmax(np.abs(np.diff(trial.states[:, row.i]))) <= np.pi + 1e-6)
+            if len(moved) > 20 and fast and off < min(0.8, plain / 2):  # 1.8 by chance
+                found.setdefault(row.i, []).append(k)
+    return found

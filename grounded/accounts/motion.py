@@ -1,0 +1,287 @@
+"""The motion given the model: predictions of one trial 0.25 to 1 s ahead, from many samples.
+
+The model predicts as it is, or calibrated on the trial itself: uncertain parameters, a gain on
+every input and a common delay of the commands are fitted, and a constant rate of each state is
+removed. The remaining error is what no plain calibration explains.
+On request everything linear in the states (unmodelled friction, back-EMF, springs) or in the
+commands is removed as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.frozen import Array, white_noise
+from grounded.model import Model
+from grounded.places import motion, true_values
+from grounded.rollout import stepper
+from grounded.trial import Trial
+
+AHEAD = 0.25  # [s]
+FAR = 1e9  # bound on predicted states
+HORIZONS, LOUD = (AHEAD, 0.5, 1.0), 4.0  # [s] tried in turn; motion over noise that is enough
+FLOOR = 0.05  # of a motion: smaller errors count as this
+DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
+LEAST = 20  # fewest samples
+LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
+ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
+SAME = 1e-6  # singular values below this share of the largest count as zero
+ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
+
+Steps = NDArray[np.intp]
+
+
+def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
+    """Return the states that predictions start from at each sample, (T + 1, n).
+
+    States without a sensor are taken as 0, but the memory of adopted inputs' effects as the trial
+    has it, where it follows the commands, and true values behind a delayed log as what is logged
+    later.
+    """
+    names, x = model.state_names, np.array(trial.states)
+    hidden, own = [i for i in range(model.n) if i not in shown], motion(model).state_names
+    known = np.isfinite(x) & np.array([name not in own for name in names])
+    x[:, hidden] = np.where(known, x, 0.0)[:, hidden]
+    for i, k in true_values(names, [names[i] for i in hidden]).items():
+        stem, _, steps = names[i].rpartition("_")
+        stem, ago = (stem, int(steps)) if steps.isdigit() else (names[i], 0)
+        late = sum(f"{stem}_{j + 1}" in names for j in range(model.n))  # up to one step too long
+        at = np.arange(len(x)) + late - ago
+        newer, older = (x[np.clip(at - j, 0, len(x) - 1)] for j in (0, 1 if late else 0))
+        x[:, i] = (older + 0.5 * model.difference(newer, older))[:, k]
+    return x
+
+
+def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
+    """Return how far ahead to predict [s]: until most states move by more than their noise."""
+    noise = np.maximum(white_noise(trial.states[:, list(shown)]), TINY)
+    for seconds in HORIZONS:
+        steps = max(1, round(seconds / trial.dt))
+        moved = trial.states[steps:, list(shown)] - trial.states[:-steps, list(shown)]
+        known = np.isfinite(moved).all(axis=0)
+        if len(moved) < LEAST or not known.any():
+            return seconds
+        if np.median((moved.std(axis=0) / noise)[known]) > LOUD:
+            return seconds
+    return HORIZONS[-1]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The result of calibrating a model on one trial.
+
+    Args:
+        rms: rms error of each state (n,), in its unit; 1 for states without a sensor.
+        gains: gain of each input (m,).
+        moved: how far each state moves in that time (n,); 1 for states without a sensor.
+    """
+
+    rms: Array
+    gains: Array
+    moved: Array
+
+    @property
+    def score(self) -> float:
+        """Sum of the logarithms of the errors [nats]; it is invariant to exchanged columns."""
+        return float(np.log(self.rms).sum())
+
+    @property
+    def share(self) -> Array:
+        """Share of each state's motion that is missed (n,), at most 1: nothing is predicted."""
+        return np.asarray(np.clip(self.rms / np.maximum(self.moved, TINY), FLOOR, 1.0))
+
+    @property
+    def missed(self) -> float:
+        """Sum of the logarithms of the shares [nats], at most 0; it is the same in any unit."""
+        return float(np.log(self.share).sum())
+
+
+class Ahead:
+    """Predictions of one trial.
+
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        shown: indices of the states with a sensor.
+        starts: largest number of samples to predict from.
+        delays: command delays tried [s].
+        linear: also remove errors that are linear in the initial states.
+        constant: remove a constant rate of each state.
+        horizon: how far ahead is predicted [s].
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        trial: Trial,
+        shown: Sequence[int],
+        starts: int,
+        delays: Sequence[float] = DELAYS,
+        *,
+        linear: bool = False,
+        constant: bool = True,
+        horizon: float = AHEAD,
+    ) -> None:
+        self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
+        self.steps = max(1, round(horizon / trial.dt))
+        self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
+        logged = starts_from(model, trial, self.shown)
+        good = np.asarray(np.isfinite(logged).all(axis=1))
+        at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
+        at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
+        self.at = at[:: -(-len(at) // starts)] if len(at) else at
+        self.first, self.last = logged[self.at], logged[self.at + self.steps]
+        self.left_out = basis(self.first[:, self.shown] if linear else self.first[:, :0])
+        self.left_out = self.left_out if constant else self.left_out[:, :0]
+        moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
+        self.least = LITTLE * moves + TINY
+        params = list(model.params.values())
+        self.moving = [k for k, param in enumerate(params) if param.uncertain]
+        self.spread = np.array([params[k].spread for k in self.moving])
+        self.low, self.high = (
+            np.array([other if end is None else end for end in ends])
+            for ends, other in (
+                ([params[k].low for k in self.moving], -np.inf),
+                ([params[k].high for k in self.moving], np.inf),
+            )
+        )
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are enough samples."""
+        return len(self.at) >= LEAST and bool(self.shown)
+
+    @property
+    def moved(self) -> Array:
+        """How far each state moves until the predicted time (n,), rms about the mean."""
+        found = np.ones(self.model.n)
+        off = self.model.difference(self.last, self.first)[:, self.shown]
+        found[self.shown] = off.std(axis=0)
+        return found
+
+    def whatever_commands_do(self) -> Ahead:
+        """Return a copy that also removes errors linear in the past and present commands."""
+        h, half = self.steps, max(1, self.steps // 2)
+        sums = np.concatenate([np.zeros((1, self.model.m)), np.cumsum(self.sent, axis=0)])
+        spans = [(-h, 0), (0, half)] + ([(half, h)] if half < h else [])
+        starts = [np.maximum(self.at + a, 0) for a, _ in spans]
+        told = [sums[self.at + b] - sums[a] for a, (_, b) in zip(starts, spans, strict=True)]
+        other = self._with(self.sent)
+        other.left_out = basis(np.hstack([self.left_out, *told]))
+        return other
+
+    def plain(self, gains: Array) -> Fit:
+        """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
+        return self._fit(self.size(self._off(gains, self.model.values, 0)[0]), gains)
+
+    def still(self) -> Fit:
+        """Return the calibrated fit with every command at its mean: the commands have no effect."""
+        mean = np.broadcast_to(self.sent.mean(axis=0), self.sent.shape)
+        return self._with(mean)._fitted(np.ones(self.model.m), 0, free=False)
+
+    def best(self, starts: Sequence[Array], *, free: bool = True) -> Fit:
+        """Return the best fit over several initial gains, each with its best delay.
+
+        Args:
+            starts: initial gains (m,) each.
+            free: fit the gains as well as the parameters.
+        """
+        fits = [self._fitted(gains, self._late(gains), free=free) for gains in starts]
+        return min(fits, key=lambda fit: fit.score)
+
+    def _late(self, gains: Array) -> int:
+        """Return the command delay [steps] that fits best with these gains."""
+        off = self._off(gains, self.model.values, np.array(self.delays))
+        left = [float(np.log(self.size(one)).sum()) for one in off]
+        return self.delays[int(np.argmin(left))]
+
+    def _with(self, sent: Array) -> Ahead:
+        other = object.__new__(Ahead)
+        other.__dict__.update(self.__dict__ | {"sent": sent})
+        return other
+
+    def _fitted(self, gains: Array, late: int, *, free: bool) -> Fit:
+        """Fit gains (if free) and parameters by Gauss-Newton, each state weighted by its error."""
+        m = self.model.m if free else 0
+        prior = np.concatenate([np.zeros(m), np.ones(len(self.moving))])
+        theta = np.zeros(len(prior))
+
+        def off(theta: Array) -> Array:
+            """Return the errors (K, N, shown) for several parameter vectors (K, q)."""
+            own = (gains, self.model.values)
+            moved, values = (np.repeat(one[None], len(theta), axis=0) for one in own)
+            moved[:, :m] += theta[:, :m]
+            shifted = values[:, self.moving] + theta[:, m:] * self.spread
+            values[:, self.moving] = np.clip(shifted, self.low, self.high)
+            return self._off(moved, values, late)
+
+        (r,) = off(theta[None])
+        size = self.size(r)
+        for _ in range(ROUNDS if len(theta) else 0):
+            each = (off(theta + SLOPE * np.eye(len(theta))) - r) / size / SLOPE
+            J, white = each.reshape(len(theta), -1).T, (r / size).ravel()
+            if not (np.isfinite(J).all() and np.isfinite(white).all()):
+                break  # the prediction diverges
+            H = J.T @ J + np.diag(prior + 1e-9 * len(white))
+            step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
+            for part in DAMPING:
+                (new,) = off((theta + part * step)[None])
+                if np.log(self.size(new) / size).sum() < -ENOUGH:
+                    break
+            else:
+                break
+            theta, r, size = theta + part * step, new, self.size(new)
+        found = gains.copy()
+        found[:m] += theta[:m]
+        return self._fit(size, found)
+
+    def _off(self, gains: Array, values: Array, late: int | Steps) -> Array:
+        """Return the errors (K, N, shown) minus the removed parts, usually at least their means.
+
+        For K gains (K, m), parameters (K, k) and delays (K,); a single one is broadcast.
+        """
+        off = self.missed(gains, values, late)
+        return np.asarray(off - self.left_out @ (self.left_out.T @ off))
+
+    def missed(self, gains: Array, values: Array, late: int | Steps) -> Array:
+        """Return the errors of the predictions (K, N, shown), nothing removed.
+
+        For K gains (K, m), parameters (K, k) and delays (K,) in steps; a single one is broadcast.
+        Before the trial its first command is taken as sent.
+        """
+        gains, values, late = np.atleast_2d(gains), np.atleast_2d(values), np.atleast_1d(late)
+        K, N = max(len(gains), len(values), len(late)), len(self.at)
+        at = self.at - late[:, None]
+        x, last = np.tile(self.first, (K, 1)), np.tile(self.last, (K, 1))
+        own = np.repeat(np.broadcast_to(values, (K, values.shape[1])), N, axis=0)
+        stepped = stepper(self.model, own, self.dt)
+        for j in range(self.steps):
+            sent = self.sent[np.maximum(at + j, 0)]
+            u = np.broadcast_to(sent * gains[:, None], (K, N, self.model.m))
+            x = stepped(x, u.reshape(K * N, -1))
+            x = np.fmax(np.fmin(x, FAR), -FAR)
+        return np.asarray(self.model.difference(x, last)[:, self.shown].reshape(K, N, -1))
+
+    def size(self, off: Array) -> Array:
+        """Return the rms of errors (..., N, shown) by state, at least what counts."""
+        size = np.sqrt((off**2).mean(axis=0))
+        return np.asarray(np.maximum(np.where(np.isfinite(size), size, FAR), self.least))
+
+    def _fit(self, size: Array, gains: Array) -> Fit:
+        rms = np.ones(self.model.n)
+        rms[self.shown] = size
+        return Fit(rms, gains, self.moved)
+
+
+def basis(told: Array) -> Array:
+    """Return an orthonormal basis (N, k) of a constant and the columns `told` (N, m)."""
+    told = told - told.mean(axis=0) if len(told) else told
+    spread = told.std(axis=0) if len(told) else np.zeros(told.shape[1])
+    own = spread > TINY
+    columns = np.hstack([np.ones((len(told), 1)), told[:, own] / spread[own]])
+    turned, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(turned[:, size > SAME * size.max(initial=0.0)])

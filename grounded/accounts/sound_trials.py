@@ -1,0 +1,219 @@
+"""START HERE: all that sensors and commands show before any physics is identified, in one call.
+
+signals      samples of one sensor: missing, stuck, held, wrapped, dropping out
+judge        which account of the table tells how each log came about
+ages         late, filtered and computed velocities, biases
+commands     clocks that differ, inputs that act in reverse; `inputs` copies and limits
+time_step    a model, or a motion, that is too fast for the steps
+
+What is certain is corrected in the trials passed on; what can't be is refused, with the remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.accounts.ages import Ages
+from grounded.accounts.commands import judge_clocks, judge_signs
+from grounded.accounts.finding import Finding, Preflight, put_right, unusable
+from grounded.accounts.inputs import judge_inputs
+from grounded.accounts.judge import Told, Verdict, judge
+from grounded.accounts.kinematics import folded, gaps, kinematic_rows
+from grounded.accounts.signals import judge_signal, signal_of
+from grounded.accounts.table import DEGREES
+from grounded.accounts.time_step import judge_resolution, judge_time_step
+from grounded.accounts.words import clause, is_folded, mend, remedy
+from grounded.errors import GroundedError, NextCommand
+from grounded.model import Model
+from grounded.result import listed, per_second, with_unit
+from grounded.task import Task
+from grounded.trial import Trial
+
+GROSS, BAD = 0.7, 0.5  # unexplained share of a row's motion, and of it without a constant: reported
+ALIKE = 0.1  # relative tolerance within which several scales are one pace of the clock
+
+
+def sound_trials(
+    subject: Task | Model,
+    trials: Sequence[Trial],
+    hidden: Sequence[str] = (),
+    first: int | None = None,
+    one_message: Sequence[str] = (),
+) -> Preflight:
+    """Run all checks of sensors and commands, and correct the trials where that is certain.
+
+    Args:
+        subject: the model, whose kinematics relate the sensors; a task adds the input limits.
+        trials: real ones, of one time grid; unchanged if they don't fit the model.
+        hidden: states without a sensor.
+        first: number of trials in the first of two groups, between which inputs may change their
+            signs; None: one group.
+        one_message: states that are logged in one message, so that all or none of them are late.
+
+    Returns:
+        The findings and the corrected trials.
+
+    Raises:
+        UnusableTrials: for logs that can't be used, with the correction.
+    """
+    model = subject.model if isinstance(subject, Task) else subject
+    names = (model.state_names, model.input_names)
+    used = [t.until(t.known_steps) for t in trials if t.known_steps >= 2]
+    if not used or any((t.state_names, t.input_names) != names for t in used):
+        return Preflight((), tuple(trials))
+    shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
+    with np.errstate(all="ignore"):
+        # samples first, since a drop-out looks like motion
+        found, used = _samples(model, used, shown)
+        verdict = judge(model, used, shown)
+        refuse(model, used, verdict)
+        found += [one for told in verdict.told for one in corrections(model, used, told)]
+        used = list(verdict.corrected)
+        for k, keep, cut in list(judge_resolution(model, used, shown)):
+            if keep >= 2:
+                used[k] = used[k].until(keep)
+                found.append(cut)
+        # what is late, on trials in their units
+        ages = Ages(model, used, shown)
+        found += ages.findings(one_message)
+        found += _unexplained(model, ages.trials, verdict, shown)
+        found += [*judge_inputs(subject, ages.trials)]
+        found += judge_time_step(model, ages.trials, ages.shown)
+        found = _by_the_clock(model, found, used, ages)
+    judge_clocks(model, ages.trials, shown)
+    for group in (ages.trials[:first], ages.trials[first:] if first else ()):
+        judge_signs(model, group, shown)
+    return Preflight(
+        tuple(found), tuple(ages.trials), frozenset(ages.in_step), frozenset(ages.refuted)
+    )
+
+
+def _samples(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+) -> tuple[list[Finding], list[Trial]]:
+    """Check the samples of each sensor on its own; return the findings and the mended trials."""
+    found, mended = list[Finding](), list(trials)
+    for i in shown:
+        signal = signal_of(model, mended, i, shown)
+        findings, after = judge_signal(signal)
+        found += findings
+        if after is not signal:
+            for k, x in enumerate(after.columns):
+                states = np.array(mended[k].states)
+                states[:, i] = x
+                mended[k] = replace(mended[k], states=states)
+    return found, mended
+
+
+def refuse(model: Model, trials: Sequence[Trial], verdict: Verdict) -> None:
+    """Raise an error for the first account that can't be corrected here.
+
+    Raises:
+        UnusableTrials: with the trials, the account, its evidence and the remedy.
+    """
+    stop_at_folded(model, trials, verdict.folded)
+    stops = [one for one in verdict.told if not (one.certain or one.account.kind == "offset")]
+    if stops:
+        first = stops[0]
+        some = [one for one in stops if one.trials == first.trials]
+        said, plain = (
+            "; ".join(clause(model, one, log=log) for one in some) for log in (True, False)
+        )
+        raise unusable(trials, first.trials, said, mend(model, first), plain)
+
+
+def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[Finding]:
+    """Yield the findings of an account that is corrected, or only reported: an offset."""
+    account, names = told.account, (*model.state_names, *model.input_names)
+    ids = [trials[k].id or f"number {k + 1}" for k in told.trials]
+    where = "" if told.whole else f" in trial{'s' * (len(ids) > 1)} {', '.join(ids)}"
+    for k in account.columns if told.certain or account.kind == "offset" else ():
+        text, log = remedy(model, told, k, where)
+        log *= not where
+        if account.kind == "dead":
+            yield Finding(names[k], text, "stuck", corrected=True)
+        elif account.kind == "offset":
+            yield Finding(names[k], text, "offset")
+        else:
+            kind = "degrees" if account.kind == "unit" else "sign"
+            kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
+            yield put_right(names[k], text, kind, log, scale=account.factor)
+
+
+def stop_at_folded(
+    model: Model, trials: Sequence[Trial], lost: Mapping[int, Sequence[int]] | None = None
+) -> None:
+    """Raise an error for an angle in degrees that was unwrapped as if it were in radians.
+
+    Args:
+        model: however crude.
+        trials: of this model's states.
+        lost: such angles with their trials, if already known.
+
+    Raises:
+        GroundedError: with the scale with which to ingest the log again.
+    """
+    if lost is None:
+        lost = folded(model, trials, kinematic_rows(model, range(model.n)))
+    for i, some in lost.items():
+        name, ids = model.state_names[i], tuple(trials[k].id for k in some if trials[k].id)
+        where = f"in trial{'s' * (len(ids) > 1)} {listed(ids)} " if ids else ""
+        unit = model.states[name]
+        these = ("these trials", "their logs") if ids[1:] else ("it", "the log")
+        raise GroundedError(
+            f"{where}{name} {is_folded(model, i)} when the log was ingested: multiply the scale in "
+            f"[log.state.{name}] by {1 / DEGREES:.8g} (a missing scale is 1) or write {unit} into "
+            f"the log, discard {these[0]} and ingest {these[1]} again",
+            then=NextCommand("discard", ids) if ids else None,
+        )
+
+
+def _unexplained(
+    model: Model, trials: Sequence[Trial], verdict: Verdict, shown: Sequence[int]
+) -> Iterator[Finding]:
+    """Yield a finding for each row of several sensors that most trials contradict grossly."""
+    rows = [row for row in verdict.open if len(row.by) > 1]
+    every = [gaps(model, trial, rows) for trial in trials]
+    for row in rows:
+        some = [one[row] for one in every if row in one]
+        if not some or np.median([gap.share for gap in some]) < GROSS:
+            continue
+        if np.median([gap.varying for gap in some]) < BAD:
+            continue  # at rest in a current
+        name, *by = (model.state_names[i] for i in (row.i, *row.by))
+        rate = float(np.median([gap.rate for gap in some]))
+        off = with_unit(f"{rate:.3g}", per_second(model.states[name]))
+        text = (
+            f"does not move as {listed(by)} {'imply' if len(by) > 1 else 'implies'} (its rate is "
+            f"off by {off}): check units, axes and signs"
+        )
+        yield Finding(name, text, "mismatch")
+
+
+def _by_the_clock(
+    model: Model, found: Sequence[Finding], trials: Sequence[Trial], ages: Ages
+) -> list[Finding]:
+    """Replace several scale findings by one of the clock, if that explains them all.
+
+    A clock that runs at half speed halves all derivatives, which looks like a scale of each sensor.
+    """
+    rates = [one for one in found if one.kind == "scale" and not one.corrected]
+    ratios = [one.scale for one in rates]
+    contradicted = any(name.startswith("sensor_scale:") for name in ages.refuted)
+    if len(ratios) < 2 or contradicted:
+        return list(found)
+    pace = float(np.exp(np.mean(np.log(ratios))))
+    if max(abs(r / pace - 1) for r in ratios) > ALIKE or abs(pace - 1) < 2 * ALIKE:
+        return list(found)
+    text = (
+        f"the clock is wrong, not a sensor: every rate is {pace:.3g} times the derivative of its "
+        f"position by the time stamps, so one second of stamps is {1 / pace:.3g} s of the run: "
+        f"multiply the stamps by {1 / pace:.3g} and ingest the logs again"
+    )
+    at = min(found.index(one) for one in rates)
+    rest = [one for one in found if one not in rates]
+    one = Finding("+".join(one.signal for one in rates), text, "scale", scale=pace)
+    return [*rest[:at], one, *rest[at:]]

@@ -1,0 +1,268 @@
+"""Which story is told of how a log came about: faults of several robots, honest logs, remedies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.accounts import ROBOTS, driven, faults, named, verdict
+from facts import holds
+from grounded import Model, Param, Trial
+from grounded.accounts.commands import answers_early, how_inputs_act
+from grounded.accounts.finding import UnusableTrials
+from grounded.accounts.judge import contradicted, judge
+from grounded.accounts.sound_trials import sound_trials
+from grounded.accounts.table import DEGREES, Account, of_motion, units_of
+from real_systems import ACROBOT, BAM_KP, DART_STEERING, EMPS, SYSID
+from shared_data import needs_data
+
+ROBOT = {name: make() for name, make in ROBOTS.items()}
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Each robot's trials, and those with each fault."""
+    found = {}
+    for k, (name, robot) in enumerate(ROBOT.items()):
+        rng = np.random.default_rng([6, k])
+        trials = driven(robot, rng)
+        found[name] = {fault.name: fault for fault in faults(robot, trials, rng)}
+    return found
+
+
+@pytest.mark.parametrize(
+    ("robot", "fault"),
+    [
+        *(
+            (name, fault)
+            for name in ("car", "boat")
+            for fault in (
+                "angle in degrees",
+                "angle of one trial in degrees",
+                "position in mm",
+                "positions in mm",
+                "positions in feet",
+                "positions exchanged",
+                "sign of a position",
+                "speeds in km/h",
+                "speeds in knots",
+                "position and heading exchanged",
+                "heading with an offset",
+                "compass heading",
+                "sign of the heading",
+                "commands exchanged",
+                "commands in another unit",
+            )
+        ),
+        ("car", "all lengths in mm"),
+        ("boat", "compass and gyro"),
+        *(
+            (name, fault)
+            for name in ("arm", "drone")
+            for fault in (
+                "all angles in degrees",
+                "rate in degrees",
+                "rate in rpm",
+                "sign of a rate",
+                "scale of a rate",
+                "dead rate (noise)",
+                "dead rate (zero)",
+                "dead rate of one trial",
+                "late rate",
+                "position and velocity exchanged",
+                "sign of a joint",
+                "commands exchanged",
+                "states early",
+                "held values",
+                "stuck at times",
+            )
+        ),
+        ("arm", "joints exchanged"),
+        ("arm", "command of one trial reversed"),
+        ("rover", "angle in degrees"),
+        ("rover", "positions in mm"),
+        ("rover", "sign of the heading"),
+        ("rover", "commands in another unit"),
+    ],
+)
+def test_a_fault_is_named_with_its_signals(logs, robot, fault):
+    one = logs[robot][fault]
+    found, _ = named(ROBOT[robot].model, one.trials)
+    assert verdict(one, found) == "right", found
+
+
+@pytest.mark.parametrize("robot", ROBOT)
+def test_nothing_is_told_of_an_honest_log(logs, robot):
+    assert named(ROBOT[robot].model, logs[robot]["sound"].trials) == ([], False)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "system",
+    [ACROBOT, BAM_KP, DART_STEERING, EMPS, SYSID],
+    ids=["acrobot", "bam", "dart", "emps", "sysid"],
+)
+def test_no_log_of_a_real_system_has_another_story(system):
+    model, trials = system.model, [t.until(t.known_steps) for t in system.read()[:3]]
+    assert judge(model, trials, range(model.n)).told == ()
+    assert not any(answers_early(model, trial, range(model.n)) for trial in trials)
+    assert all(a.sign >= 0 for t in trials for a in how_inputs_act(model, t, range(model.n)))
+
+
+@needs_data
+def test_an_exchange_in_a_real_log_is_named():
+    model, trial = ACROBOT.model, ACROBOT.read()[0]
+    for pair in ((0, 1), (0, 2), (1, 3)):
+        swapped = Account("exchange", pairs=(pair,)).mended(trial)
+        (told,) = judge(model, [swapped], range(4)).told
+        assert told.account.kind == "exchange" and told.account.touched & {*pair}
+
+
+def rotor(unit):
+    """A drone whose thrust grows with the square of its rotor's speed in a unit."""
+    k = 1.6e-5 / (91.19 if unit == "rpm" else 1.0)
+    return Model(
+        states={"z": "m", "vz": "m/s"},
+        inputs={"rotor": unit},
+        params={"k": Param(k, "m/s^2", std=k / 50)},
+        derivative=lambda s, a, p: {"z": s.vz, "vz": p.k * a.rotor**2 - 9.81},
+    )
+
+
+def held(model, rng, steps=400, dt=0.02):
+    """A run of the rotor in rad/s about a moving height."""
+    x, states, inputs = np.zeros(2), [np.zeros(2)], []
+    for i in range(steps):
+        want = 0.6 * np.sin(0.8 * i * dt) + 0.3 * np.sin(2.1 * i * dt)
+        w = np.sqrt(max(9.81 + 6 * (want - x[0]) - 4 * x[1], 0) / 1.6e-5)
+        x = x + dt * np.array([x[1], 1.6e-5 * w**2 - 9.81])
+        states.append(x)
+        inputs.append([w])
+    noise = np.array([5e-4, 3e-3]) * rng.normal(size=(steps + 1, 2))
+    names = (model.state_names, model.input_names)
+    return Trial(np.array(states) + noise, np.array(inputs), dt, *names)
+
+
+def test_rad_per_second_under_rpm_is_named_by_its_factor():
+    rng = np.random.default_rng(5)
+    with pytest.raises(UnusableTrials) as refused:
+        sound_trials(rotor("rpm"), [held(rotor("rpm"), rng) for _ in range(2)])
+    assert holds(str(refused.value), "rotor", "9.549", "rad/s", "[log.input.rotor]")
+    assert judge(rotor("rad/s"), [held(rotor("rad/s"), rng)], range(2)).told == ()
+
+
+def gyro(rng, *, dead=True, steps=600, dt=0.1):
+    """A heading that follows a wheel, and a gyro that shows noise alone."""
+    model = Model(
+        states={"psi": "rad", "r": "rad/s"},
+        inputs={"omega": "rad/s"},
+        params={"tau": Param(0.2, "s", 0.05, 1.0)},
+        angles=("psi",),
+        derivative=lambda s, a, p: {"psi": s.r, "r": (a.omega - s.r) / p.tau},
+    )
+    t = dt * np.arange(steps)
+    sent = (0.35 * np.sin(0.3 * t) + 0.2 * np.sin(1.1 * t))[:, None]
+    x = [np.zeros(2)]
+    for u in sent:
+        x.append(model.system.step(x[-1][None], u[None], model.values, dt)[0])
+    y = np.array(x) + [0.002, 0.024] * rng.normal(size=(steps + 1, 2))
+    y[:, 1] -= dead * np.array(x)[:, 1]
+    return model, Trial(y, sent, dt, model.state_names, model.input_names)
+
+
+def test_dead_comes_before_exchanged():
+    model, trial = gyro(np.random.default_rng(1))
+    (told,) = judge(model, [trial], range(2)).told
+    assert (told.account.kind, told.account.columns) == ("dead", (1,))
+    _, sound = gyro(np.random.default_rng(2), dead=False)
+    (told,) = judge(model, [trial, sound], range(2)).told
+    assert told.certain and told.trials == (0,)
+    looked = sound_trials(model, [trial, sound])
+    assert np.isnan(looked.trials[0].states[:, 1]).all()
+    assert np.isfinite(looked.trials[1].states[:, 1]).all()
+
+
+def test_a_throttle_that_is_all_but_a_function_of_speed_is_no_reversed_motor():
+    """A slow ramp tells nothing of a sign, whatever share a fit gives it."""
+    model = Model(
+        states={"v": "m/s"},
+        inputs={"throttle": "1"},
+        params={"g": Param(10.0, "m/s^2", 3.0, 30.0), "tau": Param(1.5, "s", 0.5, 5.0)},
+        derivative=lambda s, a, p: {"v": p.g * a.throttle - s.v / p.tau},
+    )
+    trials = []
+    for k in range(3):
+        rng, u = np.random.default_rng(k), 0.045 + 0.1 * np.arange(300)[:, None] / 300
+        v = [0.6]
+        for sent in u[:, 0]:
+            v.append(v[-1] + 0.05 * (10 * sent - v[-1] / 1.5 - 0.2 * k * v[-1] ** 2))
+        y = np.array(v)[:, None] + 0.01 * rng.normal(size=(301, 1))
+        trials.append(Trial(y, u, 0.05, ("v",), ("throttle",)))
+    assert all(how_inputs_act(model, t, [0])[0].sign >= 0 for t in trials)
+    sound_trials(model, trials)
+
+
+def test_a_refusal_names_the_trials_the_table_and_the_next_command(logs):
+    model, odd = ROBOT["car"].model, logs["car"]["positions in mm"].trials
+    trials = [replace(trial, id=f"t{k}") for k, trial in enumerate(odd)]
+    with pytest.raises(UnusableTrials) as refused:
+        sound_trials(model, trials)
+    error = refused.value
+    assert error.then is not None and error.then.arguments == ("t0", "t1")
+    assert holds(error.mend, "[log.state.x]", "[log.state.y]", "0.001")
+    assert "[log" not in error.in_program and holds(error.in_program, "x", "y", "1000")
+
+
+def test_what_is_certain_is_corrected_and_keeps_its_key_of_log(logs):
+    model, sound = ROBOT["arm"].model, logs["arm"]["sound"].trials
+    for name, kind, factor in (
+        ("rate in rpm", "degrees", 30 / np.pi),
+        ("sign of a rate", "sign", -1),
+    ):
+        fault = logs["arm"][name]
+        looked = sound_trials(model, fault.trials)
+        (found,) = (one for one in looked.findings if one.kind == kind)
+        i = model.state_names.index(found.signal)
+        assert found.corrected and found.scale == pytest.approx(factor)
+        assert holds(found.log, "scale")
+        assert looked.trials[0].states[:, i] == pytest.approx(sound[0].states[:, i])
+
+
+def test_accounts_undo_what_they_name():
+    rng = np.random.default_rng(0)
+    trial = Trial(
+        rng.normal(size=(9, 3)), rng.normal(size=(8, 2)), 0.1, ("a", "b", "c"), ("u", "w")
+    )
+    assert Account("unit", (1,), DEGREES).mended(trial).states[:, 1] == pytest.approx(
+        trial.states[:, 1] / DEGREES
+    )
+    compass = Account("sign", (2, 1), -1.0, offset=0.5).mended(trial)
+    assert compass.states[:, 2] == pytest.approx(0.5 - trial.states[:, 2])
+    assert compass.states[:, 1] == pytest.approx(-trial.states[:, 1])
+    mixed = Account("exchange", pairs=((0, 3),)).mended(trial)
+    assert mixed.states[:8, 0] == pytest.approx(trial.inputs[:, 0])
+    assert mixed.inputs[:, 0] == pytest.approx(trial.states[:8, 0])
+    both = Account("exchange", pairs=((3, 4),)).mended(trial)
+    assert both.inputs == pytest.approx(trial.inputs[:, ::-1])
+    assert Account("pace", (), 1e-3).mended(trial).dt == pytest.approx(1e-4)
+    assert np.isnan(Account("dead", (0,)).mended(trial).states[:, 0]).all()
+
+
+def test_units_of_any_kind_have_others():
+    assert units_of("rad/s")["rpm"] == pytest.approx(9.5493)
+    assert 3.6 in units_of("m/s").values()
+    assert units_of("N") == {"mN": 1e3} and 1e3 in units_of("N m").values()
+    assert units_of("1", 80.0) == {"percent": 100.0} and not units_of("1", 1.0)
+
+
+def test_a_model_with_lengths_as_inputs_is_not_told_that_all_lengths_are_off():
+    model = replace(ROBOT["car"].model, inputs={"throttle": "m/s", "steering": "rad"})
+    table = list(of_motion(model, range(4), []))
+    assert not any(one.kind == "unit" and {0, 1, 3} <= one.touched for one in table)
+
+
+def test_a_sound_trial_contradicts_the_exchange_of_another(logs):
+    model, sound = ROBOT["car"].model, logs["car"]["sound"].trials[0]
+    swap = Account("exchange", pairs=((4, 5),))
+    assert contradicted(model, sound, range(4), swap)
+    assert not contradicted(model, swap.mended(sound), range(4), swap)

@@ -1,0 +1,164 @@
+"""Velocities that the robot's program computes from positions, as an overhead crane's did."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Trial, diagnose
+from grounded.accounts.finding import (
+    a_mean,
+    late_as_positions,
+    late_effects,
+    put_right,
+)
+from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.diagnosis.diagnose import DiagnosisOptions
+from grounded.diagnosis.tables import instrument_lines
+from grounded.effects import Scales, Site, wrap
+from grounded.effects.sensor import sensor_lag
+
+DT = 0.04
+SWING = Model(
+    name="swing",
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "rad/s^2"},
+    params={},
+    derivative=lambda s, a, p: {"q": s.w, "w": a.u - 12.0 * s.q},
+)
+
+
+def swung(kind, noise=2e-4, steps=700, keep=0.5):
+    """A swing; w is filtered from q's differences, or an own sensor: 2 steps late, or slow."""
+    rng, fine = np.random.default_rng(3), 20
+    t = DT / fine * np.arange((steps + 1) * fine)
+    rates, q, w = [], [], []
+    for a, b, c in ((0.35, 3.4, 0.0), (0.1, 1.3, 1.0), (0.05, 6.0, 2.0)):
+        q.append(a * np.sin(b * t + c))
+        w.append(a * b * np.cos(b * t + c))
+        rates.append(-a * b * b * np.sin(b * t + c))
+    q, w = sum(q), sum(w)
+    u = (sum(rates) + 12.0 * q)[::fine]
+    seen = q[::fine] + noise * rng.standard_normal(steps + 1)
+    if kind == "filtered":
+        logged, last = np.zeros(steps + 1), 0.0
+        for k in range(2, steps + 1):  # the rate of the loop's last round
+            last = keep * last + (1 - keep) * (seen[k - 1] - seen[k - 2]) / DT
+            logged[k] = last
+    elif kind == "slow":
+        slow, logged = np.zeros(len(w)), np.zeros(steps + 1)
+        for k in range(1, len(w)):
+            slow[k] = slow[k - 1] + (w[k] - slow[k - 1]) / (2 * fine)
+        logged = slow[::fine] + 1e-4 * rng.standard_normal(steps + 1)
+    else:
+        logged = np.concatenate([np.zeros(2 * fine), w])[: len(w)][::fine]
+        logged = logged + 2e-3 * rng.standard_normal(steps + 1)
+    states = np.stack([seen, logged], axis=1)[4:]
+    return [Trial(states, u[4:-1, None], DT, ("q", "w"), ("u",))]
+
+
+@pytest.mark.parametrize("keep", [0.5, 0.8])
+@pytest.mark.parametrize("noise", [2e-4, 2e-3])
+def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(noise, keep):
+    """It was taken for a rate 0.08 s late: `offset:omega`, a false `rate_gain`, L 16 sigma off."""
+    found = preflight(SWING, swung("filtered", noise, keep=keep))
+    kinds = {f.kind for f in found.findings if f.signal == "w"}
+    assert "smoothed" in kinds and kinds <= {"smoothed", "delay", "lag"}
+    assert np.isnan(found.trials[0].states[:, 1]).all()
+
+
+def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted():
+    """It follows from the positions as before: diagnoses were of their noise, fits ran away."""
+    site = Site(SWING, ("w",), Scales(dt=DT))
+    behind = wrap(sensor_lag.at(site), {"tau": 0.04}, DT)
+    (trial,) = swung("filtered", keep=0.8)
+    states = np.column_stack([trial.states, trial.states[:, 1]])
+    lifted = replace(trial, states=states, state_names=behind.state_names)
+    found = preflight(behind, [lifted], behind.state_names[2:])
+    assert [f.kind for f in found.findings if f.signal == "w"] == ["smoothed"]
+    assert np.isnan(found.trials[0].states[:, 1]).all()
+
+
+@pytest.mark.parametrize("noise", [2e-4, 2e-3, 1e-2])
+def test_a_late_sensor_of_its_own_is_still_used(noise):
+    found = preflight(SWING, swung("late", noise))
+    (one,) = (f for f in found.findings if f.signal == "w")
+    assert one.kind == "delay" and abs(one.delay_s - 2 * DT) < 0.1 * DT
+    assert np.isfinite(found.trials[0].states[:, 1]).any()
+
+
+@pytest.mark.parametrize("noise", [2e-4, 2e-3])
+def test_a_slow_sensor_of_its_own_is_still_used(noise):
+    """Weights of past differences fit its motion, but not its noise: it was left out, too."""
+    found = preflight(SWING, swung("slow", noise))
+    assert "smoothed" not in {f.kind for f in found.findings}
+    assert np.isfinite(found.trials[0].states[:, 1]).any()
+
+
+def test_a_signal_that_is_not_used_has_one_line():
+    """One line said "corrected here", the next the opposite."""
+    for kind, keep in (("filtered", 0.5), ("filtered", 0.8)):
+        found = preflight(SWING, swung(kind, keep=keep)).findings
+        assert {"smoothed"} < {f.kind for f in found if f.signal == "w"}
+        (line,) = (one for one in instrument_lines(found) if one.startswith("w:"))
+        assert "left out" in line and "corrected here" not in line
+    late = put_right("w", "0.02 s later than the derivative of q", "delay", "delay_s = 0.02")
+    (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
+    assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
+    assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]
+
+
+BALL = Model(
+    name="ball",
+    states={"x": "m", "v": "m/s", "beam": "rad"},
+    inputs={"u": "rad/s"},
+    params={},
+    derivative=lambda s, a, p: {"x": s.v, "v": 7.0 * s.beam, "beam": a.u},
+)
+
+
+def rolled(late, steps=350):
+    """A ball is balanced; x is logged `late` steps late, v is a filter of differences of that."""
+    rng, s, true, u = np.random.default_rng(2), np.array([0.05, 0.0, 0.0]), [], np.zeros(steps)
+    for k in range(steps + 1):
+        true.append(s)
+        there = 0.1 * np.sin(0.8 * k * DT) * np.sign(np.sin(0.31 * k * DT))
+        wanted = -4 * (s[2] + 0.4 * (s[0] - there) + 0.5 * s[1]) + 0.3 * rng.standard_normal()
+        u[min(k, steps - 1)] = wanted
+        for _ in range(10):
+            s = s + DT / 10 * np.array([s[1], 7 * s[2], wanted])
+    true = np.array(true)
+    x = true[np.maximum(np.arange(steps + 1) - late, 0), 0] + 1e-3 * rng.standard_normal(steps + 1)
+    v = np.zeros(steps + 1)
+    for k in range(1, steps + 1):
+        v[k] = 0.7 * v[k - 1] + 0.3 * (x[k] - x[k - 1]) / DT
+    beam = true[:, 2] + 5e-4 * rng.standard_normal(steps + 1)
+    states = np.stack([x, v, beam], axis=1)[5:]
+    return Trial(states, u[5:, None], DT, ("x", "v", "beam"), ("u",))
+
+
+@pytest.mark.slow
+def test_a_speed_that_is_computed_from_a_late_position_is_as_late():
+    """A plan took a speed for 57 ms old that came from a camera 32 ms late: promised too much."""
+    found = diagnose(BALL, [rolled(late=2)], DiagnosisOptions(max_effects=1))
+    assert found.effects == ("sensor_delay:x",)
+    late = found.late_sensors
+    assert late["sensor_delay:v"]["d"] == pytest.approx(found.values("sensor_delay:x")["d"])
+    assert late["sensor_delay:v"]["d"] == pytest.approx(2 * DT, abs=0.01)
+    assert late["sensor_lag:v"]["tau"] == pytest.approx(DT * 0.7 / 0.3, abs=0.03)
+
+
+def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted():
+    seen = [a_mean("v", "x", 0.04)]
+    (late,) = late_as_positions(seen, {"sensor_delay:x": 0.03, "sensor_delay:beam": 0.5}, ())
+    assert (late.signal, late.delay_s, late.source) == ("v", 0.03, "x")
+    (line,) = instrument_lines([*seen, late])
+    assert line.startswith("v: is a mean over") and "older by another 0.03 s" in line
+    assert not [*late_as_positions(seen, {"sensor_delay:x": 0.03}, ("sensor_delay:v",))]
+    assert not [*late_as_positions(seen, {"sensor_delay:x+v": 0.03}, ())]  # v's own delay
+    assert not [*late_as_positions(seen, {}, ())]
+    own = put_right("v", "0.02 s later than the derivative of x", "delay", "", delay_s=0.02)
+    both = late_effects([own, *seen, late])
+    assert both["sensor_delay:v"]["d"] == pytest.approx(0.05)
+    (line,) = instrument_lines([own, *seen, late])
+    assert "0.02 s later" in line and "mean over" in line and "another 0.03 s" in line

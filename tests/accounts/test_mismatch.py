@@ -1,0 +1,355 @@
+"""What only several sensors together give away: a boat's units, signs, axes, late positions."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param
+from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
+from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.models.car import model as CAR
+from grounded.trial import Trial
+
+DT = 0.1
+SCALE = {"m": Param(40.0, "kg", 30.0, 60.0), "k": Param(1.5, "1/s", 0.3, 4.0)}
+
+
+def moving(s, a, p):
+    return {
+        "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
+        "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
+        "psi": s.r,
+        "u": (a.thrust - 12 * s.u) / p.m,
+        "v": -1.0 * s.v - 0.6 * s.u * s.r,
+        "r": p.k * a.rudder * s.u - 1.5 * s.r,
+    }
+
+
+BOAT = Model(
+    name="boat",
+    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"},
+    inputs={"thrust": "N", "rudder": "rad"},
+    params=SCALE,
+    angles=("psi",),
+    derivative=moving,
+)
+# without a sway sensor, the model has none either
+PLAIN = Model(
+    name="plain boat",
+    states={name: unit for name, unit in BOAT.states.items() if name != "v"},
+    inputs=dict(BOAT.inputs),
+    params=SCALE,
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "x": s.u * np.cos(s.psi),
+        "y": s.u * np.sin(s.psi),
+        "psi": s.r,
+        "u": (a.thrust - 12 * s.u) / p.m,
+        "r": p.k * a.rudder * s.u - 1.5 * s.r,
+    },
+)
+NAMES = BOAT.state_names
+NOISE = np.array([0.02, 0.02, 0.005, 0.02, 0.02, 0.01])
+
+
+def sailed(seed: int, current: tuple[float, float] = (0.1, -0.06)) -> tuple[Array, Array]:
+    """30 s of a boat in a current with noisy sensors: states (301, 6), inputs (300, 2)."""
+    rng, x = np.random.default_rng(seed), np.array([0, 0, 0.4 * seed, 1.0, 0, 0])
+    states, inputs = [x], []
+    for k in range(300):
+        if k % 20 == 0:
+            u = np.array([rng.uniform(8, 30), rng.uniform(-0.5, 0.5)])
+        x = BOAT.system.step(x[None], u[None], BOAT.values, DT)[0]
+        x[:2] += np.array(current) * DT
+        states.append(x)
+        inputs.append(u)
+    return np.array(states) + NOISE * rng.normal(size=(301, 6)), np.array(inputs)
+
+
+def logged(model: Model, fault=lambda x: x, trials: int = 3) -> list[Trial]:
+    """Trials with the states of a model, after a fault (T, 6) -> (T, 6), or less at the start."""
+    found = []
+    shown = [NAMES.index(name) for name in model.state_names]
+    for seed in range(trials):
+        states, inputs = sailed(seed)
+        names = (model.state_names, model.input_names)
+        seen = fault(states)[:, shown]
+        found.append(Trial(seen, inputs[len(states) - len(seen) :], DT, *names, id=f"t{seed:04}"))
+    return found
+
+
+def times(**by: float):
+    return lambda x: x * [by.get(name, 1.0) for name in NAMES]
+
+
+def swapped(a: str, b: str):
+    def fault(x: Array) -> Array:
+        order = list(NAMES)
+        i, j = order.index(a), order.index(b)
+        order[i], order[j] = b, a
+        return x[:, [NAMES.index(name) for name in order]]
+
+    return fault
+
+
+def late(x: Array) -> Array:
+    """Every velocity three steps late, u off by 0.1 m/s and 10 % too large."""
+    y = np.array(x)
+    y[3:, 3:] = x[:-3, 3:]
+    y[:, 3] = 0.1 + 1.1 * y[:, 3]
+    return y
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+def test_kinematic_rows_are_read_off_the_model(model):
+    names = model.state_names
+    found = {
+        names[row.i]: [names[j] for j in row.by] for row in kinematic_rows(model, range(model.n))
+    }
+    across = ["v"] * ("v" in names)
+    assert found == {"x": ["psi", "u", *across], "y": ["psi", "u", *across], "psi": ["r"]}
+
+
+def test_a_state_without_a_sensor_or_an_uncertain_parameter_makes_no_row():
+    assert [row.i for row in kinematic_rows(BOAT, [0, 1, 2, 3, 5])] == [2]
+    geared = Model(
+        name="geared",
+        states={"x": "m", "w": "rad/s"},
+        inputs={"F": "N"},
+        params={"R": Param(0.1, "m", 0.05, 0.2), "c": Param(0.5, "m")},
+        derivative=lambda s, a, p: {"x": p.R * s.w, "w": a.F - p.c * s.w},
+    )
+    assert kinematic_rows(geared, [0, 1]) == []
+
+
+def test_states_that_no_other_sensor_is_held_against_are_named():
+    def without(*states):
+        return logged(BOAT, lambda y: np.where(np.isin(NAMES, states), np.nan, y))
+
+    assert not unheld(BOAT, without())
+    assert unheld(BOAT, without("v")) == ("x", "y", "u")
+    assert unheld(BOAT, without("u", "v", "r")) == ("x", "y", "psi")
+
+
+def test_a_constant_drift_that_was_adopted_leaves_the_rows():
+    drifting = Model(
+        name="drifting",
+        states=dict(BOAT.states),
+        inputs=dict(BOAT.inputs),
+        params={**SCALE, "a": Param(0.1, "m/s", -1.0, 1.0)},
+        angles=("psi",),
+        derivative=lambda s, a, p: {**(rate := moving(s, a, p)), "x": rate["x"] + p.a},
+    )
+    assert [row.i for row in kinematic_rows(drifting, range(6))] == [0, 1, 2]
+
+
+def test_the_gap_of_a_row_is_what_its_change_is_off_by():
+    row = kinematic_rows(BOAT, range(6))[0]
+    assert row == Row(0, (2, 3, 4))
+    (sound,) = gaps(BOAT, logged(BOAT, trials=1)[0], [row]).values()
+    assert sound.share < 0.2 and sound.rate == pytest.approx(0.1, abs=0.05)
+    (turned,) = gaps(BOAT, logged(BOAT, times(x=-1), 1)[0], [row]).values()
+    assert turned.share > 1.5
+
+
+def adrift(x: Array) -> Array:
+    """At rest in a current."""
+    y = NOISE * np.random.default_rng(0).normal(size=x.shape)
+    y[:, :2] += np.linspace(0, 3.0, len(x))[:, None] * [1.0, -0.6]
+    return y
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+@pytest.mark.parametrize("fault", [lambda x: x, late, adrift])
+def test_a_current_a_bias_noise_and_a_late_sensor_are_no_mismatch(model, fault):
+    found = preflight(model, logged(model, fault)).findings
+    assert not {one.kind for one in found} & {"mismatch", "degrees", "sign"}
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+@pytest.mark.parametrize(
+    ("fault", "kind", "signals"),
+    [
+        (times(r=180 / np.pi), "degrees", ["r"]),
+        (times(psi=180 / np.pi), "degrees", ["psi"]),
+        (times(y=-1), "sign", ["y"]),
+        (times(psi=-1), "sign", ["psi"]),
+        (times(psi=-1, r=-1), "sign", ["psi", "r"]),
+    ],
+)
+def test_degrees_and_signs_are_put_right_in_the_one_signal_that_has_them(
+    model, fault, kind, signals
+):
+    found = preflight(model, logged(model, fault))
+    assert [(one.signal, one.kind) for one in found.findings] == [(name, kind) for name in signals]
+    assert all(one.corrected and one.log.startswith("scale = ") for one in found.findings)
+    sound = logged(model)
+    for trial, other in zip(found.trials, sound, strict=True):
+        np.testing.assert_allclose(trial.states, other.states, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "fault", "first", "no"),
+    [
+        (BOAT, times(x=1e3, y=1e3), ["[log.state.x] scale = 0.001", "[log.state.y]"], ["psi]"]),
+        (PLAIN, times(x=1e3, y=1e3), ["[log.state.x] scale = 0.001", "[log.state.y]"], ["psi]"]),
+        (BOAT, times(u=1e3), ["[log.state.u] scale = 0.001"], ["state.x]", "state.y]"]),
+        (BOAT, times(y=1e2), ["[log.state.y] scale = 0.01"], ["state.x]", "state.u]"]),
+        (BOAT, swapped("x", "y"), ["columns of x and y"], ["u and v"]),
+        (BOAT, swapped("u", "v"), ["columns of u and v"], ["x and y"]),
+        (PLAIN, swapped("x", "y"), ["columns of x and y"], []),
+    ],
+)
+def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(model, fault, first, no):
+    with pytest.raises(GroundedError) as error:
+        preflight(model, logged(model, fault))
+    said = str(error.value).partition("or else")[0]
+    assert "every trial" in said
+    assert all(one in said for one in first) and not any(one in said for one in no)
+    assert error.value.then is not None
+    assert error.value.then.arguments == ("t0000", "t0001", "t0002")
+
+
+def test_one_trial_that_is_off_is_named_alone():
+    trials = [*logged(BOAT)[:2], logged(BOAT, times(x=1e3, y=1e3))[2]]
+    with pytest.raises(GroundedError) as error:
+        preflight(BOAT, trials)
+    assert error.value.then is not None and error.value.then.arguments == ("t0002",)
+    (one,) = preflight(BOAT, [*trials[:2], logged(BOAT, times(y=-1))[2]]).findings
+    assert (one.signal, one.kind) == ("y", "sign")
+    assert "t0002" in one.finding and one.log == ""
+
+
+def folded(x: Array) -> Array:
+    """Return states whose heading was in degrees and was unwrapped as radians."""
+    y = np.array(x)
+    steps = np.rad2deg(np.diff(x[:, 2], prepend=0.0))
+    y[:, 2] = np.cumsum(steps - 2 * np.pi * np.rint(steps / (2 * np.pi)))
+    return y
+
+
+def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
+    with pytest.raises(GroundedError, match=r"scale in \[log\.state\.psi\] by 0\.0174532"):
+        preflight(BOAT, logged(BOAT, folded))
+
+
+def test_of_several_trials_the_one_with_a_folded_heading_is_named():
+    """A rover's later log alone was in degrees: `no fault found in the sensors`."""
+    trials = [*logged(BOAT)[:2], logged(BOAT, folded)[2]]
+    with pytest.raises(GroundedError, match="in trial t0002 psi is in degrees") as error:
+        preflight(BOAT, trials)
+    assert error.value.then is not None and error.value.then.arguments == ("t0002",)
+
+
+def test_what_no_single_change_mends_is_stated():
+    def other(x: Array) -> Array:
+        y = np.array(x)
+        y[:, :2] = sailed(9)[0][:, :2]  # of another run
+        return y
+
+    found = preflight(BOAT, logged(BOAT, other)).findings
+    assert {(one.signal, one.kind) for one in found} == {("x", "mismatch"), ("y", "mismatch")}
+    assert not any(one.corrected for one in found)
+    assert all("psi, u and v" in one.finding for one in found)
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+@pytest.mark.parametrize("angle", [np.pi / 2, np.pi])
+def test_a_heading_off_by_a_constant_is_no_exchange_and_no_sign(model, angle):
+    def off(x: Array) -> Array:
+        return x + angle * np.eye(6)[2]
+
+    (found,) = preflight(model, logged(model, off)).findings
+    assert (found.signal, found.kind, found.corrected) == ("psi", "offset", False)
+
+
+def positions_late(by: float, which: tuple[int, ...] = (0, 1)):
+    def fault(x: Array) -> Array:
+        at, y = np.arange(len(x)) - by / DT, np.array(x)
+        for i in which:
+            y[:, i] = np.interp(at, np.arange(len(x)), x[:, i])
+        return y[int(np.ceil(by / DT)) :]
+
+    return fault
+
+
+def delayed(findings):
+    return {f.signal: f.delay_s for f in findings if f.kind == "delay" and f.corrected}
+
+
+@pytest.mark.parametrize("by", [0.15, 0.3])
+def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
+    found = preflight(BOAT, logged(BOAT, positions_late(by)))
+    assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
+    assert not delayed(preflight(BOAT, found.trials).findings)
+
+
+@pytest.mark.parametrize("alone", [0, 1])
+def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypatch):
+    """Half of its delay is left along and across; noise may hide that, each by itself tells."""
+    monkeypatch.setattr("grounded.accounts.ages._left", lambda *_, **__: [(0.0, 0.0)])
+    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+    found = preflight(BOAT, logged(BOAT, positions_late(0.15, (alone,))))
+    assert not delayed(found.findings)
+    assert "sensor_delay:" + "xy"[alone] not in found.settled
+
+
+def test_a_delay_that_a_constant_drift_makes_as_well_is_none(monkeypatch):
+    """A blind case: a car that drifted by 0.3 m/s along its way was given sensors 57 ms late."""
+    found = {False: (0.0, 0.013), True: (0.03, 0.013)}  # [s], after the shift and before it
+    name = "grounded.accounts.ages._left"
+    monkeypatch.setattr(name, lambda ways, steps, *_, **__: [found[steps == 0]])
+    assert not delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+    found[True] = (0.15, 0.013)
+    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
+
+
+def test_what_nothing_measures_sideways_makes_no_position_late():
+    found = preflight(PLAIN, logged(PLAIN, positions_late(0.3)))
+    assert not delayed(found.findings)
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
+    def ahead(x: Array) -> Array:  # an antenna 0.4 m behind the middle
+        y = np.array(x)
+        y[:, 0] -= 0.4 * np.cos(x[:, 2])
+        y[:, 1] -= 0.4 * np.sin(x[:, 2])
+        return y
+
+    def slipping(x: Array) -> Array:  # a log that reads more the more it speeds up
+        y = np.array(x)
+        y[:, 3] += 0.3 * np.gradient(np.convolve(x[:, 3], np.ones(5) / 5, "same"), DT)
+        return y
+
+    def drifting(x: Array) -> Array:  # by as much to its side all the time
+        y = np.array(x)
+        y[1:, 0] += 0.2 * DT * np.cumsum(np.cos(x[:-1, 2]) - np.sin(x[:-1, 2]))
+        y[1:, 1] += 0.2 * DT * np.cumsum(np.sin(x[:-1, 2]) + np.cos(x[:-1, 2]))
+        return y
+
+    for fault in (lambda x: x, ahead, slipping, drifting):
+        assert not delayed(preflight(model, logged(model, fault)).findings)
+
+
+def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
+    """Blind cases: a car whose tyres slip was given positions 42 ms late.
+
+    A delay that only shows across its way is a slip as well, since nothing measures that speed.
+    """
+    late_along_and_across = [(0.0, 0.003), (0.07, 0.003)]
+
+    def left(ways, steps, dt, *, apart):
+        return [(0.033 * (steps == 0), 0.006)] if not apart else late_along_and_across
+
+    monkeypatch.setattr("grounded.accounts.ages._left", left)
+    rng, t = np.random.default_rng(5), np.arange(200) * 0.05
+    u = np.column_stack([0.6 * np.sin(t), 0.6 + 0.25 * np.sin(0.5 * t)])
+    x = [np.zeros(6)]
+    for one in u:
+        x.append(CAR.system.step(x[-1][None], one[None], CAR.values, 0.05)[0])
+    behind = np.array(x[5:]) + 0.003 * rng.standard_normal((196, 6))
+    behind[:, 2:4] = np.array(x)[:-5, 2:4]
+    trial = Trial(behind, u[5:], 0.05, CAR.state_names, CAR.input_names)
+    assert not delayed(preflight(CAR, [trial]).findings)

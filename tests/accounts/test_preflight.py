@@ -1,0 +1,844 @@
+"""The instruments, judged from their own signals: known faults of generated ones, real ones."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from grounded import Model, Param, Trial
+from grounded.accounts.ages import bias_of as constant_of
+from grounded.accounts.kinematics import dead as dead_rates
+from grounded.accounts.kinematics import kinematic_rows, turned
+from grounded.accounts.lag import at_samples, lag_between
+from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.diagnosis.diagnose import diagnose
+from grounded.effects import Library, wrap
+from grounded.errors import GroundedError, NextCommand
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+from grounded.places import integrals
+from real_systems import DART_STEERING, EMPS, SERVO
+from shared_data import data, needs_data
+
+DT = 0.02
+GYRO = np.eye(car.n)[car.state_names.index("psi_rate")]
+ARM = Model(
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "N m"},
+    params={"b": Param(0.3, "1/s", 0.0, 3.0)},
+    derivative=lambda s, a, p: {"q": s.w, "w": a.u - p.b * s.w - 4 * np.sin(s.q)},
+)
+
+
+def arm(fault=lambda x: x, seed=0, trials=4, steps=200, friction=0.0):
+    """Trials of an arm whose noisy sensors have a fault: (T + 1, 2) -> (T + 1, 2)."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(trials):
+        t = np.arange(steps) * DT
+        u = 2 * np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6)) + np.sin(rng.uniform(4, 9) * t)
+        states = [np.zeros(2)]
+        for k in range(steps):
+            z = states[-1]
+            for _ in range(4):
+                push = u[k] - friction * np.tanh(z[1] / 0.02)
+                z = ARM.system.step(z[None], np.array([[push]]), ARM.values, DT / 4)[0]
+            states.append(z)
+        y = np.array(states) + rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
+        found.append(Trial(fault(y), u[:, None], DT, ("q", "w"), ("u",)))
+    return found
+
+
+def late(x, steps):
+    before = np.concatenate([np.full(20, x[0]), x])
+    return at_samples(before, np.arange(len(x)) + 20 - steps)
+
+
+def lagged(x, tau):
+    out, a = x.copy(), np.exp(-DT / tau)
+    for k in range(1, len(x)):
+        out[k] = a * out[k - 1] + (1 - a) * 0.5 * (x[k] + x[k - 1])
+    return out
+
+
+def lowpass(x, samples=9):
+    """The same without its noise, nearly: a moving average."""
+    edge = np.pad(x, samples // 2, mode="edge")
+    return np.convolve(edge, np.full(samples, 1 / samples), mode="valid")
+
+
+def columns(q=lambda x: x, w=lambda x: x):
+    return lambda y: np.stack([q(y[:, 0]), w(y[:, 1])], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "signal", "kind", "delay", "scale"),
+    [
+        (columns(w=lambda x: late(x, 1.0)), "w", "delay", 0.02, 1),
+        (columns(w=lambda x: late(x, 0.4)), "w", "delay", 0.008, 1),
+        (columns(q=lambda x: late(x, 1.5)), "q", "delay", 0.03, 1),
+        (columns(w=lambda x: lagged(x, 0.08)), "w", "lag", 0.08, 1),
+        (columns(w=lambda x: -x), "w", "sign", 0, -1),
+        (columns(w=np.rad2deg), "w", "degrees", 0, 180 / np.pi),
+        (columns(q=np.rad2deg), "q", "degrees", 0, 180 / np.pi),
+        (columns(w=lambda x: 1.06 * x), "w", "scale", 0, 1.06),
+    ],
+)
+def test_a_velocity_is_held_against_its_position(fault, signal, kind, delay, scale):
+    found = preflight(ARM, arm(fault))
+    assert [(one.signal, one.kind) for one in found.findings] == [(signal, kind)]
+    one = found.findings[0]
+    assert one.delay_s == pytest.approx(delay, rel=0.1, abs=2e-4)
+    if kind == "delay":  # it was "0.0152 +- 6.7e-05 s"
+        assert re.match(r"\d+\.\d+ \+- 0\.\d+ ms later than ", one.finding), one.finding
+    assert one.scale == pytest.approx(scale, rel=0.01)
+    assert one.corrected is (kind != "scale")
+    if kind == "lag":  # its samples stay: the diagnosis' own filter knows
+        sent = arm(fault)
+        assert found.filters == {signal: one.delay_s}
+        assert all((a.states == b.states).all() for a, b in zip(found.trials, sent, strict=True))
+    elif one.corrected:
+        assert all(abs(f.delay_s) < 0.2 * delay for f in preflight(ARM, found.trials).findings)
+
+
+def differenced(x, steps):
+    before = np.concatenate([np.full(steps, x[0]), x])
+    return (x - before[:-steps]) / (steps * DT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moved_back", [0, 1.5])
+def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(moved_back):
+    """Taken for a sensor, it made 0.41 rad/s^2 of a friction of 0.5: it goes on where q stops."""
+
+    def fault(y):
+        w = differenced(y[:, 0], 3)
+        return np.stack([y[:, 0], at_samples(w, np.arange(len(w)) + moved_back)], axis=1)
+
+    trials = arm(fault, friction=0.5)
+    looked = preflight(ARM, trials)
+    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
+    assert found.signal == "w" and found.corrected and "q" in found.finding
+    assert abs(float(re.search("over ([0-9.]+) s", found.finding)[1]) - 3 * DT) < DT
+    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
+    (late,) = [f.delay_s for f in looked.findings if f.kind == "delay"] or [0.0]
+    assert abs(late - (1.5 - moved_back) * DT) < 0.05 * DT
+    diagnosis = diagnose(ARM, trials)
+    assert diagnosis.effects == ("coulomb_friction:w",)
+    (friction,) = diagnosis.ranking[0].params.values()
+    assert abs(friction.value - 0.5) < 0.01
+    assert np.isnan(diagnosis.prediction_error[0].crude["w"]) and not diagnosis.unknowable
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first):
+    """Moved back by half a step it made an arm's delay of 20 ms 1.7 ms longer."""
+
+    def fault(y):
+        q = 1e-3 * np.round(y[:, 0] / 1e-3)  # an encoder
+        w = np.diff(q, prepend=q[0]) if first else np.diff(q, append=2 * q[-1] - q[-2])
+        return np.stack([q, np.round(w / DT, 4)], axis=1)
+
+    looked = preflight(ARM, arm(fault))
+    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
+    assert found.signal == "w" and found.corrected
+    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_sensor(seed):
+    """Moved back by 59 ms, it hid a ball's rolling friction and the delay of its camera."""
+    rng, half = np.random.default_rng(seed), DT / 2
+
+    def fault(y):
+        steps = np.arange(2 * len(y) - 1) / 2
+        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps)
+        q += 2e-3 * rng.standard_normal(len(q))
+        w, part = np.zeros(len(q)), half / (0.05 + half)
+        for k in range(1, len(q)):
+            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / half
+        return np.stack([q, w], axis=1)[::2]
+
+    looked = preflight(ARM, arm(fault, seed, trials=1, steps=700))
+    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
+    assert found.signal == "w" and "filtered derivative of q" in found.finding
+    (age,) = [one.delay_s for one in looked.findings if one.kind in ("lag", "delay")]
+    assert age == pytest.approx(0.055, abs=0.003)  # and half a step
+    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
+
+
+@pytest.mark.parametrize("counts", [1024, 4096])
+def test_a_speed_that_a_motor_controller_filters_from_its_encoder_is_no_sensor(counts):
+    """A student's time constant was 0.065 +- 0.001 s, truly 0.070 s, with such a speed as a sensor.
+
+    The controller counts at 1 kHz, and sends every 20 ms.
+    """
+    rng, fine = np.random.default_rng(counts), 20
+    count, part = 2 * np.pi / counts, 1e-3 / (0.02 + 1e-3)
+
+    def fault(y):
+        steps = np.arange(fine * (len(y) - 1) + 1) / fine
+        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps) + 0.1 * rng.random()
+        q, w = np.round(q / count) * count, np.zeros(len(q))
+        for k in range(1, len(q)):
+            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / 1e-3
+        return np.stack([q, w], axis=1)[::fine]
+
+    looked = preflight(ARM, arm(fault, trials=1, steps=700))
+    assert [one.signal for one in looked.findings if one.kind == "smoothed"] == ["w"]
+
+
+@pytest.mark.parametrize("w", [lambda x: late(x, 1.5), lambda x: lagged(x, 0.08), lambda x: x])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
+    rng = np.random.default_rng(5)
+    trials = arm(columns(w=lambda x: w(x) + noise * rng.standard_normal(len(x))))
+    assert not any(f.kind == "smoothed" for f in preflight(ARM, trials).findings)
+
+
+def test_sound_sensors_are_left_alone():
+    for seed in range(6):
+        trials = arm(seed=seed)
+        found = preflight(ARM, trials)
+        assert found.findings == ()
+        assert found.in_step == {"q", "w"}
+        sensors = {f"sensor_{of}:{n}" for of in ("delay", "lag", "scale") for n in "qw"}
+        assert found.settled == sensors | {"sensor_bias:w", "offset:q", "rate_gain:q"}
+        for before, after in zip(trials, found.trials, strict=True):
+            np.testing.assert_array_equal(before.states, after.states)
+
+
+def test_sensors_too_noisy_to_be_held_against_each_other_may_still_be_late():
+    rng = np.random.default_rng(1)
+    found = preflight(ARM, arm(lambda y: y + rng.standard_normal(y.shape) * [0.03, 0.3]))
+    assert not found.in_step and not found.settled
+
+
+@pytest.mark.parametrize("bias", [0.05, -0.02])
+def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
+    """0.05 rad/s are 20 cm of way in a run of 4 s; which of the two is off, the physics says."""
+    found = preflight(ARM, arm(columns(w=lambda x: x + bias)))
+    (one,) = found.findings
+    assert (one.signal, one.kind, one.corrected) == ("w", "offset", False)
+    assert ("more" if bias > 0 else "less") in one.finding
+    assert not {"sensor_bias:w", "offset:q"} & found.settled
+    (tie,) = integrals(ARM)
+    for seed in range(4):
+        off = constant_of(ARM, tie, arm(columns(w=lambda x: x + bias), seed=seed))
+        assert off.value == pytest.approx(bias, abs=3 * off.std) and off.std < 0.002
+
+
+def test_a_constant_that_few_or_noisy_samples_would_not_show_may_be_there():
+    (tie,) = integrals(ARM)
+    assert constant_of(ARM, tie, arm(trials=1, steps=40)) is None
+    rng = np.random.default_rng(1)
+    noisy = arm(lambda y: y + rng.standard_normal(y.shape) * [0.3, 0.3])
+    off = constant_of(ARM, tie, noisy)
+    assert not off.refuted and not off.found
+    assert "sensor_bias:w" not in preflight(ARM, noisy).settled
+
+
+@pytest.mark.slow
+def test_a_heading_rate_that_is_only_carried_rules_out_no_effect_on_the_heading():
+    """A car that turned by -0.43 rad/s was told as a patch of ground, with ten times the error."""
+    rng, trials = np.random.default_rng(2), []
+    real = wrap(Library().effect("offset:psi", car), {"c": -0.4}, DT)
+    for _ in range(4):
+        t, w = DT * np.arange(200), rng.uniform(1, 6, 3)
+        u = np.stack(
+            [0.3 * np.sin(w[0] * t) + 0.2 * np.sin(w[1] * t), 0.5 + 0.2 * np.sin(w[2] * t)]
+        )
+        x = real.system.march(-0.4 * GYRO[None], u.T[:, None], real.values, DT)[:, 0]
+        noise = np.array([5e-3, 1e-2, 2e-3, 2e-3, 2e-3, 1e-2]) * rng.standard_normal(x.shape)
+        trials.append(Trial(x + noise, u.T, DT, car.state_names, car.input_names))
+    settled = preflight(car, trials).settled
+    assert "sensor_bias:psi_rate" in settled and not {"offset:psi", "rate_gain:psi"} & settled
+    assert diagnose(car, trials).effects == ("offset:psi",)
+
+
+@pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (1.01, False), (0.994, False)])
+def test_a_scale_between_two_sensors_that_agree_is_no_candidate(scale, settled):
+    found = preflight(ARM, arm(columns(w=lambda x: scale * x)))
+    assert not found.findings
+    scales = {"sensor_scale:w", "sensor_scale:q", "rate_gain:q"}
+    assert (scales <= found.settled) is settled and bool(scales & found.settled) is settled
+
+
+def stuck(x):
+    out = x.copy()
+    out[60:85] = out[60]
+    return out
+
+
+def dropped(x):
+    out = x.copy()
+    out[[50, 90, 91, 130]] = -20.0
+    return out
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "lost"),
+    [
+        (stuck, "stuck", 24),
+        (dropped, "dropout", 4),
+        (lambda x: np.repeat(x[::4], 4)[:201], "held", 150),
+    ],
+)
+def test_samples_that_show_nothing_become_missing(fault, kind, lost):
+    found = preflight(ARM, arm(columns(q=fault), trials=2))
+    one = next(f for f in found.findings if f.kind == kind)
+    assert (one.signal, one.corrected) == ("q", True)
+    gone = [int(np.isnan(t.states[:, 0]).sum()) for t in found.trials]
+    assert max(gone) == pytest.approx(lost, abs=1)  # a turn hides it in the other trial
+    assert one.share == pytest.approx(sum(gone) / 402)
+
+
+def dead(x):
+    return np.column_stack([x[:, 0], np.full(len(x), 0.25)])
+
+
+def test_a_velocity_that_shows_nothing_in_one_log_becomes_missing_there():
+    trials = arm()
+    trials[1] = replace(trials[1], states=dead(trials[1].states))
+    found = preflight(ARM, trials)
+    (one,) = (f for f in found.findings if f.kind == "stuck")
+    assert one.signal == "w" and one.corrected and "number 2" in one.finding
+    assert [bool(np.isnan(t.states[:, 1]).all()) for t in found.trials] == [
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_velocity_that_no_log_shows_stops_the_diagnosis():
+    with pytest.raises(GroundedError, match=r"w .*0\.25.*\[log\.state\.w\]"):
+        preflight(ARM, arm(dead))
+
+
+def of_another_axis(x):
+    """A gyro that hardly turns: its noise, about its own small bias."""
+    noise = 0.01 * np.random.default_rng(len(x)).normal(size=len(x))
+    return np.column_stack([x[:, 0], 0.002 + noise])
+
+
+def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
+    """Seen: a damping of 1e136 1/s explained it."""
+    with pytest.raises(GroundedError, match=r"w shows .*noise .*\[log\.state\.w\]"):
+        preflight(ARM, arm(of_another_axis))
+    trials = arm()
+    trials[1] = replace(trials[1], states=of_another_axis(trials[1].states))
+    found = preflight(ARM, trials)
+    (one,) = (f for f in found.findings if f.kind == "stuck")
+    assert one.signal == "w" and "number 2" in one.finding
+    assert np.isnan(found.trials[1].states[:, 1]).all()
+
+
+@pytest.mark.parametrize("late", [0, 8, -8])
+def test_a_velocity_in_a_far_smaller_unit_has_the_shape_of_its_position_however_late(late):
+    small = [
+        replace(t, states=np.column_stack([t.states[:, 0], np.roll(t.states[:, 1], late) / 57.3]))
+        for t in arm()
+    ]
+    assert not any(dead_rates(ARM, t, range(ARM.n)) for t in small)
+
+
+def test_what_stands_still_has_no_dead_sensor():
+    rest = [replace(t, states=t.states * 0 + [0.3, 0.0]) for t in arm()]
+    rolling = [
+        replace(
+            t, states=np.column_stack([0.5 * DT * np.arange(t.steps + 1), t.states[:, 1] * 0 + 0.5])
+        )
+        for t in arm()
+    ]
+    for trials in (rest, rolling):
+        assert not any(f.kind == "stuck" for f in preflight(ARM, trials).findings)
+
+
+ENCODER = 2e-3  # rad a count
+
+
+def sticking_joint(seed):
+    """An arm that dry friction holds now and then: an encoder, its filtered difference (T + 1, 2).
+
+    The difference is 0 to the last digit there, as a log with a few digits has it.
+    """
+    rng, q, w = np.random.default_rng(seed), [0.0], [0.0]
+    while len(q) < 600:
+        for speed in (rng.uniform(0.03, 0.4), 0.0):
+            q += list(q[-1] + np.cumsum(np.full(rng.integers(40, 70), speed * DT)))
+    counts = np.round(np.array(q) / ENCODER) * ENCODER
+    for moved in np.diff(counts):
+        w.append(w[-1] + (moved / DT - w[-1]) / 6)
+    return np.column_stack([counts, np.round(w, 3)])
+
+
+def of_joints(fault=lambda y: y):
+    return [
+        Trial(fault(sticking_joint(k)[:400]), np.zeros((399, 1)), DT, ("q", "w"), ("u",))
+        for k in range(3)
+    ]
+
+
+def test_a_velocity_that_is_0_while_its_encoder_stands_still_is_at_rest():
+    """A bench helicopter's dry friction: "sticks to its last value, up to 0.25 s", and cut out."""
+    found = preflight(ARM, of_joints())
+    assert not {f.kind for f in found.findings} & {"stuck", "saturated"}
+    assert all(np.isfinite(t.states[:, 0]).all() for t in found.trials)
+    assert [f.signal for f in found.findings if f.kind == "smoothed"] == ["w"]  # not as a sensor
+
+
+@pytest.mark.parametrize(("gone", "told"), [([1], ["w"]), ([0, 1], ["q", "w"])])
+def test_a_velocity_that_stays_while_its_encoder_moves_or_says_it_does_is_stuck(gone, told):
+    def held(y):
+        y[1:21, gone] = y[1, gone]  # as it speeds up; both: a log that hangs
+        return y
+
+    found = preflight(ARM, of_joints(held)).findings
+    assert [one.signal for one in found if one.kind == "stuck"] == told
+
+
+def test_coarse_missing_and_clipped_samples_are_stated_and_left():
+    def coarse(y):
+        y = np.round(y / [0.2, 1e-9]) * [0.2, 1e-9]
+        y[100:110, 1] = np.nan
+        return y
+
+    found = preflight(ARM, arm(coarse))
+    assert {(f.signal, f.kind) for f in found.findings} == {("q", "quantised"), ("w", "missing")}
+    assert not any(f.corrected for f in found.findings)
+    clipped = preflight(ARM, arm(columns(w=lambda x: np.minimum(x, 0.7))))
+    assert ("w", "saturated") in {(f.signal, f.kind) for f in clipped.findings}
+
+
+def test_jumps_by_a_full_turn_are_taken_out():
+    def turn(y, full):
+        y = y + np.array([3.0, 0])
+        y[:, 0] = (y[:, 0] * full / (2 * np.pi) + full / 2) % full - full / 2
+        return y
+
+    for full, kind in ((2 * np.pi, "wrapped"), (360.0, "degrees")):
+        found = preflight(ARM, arm(lambda y, full=full: turn(y, full)))
+        assert [f.kind for f in found.findings] == [kind]
+        steps = np.concatenate([np.diff(t.states[:, 0]) for t in found.trials])
+        assert np.abs(steps).max() < 0.3
+
+
+def test_inputs_that_are_copies_or_constant_are_stated():
+    model = replace(ARM, inputs={"u": "N m", "seen": "N m", "kp": "1"})
+    trials = []
+    for k, t in enumerate(arm(trials=4)):
+        u = t.inputs[:, 0]
+        inputs = np.stack([u, np.concatenate([u[:1], u[:1], u[:-2]]), np.full(len(u), k)], axis=1)
+        trials.append(Trial(t.states, inputs, DT, ("q", "w"), ("u", "seen", "kp")))
+    found = {f.signal: f for f in preflight(model, trials).findings}
+    assert {n: f.kind for n, f in found.items()} == {"seen": "copy", "kp": "constant"}
+    assert found["seen"].delay_s == pytest.approx(2 * DT, rel=0.02)
+
+
+def test_kinematics_come_from_the_model():
+    assert [
+        (pendulum.state_names[r.i], pendulum.state_names[r.j]) for r in integrals(pendulum)
+    ] == [("theta", "omega")]
+    plane = turned(car)
+    assert plane is not None and turned(ARM) is None
+    names = [car.state_names[i] for i in (plane.i, plane.j, plane.k)]
+    assert set(names[:2]) == {"x", "y"} and names[2] == "psi"
+
+
+def test_noise_in_both_brackets_the_scale():
+    rng, t = np.random.default_rng(0), np.arange(2000) * DT
+    true = np.sin(1.3 * t) + np.sin(3.1 * t)
+    a = true + 0.3 * rng.standard_normal(2000)
+    lag = lag_between([(a, 1.2 * true + 0.3 * rng.standard_normal(2000))], DT)
+    assert lag is not None and lag.low < 1.2 < lag.high
+    assert abs(lag.delay) < 5 * lag.std < 0.02
+
+
+@pytest.mark.parametrize("size", [1.0, 0.9])
+def test_noise_is_no_scale_where_a_motion_hardly_changes(size):
+    """In a half circle, what little a boat's turn rate changed was 5 % smaller in its gyro."""
+    rng, t = np.random.default_rng(2), np.arange(400) * DT
+    true = 0.7 + 0.06 * np.sin(1.3 * t)
+    a = true + 0.001 * rng.standard_normal(400)
+    b = size * true - 0.1 * size * (true - 0.7)  # it shows less of the changes
+    lag = lag_between([(a, b + 0.001 * rng.standard_normal(400))], DT)
+    assert lag.steady == pytest.approx(size, abs=0.01) and lag.scale < 0.95
+    assert lag.off(0.05) == (size < 0.95)
+    around_zero = lag_between([(a - 0.7, b - 0.7 * size)], DT)
+    assert np.isnan(around_zero.steady) and around_zero.off(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("filtered", [True, False])
+def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):
+    """A pendulum's rate behind a filter of 11 ms was 10 ms late and 5.6 % too small."""
+    rng, t, tau = np.random.default_rng(2), DT * np.arange(1500), 0.011
+    a, b = np.zeros(1500), np.zeros(1500)
+    for w, size in ((3.0, 0.3), (19.0, 1.0), (23.0, 0.8), (27.0, 0.6)):
+        phase = rng.uniform(0, 6)
+        gain, late = 1 / np.hypot(1, w * tau), np.arctan(w * tau) / w
+        if not filtered:
+            gain, late = 0.96, 0.01
+        a += size * np.sin(w * t + phase)
+        b += gain * size * np.sin(w * (t - late) + phase)
+    a, b = (x + 0.05 * rng.standard_normal(1500) for x in (a, b))
+    lag = lag_between([(a, b)], DT)
+    assert lag.filtered == filtered
+    assert lag.delay == pytest.approx(tau if filtered else 0.01, rel=0.08)
+    assert lag.scale == pytest.approx(1.0 if filtered else 0.96, abs=0.012)
+
+
+@pytest.mark.parametrize("of_slow", [1.0, 0.94])
+def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
+    """A balancer's torque changed sign every 25 ms: its gyro showed 94.5 % of its pitch's rate."""
+    rng, t = np.random.default_rng(3), 0.01 * np.arange(1000)
+    slow, chatter = 0.3 * np.sin(2.1 * t), np.sin(2 * np.pi * 19.94 * t)
+    a, b = slow + chatter, of_slow * slow + 0.94 * chatter
+    lag = lag_between([tuple(x + 0.01 * rng.standard_normal(1000) for x in (a, b))], 0.01)
+    assert lag.scale < 0.96
+    assert lag.slow == pytest.approx(of_slow, abs=0.01)
+    assert lag.off(0.03) == (of_slow < 1)
+
+
+@pytest.mark.slow
+def test_a_late_sensor_is_not_counted_against_the_effects():
+    trials = arm(columns(w=lambda x: late(x, 1.0)), friction=0.5, steps=120)
+    found = diagnose(ARM, trials)
+    assert [(f.signal, f.kind, f.corrected) for f in found.preflight] == [("w", "delay", True)]
+    assert found.effects == ("coulomb_friction:w",), found.sentence
+    assert not any(row.effect == "sensor_delay:w" for row in found.ranking)
+    again = type(found).from_json(found.to_json())
+    assert again.preflight == found.preflight
+
+
+@needs_data
+def test_the_late_velocity_registers_of_real_joints():
+    """Published beside the data: about 20 ms (BAM) and 15 ms (the double pendulum)."""
+    for parts, columns, step, late, kinds in (
+        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020, ["delay", "smoothed"]),
+        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015, ["delay"]),
+    ):
+        log, trials = np.load(data(parts[0], f"{parts[1]}.npz"), allow_pickle=True), []
+        for name in (n for n in log.files if n.startswith("run") and not n.endswith("_t")):
+            t = log[f"{name}_t"]
+            grid = np.arange(t[0], t[-1], step)
+            states = np.stack([np.interp(grid, t, log[name][:, c]) for c in columns], axis=1)
+            none = np.zeros((len(grid) - 1, 1))
+            trials.append(Trial(states, none, step, ("q", "w"), ("u",)))
+        found = preflight(ARM, trials).findings
+        assert [(one.signal, one.kind) for one in found] == [("w", kind) for kind in kinds]
+        assert found[0].delay_s == pytest.approx(late, abs=0.001)
+
+
+@needs_data
+def test_sound_sensors_of_real_systems():
+    for system in (EMPS, SERVO, DART_STEERING):
+        assert preflight(system.model, system.read()).findings == ()
+
+
+def test_a_whole_trial_in_degrees_is_named_and_corrected():
+    trials = arm()
+    odd = replace(trials[2], states=np.rad2deg(trials[2].states), id="t0003")
+    found = preflight(ARM, [*trials[:2], odd, trials[3]])
+    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [
+        ("q", "degrees", True),
+        ("w", "degrees", True),
+    ]
+    assert all("t0003" in f.finding for f in found.findings)
+    np.testing.assert_allclose(found.trials[2].states, trials[2].states)
+    np.testing.assert_array_equal(found.trials[1].states, trials[1].states)
+
+
+def test_one_state_of_one_trial_in_degrees_is_named():
+    trials = arm()
+    states = np.array(trials[1].states)
+    states[:, 1] = np.rad2deg(states[:, 1])
+    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("w", "degrees")]
+    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
+
+
+@pytest.mark.parametrize(
+    ("state", "factor"), [(0, 180 / np.pi), (0, np.pi / 180), (1, 180 / np.pi), (1, np.pi / 180)]
+)
+def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
+    """A theta that was 57.3 times too small passed for an omega in degrees."""
+    trials = arm()
+    states = np.array(trials[1].states)
+    states[:, state] *= factor
+    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("qw"[state], "degrees")]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
+
+
+def driven():
+    """Three drives of the car, which carries its heading's rate along."""
+    rng, trials = np.random.default_rng(4), []
+    for _ in range(3):
+        u = 0.4 + 0.2 * np.sin(DT * np.arange(150)[:, None] * rng.uniform(1, 4, 2))
+        states = [np.zeros(car.n)]
+        for one in u:
+            states.append(car.system.step(states[-1][None], one[None], car.values, DT)[0])
+        x = np.array(states) + 1e-4 * rng.standard_normal((151, car.n))
+        trials.append(Trial(x, u, DT, car.state_names, car.input_names))
+    return trials
+
+
+def test_a_gyro_that_is_off_is_told_though_the_model_carries_its_rate_along():
+    """Off by 0.95 rad/s it was not found: the carried rate stays off in the model as well."""
+    biased = [replace(trial, states=trial.states + 0.9 * GYRO) for trial in driven()]
+    (found,) = preflight(car, biased).findings
+    assert (found.signal, found.kind, found.corrected) == ("psi_rate", "offset", False)
+    assert "0.9 rad/s more than the rate of psi" in found.finding
+    assert preflight(car, driven()).findings == ()
+
+
+def test_a_heading_in_degrees_in_one_trial_leaves_the_others_alone():
+    """The car carries its heading's rate along: pooled, one trial made all be in degrees."""
+    trials = driven()
+    x = np.array(trials[1].states)
+    x[:, car.state_names.index("psi")] *= 180 / np.pi
+    found = preflight(car, [trials[0], replace(trials[1], states=x), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("psi", "degrees")]
+    for mended, trial in zip(found.trials, trials, strict=True):
+        np.testing.assert_allclose(mended.states, trial.states)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
+    """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
+    trials, rng = arm(), np.random.default_rng(3)
+    for k, trial in enumerate(trials):
+        x = np.array(trial.states)
+        x[:, 0] += 0.04 * rng.standard_normal(len(x)) + 3 * (k == 1)
+        if k == 1:
+            x[:, 0] = np.rad2deg(x[:, 0])
+            x[:, 0] = (x[:, 0] + 180) % 360 - 180 if wrapped else x[:, 0]
+        trials[k] = replace(trial, states=x)
+    found = preflight(ARM, trials)
+    assert (found.findings[0].signal, found.findings[0].kind) == ("q", "degrees")
+    assert 0.5 < np.ptp(found.trials[1].states[:, 0]) / np.ptp(arm()[1].states[:, 0]) < 2
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_commands_in_another_unit_in_one_trial_are_told(factor):
+    trials = arm(friction=0.4)
+    odd = replace(trials[2], inputs=factor * trials[2].inputs, start_inputs=np.array([factor]))
+    found = preflight(ARM, [*trials[:2], odd, trials[3]])
+    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [("u", "scale", True)]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[2].inputs, trials[2].inputs)
+    np.testing.assert_allclose(found.trials[2].start_inputs, [1.0])
+
+
+BEAM = Model(
+    states={"r": "m", "v": "m/s", "theta": "rad"},
+    inputs={"cmd": "rad"},
+    params={"k": Param(5.0, "m/s^2", 2.0, 12.0), "tau": Param(0.1, "s", 0.02, 0.5)},
+    derivative=lambda s, a, p: {
+        "r": s.v,
+        "v": p.k * np.sin(s.theta),
+        "theta": (a.cmd - s.theta) / p.tau,
+    },
+)
+
+
+@pytest.mark.parametrize("k", [2.8, 5.0, 10.0])
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("sent", [1.0, 180 / np.pi])
+def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
+    """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
+    rng, trials = np.random.default_rng(1), []
+    for phase in (0.0, 2.0):
+        u, states = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)[:, None], [np.zeros(3)]
+        for one in u:
+            real = np.array([k, 0.13])
+            states.append(BEAM.system.step(states[-1][None], one[None], real, DT)[0])
+        x = np.array(states) + rng.normal(size=(401, 3)) * [1e-3, 4e-3, 1e-3]
+        trials.append(Trial(x * [1, 1, unit], sent * u, DT, BEAM.state_names, ("cmd",)))
+    found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
+    assert found == [("theta", "degrees")] * (unit > 1) + [("cmd", "degrees")] * (sent > 1)
+
+
+def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
+    pushed, free = arm(trials=2)
+    states = [np.array([1.0, 0.0])]
+    for u in (inputs := 1e-3 * pushed.inputs):
+        states.append(ARM.system.step(states[-1][None], u[None], ARM.values, DT)[0])
+    swing = replace(free, states=np.array(states), inputs=inputs)
+    assert not preflight(ARM, [pushed, swing]).findings
+    still = replace(free, states=1e-3 * free.states, inputs=inputs)
+    assert not [f for f in preflight(ARM, [pushed, still]).findings if f.signal == "u"]
+
+
+def test_a_trial_that_moves_more_is_not_in_degrees():
+    quiet, wild = arm(trials=2)
+    small = replace(quiet, states=quiet.states / 40, inputs=quiet.inputs / 40)
+    assert not preflight(ARM, [small, wild]).findings
+
+
+def test_a_trial_with_stamps_in_milliseconds_stops_the_diagnosis():
+    trials = arm(steps=100)
+    at = np.arange(0, 100, 1e-2)
+    slow = np.stack([np.interp(at, np.arange(101), x) for x in trials[1].states.T], axis=1)
+    inputs = np.repeat(trials[1].inputs, 100, axis=0)[: len(slow) - 1]
+    slow[:, 0] = trials[1].states[0, 0] + np.cumsum(slow[:, 1]) * DT / 1000
+    odd = Trial(slow, inputs, DT, ("q", "w"), ("u",), id="t0002")
+    with pytest.raises(GroundedError, match="t0002") as error:
+        preflight(ARM, [trials[0], odd])
+    assert error.value.then == NextCommand("discard", ("t0002",))
+
+
+BOTH = Model(
+    states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+    inputs={"u": "N m"},
+    params={},
+    derivative=lambda s, a, p: {"q1": s.w1, "q2": s.w2, "w1": a.u, "w2": -a.u},
+)
+
+
+@pytest.mark.parametrize(
+    ("off", "told"),
+    [
+        ((1.0, 1.0, 2.0, 2.0), ["w1+w2"]),  # stamps at half the pace
+        ((1.0, 1.0, 0.6, 0.6), ["w1+w2"]),
+        ((1.0, 1.0, 2.0, 1.5), ["w1", "w2"]),  # two sensors
+        ((1.0, 1.0, 2.0, 1.0), ["w1"]),  # one, which the other joint's clock contradicts
+    ],
+)
+def test_one_factor_of_all_rates_is_the_clock(off, told):
+    trials = []
+    for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
+        a, b = first.states, second.states
+        states = np.column_stack([a[:, 0], b[:, 0], a[:, 1], b[:, 1]]) * off
+        trials.append(Trial(states, first.inputs, DT, BOTH.state_names, ("u",)))
+    found = [one for one in preflight(BOTH, trials).findings if one.kind == "scale"]
+    assert [one.signal for one in found] == told
+    assert found[0].scale == pytest.approx(off[2], rel=0.05)
+    assert ("clock" in found[0].finding) == ("+" in told[0])
+
+
+@pytest.mark.parametrize(
+    ("factor", "rpm", "mended"),
+    [(60 / (2 * np.pi), True, True), (2 * np.pi / 60, True, False), (9.2, False, False)],
+)
+def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
+    """`w shows 955 % of the rate of q`: a motor's driver gives turns a minute."""
+    (found,) = preflight(ARM, arm(columns(w=lambda x: factor * x))).findings
+    assert (found.signal, found.corrected) == ("w", mended)
+    assert ("rpm" in found.finding) == rpm
+    assert found.log == "scale = 0.10471976" * mended
+
+
+def test_two_rates_in_rpm_are_no_clock():
+    """It said to multiply the stamps by 0.105, and offered six effects to adopt."""
+    trials, factor = [], 60 / (2 * np.pi)
+    for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
+        a, b = first.states, second.states
+        states = np.column_stack([a[:, 0], b[:, 0], factor * a[:, 1], factor * b[:, 1]])
+        trials.append(Trial(states, first.inputs, DT, BOTH.state_names, ("u",)))
+    looked = preflight(BOTH, trials)
+    assert [(one.signal, one.kind, one.corrected) for one in looked.findings] == [
+        ("w1", "degrees", True),
+        ("w2", "degrees", True),
+    ]
+    np.testing.assert_allclose(looked.trials[0].states[:, 2], trials[0].states[:, 2] / factor)
+
+
+TRUCK = Model(
+    states={"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
+    inputs={"steering": "rad", "push": "m/s^2"},
+    params={"L": Param(0.5, "m", std=0.02)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "v": a.push - s.v,
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": s.v * np.tan(a.steering) / p.L,
+    },
+)
+CROOKED = ("coupling:psi<-v", {"k": 0.04})
+LATE = ("delay:steering", {"d": 0.008})
+PLAY = ("backlash:steering", {"b": 0.02})
+SHORT_OF = ("saturation:steering", {"c": 0.1})
+
+
+def adopted(model, *effects):
+    """Return a model with effects, the innermost first."""
+    for name, values in effects:
+        effect = Library().effect(name, model)
+        model = wrap(effect, values, DT)
+    return model
+
+
+def run_of(model, shown, inputs, noise):
+    """A run of a model from 0, with noise on its first `shown` states; the others are memory."""
+    rng, states = np.random.default_rng(0), [np.zeros(model.n)]
+    for u in inputs:
+        states.append(model.system.step(states[-1][None], u[None], model.values, DT)[0])
+    x = np.array(states) + noise * rng.standard_normal((len(states), model.n))
+    x[:, shown:] = np.nan
+    return Trial(x, inputs, DT, model.state_names, model.input_names)
+
+
+@pytest.mark.parametrize("hides", [(LATE, PLAY), (PLAY, LATE), (SHORT_OF,), (SHORT_OF, LATE)])
+def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hides):
+    truck = adopted(TRUCK, CROOKED, *hides)
+    assert not integrals(truck)
+    rows = kinematic_rows(truck, range(TRUCK.n))
+    assert [truck.state_names[row.i] for row in rows] == ["x", "y"]
+
+    t = np.arange(400) * DT
+    inputs = np.stack([0.3 * np.sin(1.3 * t), 1.5 + 0.5 * np.sin(0.7 * t)], axis=1)
+    trial = run_of(truck, TRUCK.n, inputs, 1e-3)
+    found = preflight(truck, [trial], hidden=truck.state_names[TRUCK.n :])
+    assert [one.finding for one in found.findings] == []
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.45])
+def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
+    """A steering that the crude model itself limits to 0.45 rad was probed beyond that only."""
+
+    def within(s, a, p):
+        steering = np.minimum(np.maximum(a.steering, -limit), limit)
+        return {
+            "v": a.push - s.v,
+            "x": s.v * np.cos(s.psi),
+            "y": s.v * np.sin(s.psi),
+            "psi": s.v * np.tan(steering) / 0.5,
+        }
+
+    limited = replace(TRUCK, derivative=within)
+    assert not integrals(limited)
+    rows = kinematic_rows(limited, range(limited.n))
+    assert [limited.state_names[row.i] for row in rows] == ["x", "y"]
+
+
+def test_a_relation_of_sensors_outlasts_effects_on_the_inputs():
+    arm_late = adopted(ARM, ("dead_zone:u", {"c": 0.1}), ("first_order_lag:u", {"tau": 0.1}))
+    assert integrals(arm_late) == integrals(ARM) != []
+
+
+ROVER = Model(
+    states={"omega": "rad/s", "psi": "rad"},
+    inputs={"turn": "rad/s"},
+    derivative=lambda s, a, p: {"omega": (a.turn - s.omega) / 0.12, "psi": s.omega},
+)
+
+
+def test_a_delay_that_is_part_of_the_model_is_not_corrected_again():
+    """It was: then the adopted delay "should be 0", and `diagnose` advised to adopt that."""
+    late = adopted(ROVER, ("sensor_delay:omega", {"d": 0.14 * DT}))
+    t = np.arange(1500) * DT
+    inputs = np.sin(1.3 * t)[:, None] + np.sign(np.sin(0.7 * t))[:, None]
+    trial = run_of(late, ROVER.n, inputs, 1e-4)
+    found = preflight(late, [trial], hidden=late.state_names[ROVER.n :])
+    assert not found.findings
+    np.testing.assert_array_equal(found.trials[0].states, trial.states)
+
+    own = Trial(trial.states[:, : ROVER.n], inputs, DT, ROVER.state_names, ROVER.input_names)
+    (one,) = preflight(ROVER, [own]).findings
+    assert one.signal == "omega" and one.delay_s == pytest.approx(0.14 * DT, abs=0.02 * DT)

@@ -1,0 +1,73 @@
+"""An integrator's step that is too long for the model is told, with the number that is enough."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.accounts.time_step import judge_time_step, too_long
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.effects import Library
+from grounded.models.car import model as car
+
+DT = 0.02
+
+
+def motor(a):
+    """A motor that reaches its speed at the rate a [1/s]."""
+    return Model(
+        name="motor",
+        states={"q": "rad", "w": "rad/s"},
+        inputs={"volts": "V"},
+        params={"a": Param(a, "1/s", 0.5 * a, 2 * a), "g": Param(9.0, "1/s^2")},
+        derivative=lambda s, u, p: {
+            "q": s.w,
+            "w": p.a * (5 * u.volts - s.w) - p.g * np.sin(s.q),
+        },
+    )
+
+
+def run(model, seed=0, steps=200):
+    rng, fine = np.random.default_rng(seed), replace(model, substeps=8)
+    u = np.repeat(rng.uniform(-1, 1, steps // 10), 10)[:, None]
+    states = [np.zeros(2)]
+    for one in u:
+        states.append(fine.system.step(states[-1][None], one[None], fine.values, DT)[0])
+    noise = rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
+    return Trial(np.array(states) + noise, u, DT, model.state_names, model.input_names)
+
+
+@pytest.mark.parametrize(("rate", "enough"), [(10.0, 0), (40.0, 0), (95.0, 2), (280.0, 4)])
+def test_a_motor_that_is_too_fast_for_a_step(rate, enough):
+    model = motor(rate)
+    found = judge_time_step(model, [run(model)], [0, 1])
+    assert len(found) == (enough > 0)
+    if enough:
+        assert found[0].kind == "time step" and f"substeps={enough}" in found[0].advice
+        assert not judge_time_step(replace(model, substeps=enough), [run(model)], [0, 1])
+
+
+def test_models_that_take_their_own_steps_are_not_judged():
+    own = motor(280.0)
+    stepped = replace(own, derivative=None, step=lambda s, a, p, dt: {"q": s.q, "w": 0.5 * s.w})
+    assert not judge_time_step(stepped, [run(own)], [0, 1])
+    assert not judge_time_step(own, [run(own)], [])  # nothing is measured
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1, 1, (50, car.n)), rng.uniform(-1, 1, (50, car.m))
+    assert too_long(car, x, u, 0.05) is None
+
+
+def test_a_few_samples_of_a_fall_say_nothing_about_the_others():
+    model = motor(10.0)
+    states = np.array(run(model).states)
+    states[100:103, 1] = 1e6
+    assert too_long(model, states[:-1], run(model).inputs, DT) is None
+
+
+def test_the_verdict_tells_it():
+    model = motor(95.0)
+    options = DiagnosisOptions(library=Library((Library().family("input_gain"),)))
+    found = diagnose(model, [run(model, k) for k in range(3)], options)
+    assert "w is missed by" in found.verdict.sentence and "substeps=2" in found.verdict.sentence
+    assert [one.kind for one in found.preflight] == ["time step"]

@@ -1,0 +1,79 @@
+"""A trial that becomes too fast for the model's time step is cut there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Trial
+from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.tables import instrument_lines
+from grounded.effects import Library
+from grounded.models.arm import model as arm
+
+DT, LATE, WHIRL = 0.02, 2, 10.0  # [s], steps, [N m]
+
+
+def driven(k, whirl=0.0, steps=80, size=0.4):
+    """A run whose inputs are 40 ms late; `whirl` [N m] turns the second joint from 0.6 s on."""
+    rng, t = np.random.default_rng(k), DT * np.arange(steps)
+    u = size * np.stack([3 * np.sin((3 + k) * t + k), np.sin((5 - k) * t)], axis=1)
+    u[30:, 1] += whirl
+    states = [np.array([-np.pi / 2, 0.0, 0.0, 0.0])]
+    for one in [np.zeros(2)] * LATE + list(u[: steps - LATE]):
+        z = states[-1]
+        for _ in range(40):
+            z = arm.system.step(z[None], one[None], arm.values, DT / 40)[0]
+        states.append(z)
+    y = np.array(states) + rng.standard_normal((steps + 1, 4)) * [1e-3, 1e-3, 1e-2, 1e-2]
+    return Trial(y, u, DT, arm.state_names, arm.input_names, id=f"t{k:04d}")
+
+
+def test_a_whirling_trial_is_cut_where_the_model_cannot_be_integrated():
+    trials = [driven(0, WHIRL), driven(1), driven(2)]
+    looked = preflight(arm, trials)
+    (found,) = [one for one in looked.findings if one.kind == "unresolved"]
+    keep = looked.trials[0].known_steps
+    assert (
+        found.signal == "q2_vel" and found.corrected and found.share == pytest.approx(1 - keep / 80)
+    )
+    assert 35 < keep < 60 and [t.known_steps for t in looked.trials[1:]] == [80, 80]
+    for words in ("in trial t0000", f"from {keep * DT:.3g} s on", "steps of 20 ms", "left out"):
+        assert words in found.finding
+    (line,) = [x for x in instrument_lines(looked.findings) if "time steps" in x]
+    assert line.startswith("q2_vel: reaches 331 rad/s") and "corrected" not in line
+
+
+@pytest.mark.parametrize(
+    "trials",
+    [
+        [driven(0, WHIRL)],  # nothing to compare it with
+        [driven(k, WHIRL) for k in range(3)],  # it is the manoeuvre
+        [driven(k) for k in range(3)],
+        [driven(0, size=1.0), driven(1), driven(2)],  # large, but no faster than a step resolves
+    ],
+)
+def test_others_are_kept_whole(trials):
+    looked = preflight(arm, trials)
+    assert not [one for one in looked.findings if one.kind == "unresolved"]
+    assert [t.known_steps for t in looked.trials] == [80] * len(trials)
+
+
+def test_a_model_that_steps_by_itself_is_not_judged():
+    def step(s, a, p, dt):
+        return {n: getattr(s, n) for n in arm.states}
+
+    own = replace(arm, derivative=None, step=step)
+    looked = preflight(own, [driven(0, WHIRL), driven(1), driven(2)])
+    assert not [one for one in looked.findings if one.kind == "unresolved"]
+
+
+def test_the_delay_behind_a_whirl_is_found_and_what_was_left_out_is_said():
+    """It was hidden: 182,574 rad a second ahead by one trial, and no effect was claimed."""
+    library = Library(tuple(map(Library().family, ("delay", "viscous_friction", "input_gain"))))
+    options = DiagnosisOptions(library=library)
+    found = diagnose(arm, [driven(0, WHIRL), driven(1), driven(2)], options)
+    assert found.effects == ("delay:tau1+tau2",)
+    assert found.values("delay:tau1+tau2")["d"] == pytest.approx(LATE * DT, abs=0.002)
+    assert sum("q2_vel reaches 331 rad/s" in line for line in found.verdict.lines) == 1

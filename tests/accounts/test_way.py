@@ -1,0 +1,222 @@
+"""Speeds in other axes or units, and a compass's heading: told by the way that was travelled."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from facts import holding, holds
+from grounded import Model
+from grounded.accounts.ages import lag_of
+from grounded.accounts.judge import judge
+from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.places import integrals
+from grounded.trial import Trial
+from grounded_trials.workspace.intake.remarks.log_faults import column_faults
+
+DT = 0.1
+STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}
+NAMES = tuple(STATES)
+NOISE = np.array([0.015, 0.015, 0.006, 0.01, 0.01, 0.004])
+
+
+def rates(s, a, p):
+    return {
+        "u": 1.3 * (a.port + a.starboard) - 0.7 * s.u + s.v * s.r,
+        "v": -2.0 * s.v - s.u * s.r,
+        "r": 1.6 * (a.starboard - a.port) - 1.8 * s.r,
+        "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
+        "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
+        "psi": s.r,
+    }
+
+
+BOAT = Model(
+    name="catamaran",
+    states=STATES,
+    inputs={"port": "1", "starboard": "1"},
+    angles=("psi",),
+    derivative=rates,
+)
+# without a gyro
+PLAIN = Model(
+    name="no gyro",
+    states={name: unit for name, unit in STATES.items() if name != "r"},
+    inputs=dict(BOAT.inputs),
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "u": 1.3 * (a.port + a.starboard) - 0.7 * s.u,
+        "v": -2.0 * s.v,
+        "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
+        "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
+        "psi": 0.9 * (a.starboard - a.port),
+    },
+)
+
+
+def sailed(seed: int, steps: int = 300) -> Trial:
+    """A boat in a current that a stick drives, with noisy sensors."""
+    rng, now, aim = np.random.default_rng(seed), np.zeros(2), np.zeros(2)
+    x = np.array([0, 0, 0, 0, 0, rng.uniform(-3, 3)])
+    states, inputs = [x], []
+    for k in range(steps):
+        if k % 22 == 0:
+            aim = rng.uniform([0.05, -0.45], [0.85, 0.45])
+        now = now + 0.35 * (aim - now)
+        u = np.array([now[0] - now[1], now[0] + now[1]])
+        x = BOAT.system.step(x[None], u[None], BOAT.values, DT)[0] + DT * CURRENT
+        states.append(x)
+        inputs.append(u)
+    seen = np.array(states) + NOISE * rng.standard_normal((steps + 1, 6))
+    return Trial(seen, np.array(inputs), DT, NAMES, BOAT.input_names, id=f"t{seed:04}")
+
+
+CURRENT = np.array([0, 0, 0, 0.12, -0.07, 0])
+SOUND = [sailed(seed) for seed in range(4)]
+
+
+def logged(fault=lambda x: x, trials=1) -> list[Trial]:
+    return [replace(trial, states=fault(trial.states)) for trial in SOUND[:trials]]
+
+
+def times(factor: float, *names: str):
+    return lambda x: x * np.where(np.isin(NAMES, names), factor, 1.0)
+
+
+def in_the_world(x: Array) -> Array:
+    y, (c, s) = np.array(x), (np.cos(x[:, 5]), np.sin(x[:, 5]))
+    y[:, 0], y[:, 1] = c * x[:, 0] - s * x[:, 1], s * x[:, 0] + c * x[:, 1]
+    return y
+
+
+def compass(x: Array) -> Array:
+    y = np.array(x)
+    y[:, 5] = np.pi / 2 - x[:, 5]
+    return y
+
+
+def without_gyro(trial: Trial) -> Trial:
+    left = [i for i, name in enumerate(NAMES) if name != "r"]
+    return replace(trial, states=trial.states[:, left], state_names=PLAIN.state_names)
+
+
+@pytest.mark.parametrize("trials", [1, 3])
+def test_speeds_in_the_axes_of_the_positions_stop_and_are_no_degrees(trials):
+    with pytest.raises(GroundedError, match=holding("u and v", "axes of x and y", "psi")) as no:
+        preflight(BOAT, logged(in_the_world, trials))
+    assert no.value.then is not None
+    assert no.value.then.arguments == tuple(f"t{k:04}" for k in range(trials))
+
+
+def test_one_trial_with_speeds_in_other_axes_is_named_alone():
+    odd = [*SOUND[:2], *logged(in_the_world, 3)[2:]]
+    with pytest.raises(GroundedError, match=holding("axes of x and y")) as stopped:
+        preflight(BOAT, odd)
+    assert stopped.value.then is not None and stopped.value.then.arguments == ("t0002",)
+
+
+@pytest.mark.parametrize("name", ["psi", "r"])
+def test_degrees_stay_degrees(name):
+    for trial in logged(times(180 / np.pi, name), 4):
+        (found,) = preflight(BOAT, [trial]).findings
+        assert (found.signal, found.kind) == (name, "degrees")
+
+
+@pytest.mark.parametrize("fault", [lambda x: x, times(0.0, "psi"), times(-1, "psi"), compass])
+def test_no_other_axes_are_blamed_for_a_heading(fault):
+    """One that is stuck leaves as little as speeds that it is not to turn, and its gyro differs."""
+    for trial in logged(fault, 4):
+        for model, some in ((BOAT, trial), (PLAIN, without_gyro(trial))):
+            told = judge(model, [some], range(model.n)).told
+            assert not any(one.account.kind == "axes" for one in told)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_compass_heading_is_put_right_in_one_finding(seed):
+    sound = SOUND[seed]
+    odd = replace(sound, states=compass(sound.states))
+    found = preflight(BOAT, [odd])
+    (one,) = found.findings
+    assert (one.signal, one.kind, one.scale) == ("psi", "sign", -1.0)
+    assert one.log == "scale = -1, offset = 1.5707963"
+    np.testing.assert_allclose(found.trials[0].states, sound.states, atol=1e-9)
+
+
+def test_a_compass_whose_gyro_counts_clockwise_too_is_two_findings_and_no_exchange():
+    odd = logged(lambda x: times(-1, "r")(compass(x)), 4)
+    found = preflight(BOAT, odd)
+    assert [(f.signal, f.log) for f in found.findings] == [
+        ("psi", "scale = -1, offset = 1.5707963"),
+        ("r", "scale = -1"),
+    ]
+    for trial, sound in zip(found.trials, SOUND, strict=True):
+        np.testing.assert_allclose(trial.states, sound.states, atol=1e-9)
+
+
+def test_an_offset_of_a_mirrored_heading_is_measured():
+    (one,) = preflight(BOAT, logged(lambda x: times(-1, "psi")(x + 0.8 * np.eye(6)[5]))).findings
+    scale, _, offset = one.log.partition(", offset = ")
+    assert scale == "scale = -1" and float(offset) == pytest.approx(-0.8, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "names"),
+    [
+        ("knots", 1.943844, ("u", "v")),
+        ("knots", 1.943844, ("u",)),
+        ("km/h", 3.6, ("u", "v")),
+        ("mph", 2.236936, ("u", "v")),
+        ("ft/s", 3.28084, ("u", "v")),
+        ("feet", 3.28084, ("x", "y")),
+    ],
+)
+def test_speeds_and_positions_in_another_unit_are_named_with_their_scale(unit, factor, names):
+    scales = [f"[log.state.{name}] scale = {1 / factor:.6g}" for name in names]
+    for trial in logged(times(factor, *names), 4):
+        with pytest.raises(GroundedError, match=holding(unit, *scales)) as stopped:
+            preflight(BOAT, [trial])
+        others = [f"[log.state.{name}]" for name in NAMES if name not in names]
+        assert not any(other in str(stopped.value) for other in others)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.08, 1.3, 2.05, 2.4, 3.0, 3.45, 1 / 1.943844])
+def test_a_slip_or_a_scale_of_another_size_is_no_unit(factor):
+    for trial in logged(times(factor, "u", "v"), 4):
+        assert not {f.kind for f in preflight(BOAT, [trial]).findings} - {"mismatch"}
+
+
+def test_only_the_trial_in_another_unit_is_named():
+    """One boat in knots, one 2.5 times too fast, which no unit is."""
+    knots, faster = logged(times(1.943844, "u", "v"), 2), logged(times(2.5, "u", "v"), 2)
+    with pytest.raises(GroundedError, match=holding("t0000", "knots")) as no:
+        preflight(BOAT, [knots[0], faster[1]])
+    assert no.value.then.arguments == ("t0000",)
+
+
+def test_a_gyro_that_is_no_difference_of_the_heading_stays():
+    """Of nine sound logs one had its gyro left out: wide windows agree by chance."""
+    (heading,) = integrals(BOAT)
+    for seed in range(12):
+        for steps in (230, 300):
+            trial = sailed(seed + 10, steps)
+            lag = lag_of(BOAT, heading, [trial])
+            assert lag is not None and lag.mean == 0
+
+
+@pytest.mark.parametrize(
+    "fault, words",
+    [
+        (in_the_world, ("u and v", "axes of x and y")),
+        (times(1.944, "u", "v"), ("u and v", "knots")),
+        (compass, ("psi", "scale = -1", "[log.state.psi]")),
+        (lambda x: x, ()),
+    ],
+)
+def test_it_is_told_when_a_log_is_taken_in(fault, words):
+    """Runs with a twist in the world's axes were taken in without a word, and planned from."""
+    w = SimpleNamespace(base_model=BOAT)
+    told = [one.told(logged(fault)[0], own=False) for one in column_faults(w, logged(fault)[0])]
+    assert len(told) == bool(words) and all(holds(one, *words) for one in told)
