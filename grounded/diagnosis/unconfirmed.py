@@ -106,7 +106,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         float(begin + end),
         (few, data.count),
         regions[0] if regions else None,
-        one.one_group > 0,
+        one.one_group > 1,
         tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few]),
     )
 

@@ -12,6 +12,8 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
+UNSEEN = 1e-4  # share of a value's information that must lie outside of what is held out
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -83,19 +85,19 @@ def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
     return replace(other, shift=shift)
 
 
-def leave_one_out(fit: Fitted, fold: Array) -> tuple[Array, Array]:
+def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> tuple[Array, Array]:
     """Return the changes of all values without each fold (S, C), and its rss with them (S,).
 
-    One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i. A coefficient that only the fold
-    itself shows returns to zero, so that it predicts nothing there: a weak prior does that, UNSEEN
-    of the information of all folds.
+    One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i. What only the fold itself shows
+    returns to the value at which its effect vanishes, so that it predicts nothing there: a weak
+    prior does that, `unseen` of the information of all folds.
     """
-    names = np.unique(fold)
+    names, h = np.unique(fold), fit.hypothesis
     C, total = fit.gram.shape[-1], fit.gram.sum(axis=0)
-    theta, weak = np.zeros(C), np.zeros(C)
-    free = [(v[q.name], not q.grid) for e, v in fit.hypothesis.pairs for q in e.free]
-    for k, (value, coefficient) in enumerate(free):
-        theta[k], weak[k] = value, UNSEEN * total[k, k] * coefficient
+    size, weak = np.zeros(C), np.zeros(C)
+    for k in (k for own in h.sizes for k in own):
+        size[k] = h.theta[k] - [q.start for e in h.effects for q in e.free][k]
+        weak[k] = unseen * total[k, k]
     shifts, rss = np.zeros((len(names), C)), np.zeros(len(names))
     for i, name in enumerate(names):
         own = fold == name
@@ -104,10 +106,8 @@ def leave_one_out(fit: Fitted, fold: Array) -> tuple[Array, Array]:
             A = total - G + np.diag(fit.prior + weak)
             scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
             scaled = A * np.outer(scale, scale)
-            pull = scale * (s - weak * theta)
+            pull = scale * (s - weak * size)
             shifts[i] = scale * np.linalg.lstsq(scaled, pull, rcond=1e-8)[0]
         rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
     return shifts, rss
 
-
-UNSEEN = 1e-4  # share of a coefficient's information that must lie outside of what is held out

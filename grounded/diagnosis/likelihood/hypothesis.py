@@ -42,6 +42,20 @@ class Hypothesis:
         """Free values of all effects in order, (k_effects,)."""
         return np.array([v[q.name] for e, v in self.pairs for q in e.free], float)
 
+    @cached_property
+    def sizes(self) -> list[list[int]]:
+        """The free values that give each effect its size, as indices into `theta`.
+
+        These are its coefficients; of an effect without any, its times or thresholds.
+        """
+        found, at = list[list[int]](), 0
+        for effect in self.effects:
+            every = range(at, at + len(effect.free))
+            coefficients = [k for k, q in zip(every, effect.free, strict=True) if not q.grid]
+            found.append(coefficients or list(every))
+            at += len(effect.free)
+        return found
+
     def with_theta(self, theta: Array) -> Hypothesis:
         """Return the same effects with other free values, clipped to their bounds."""
         values, at = [], 0

@@ -28,7 +28,7 @@ from grounded.diagnosis.validation.gain import LEAST, Errors, Gain
 
 CLAIM = 3.0  # nats by which a cause must make a set likelier; within which two sets tie
 SCATTERS = 1.0  # standard errors by which predictions must gain by each cause
-SHARE = 0.01  # of what a set gains, below which a cause of it does not matter
+SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
 WITHIN = 1.0  # standard errors of the reference within which a smaller set predicts as well
 
 
@@ -68,6 +68,7 @@ class Rule:
         less: returns a set without one cause, fitted if it was not; None if it can't be, or if a
             guard refuses the cause.
         held_out: False if nothing could be held out; then evidence alone decides.
+        outset: errors of the model before anything was adopted; of the set without causes if None.
     """
 
     def __init__(
@@ -77,9 +78,10 @@ class Rule:
         less: Callable[[Option, str], Option | None],
         *,
         held_out: bool = True,
+        outset: Errors | None = None,
     ) -> None:
         self.options, self.gain, self.less, self.held_out = list(options), gain, less, held_out
-        self.crude = next(option for option in options if not option.causes)
+        self.outset = outset or next(o.errors for o in options if not o.causes)
         self._unsupported: dict[frozenset[str], list[str]] = {}
 
     def choose(self) -> Choice:
@@ -102,8 +104,8 @@ class Rule:
         return Choice(chosen, reference, apart.mean, apart.scatter)
 
     def gained(self, option: Option) -> float:
-        """Return the mean log gain over the set without causes."""
-        return self.gain(self.crude.errors, option.errors).mean
+        """Return the mean log gain since the outset."""
+        return self.gain(self.outset, option.errors).mean
 
     def unsupported(self, option: Option) -> list[str]:
         """Return the causes of a set that it does not need, or that a guard refuses."""

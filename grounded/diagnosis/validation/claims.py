@@ -362,19 +362,14 @@ class Claims:
         """Check whether a fit with another effect in place of one is as likely, or equivalent.
 
         Equivalent effects differ only in the integration of a step, but over hundreds of steps that
-        adds up to nats. They tie if held-out predictions don't separate them and their priors
-        (mainly those of the parameters) differ by less than TIE.
+        adds up to nats. They tie if their priors (mainly those of the parameters) do.
         """
         score, best = self.search.score, self.best
         if score(best) - score(fit) < TIE:
             return self._not_refused(fit)
-        if not self.ruler.held_out or not self._one_thing(name, other):
-            return False
         b = self.search.tempering.factor
         known, other_known = (score(f) - b * f.loglik for f in (best, fit))
-        unlike = abs(known - other_known) > TIE
-        gains = (self.ruler.gain(fit, best), self.ruler.gain(best, fit))
-        return not unlike and not any(gain.clear for gain in gains)
+        return abs(known - other_known) < TIE and self._one_thing(name, other)
 
     def _as_likely(self, fit: Fitted) -> bool:
         """Check whether a fit is as likely as the claim, or likelier and predicts as well."""

@@ -26,8 +26,8 @@ from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
-from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.intervals import standard_deviations
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
+from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.choose import CLAIM, Choice, Option, Rule
@@ -101,7 +101,8 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
     """
     ruler.beside(search.exact_null())
     options = Options(search, ruler)
-    rule = Rule(options.hopeful(), ruler.compared, options.less, held_out=ruler.held_out)
+    hopeful, outset = options.hopeful(), ruler.outset
+    rule = Rule(hopeful, ruler.compared, options.less, held_out=ruler.held_out, outset=outset)
     choice = rule.choose()
     while vague := options.vague(choice.chosen):
         rule.refuse(choice.chosen, vague)
@@ -207,15 +208,13 @@ class Options:
         Of effects without coefficients, their times or thresholds are asked. Parameters are exempt,
         since they have priors.
         """
-        at, found, theta = 0, list[str](), fit.hypothesis.theta
-        for effect in fit.hypothesis.effects:
-            every = [at + k for k in range(len(effect.free))]
-            own = [k for k, q in zip(every, effect.free, strict=True) if not q.grid] or every
-            at += len(every)
-            none = (np.abs(theta[own]) < NO_SIZE * std[own]).all()
-            if own and none and not isinstance(effect.family, ParamFamily):
-                found.append(effect.name)
-        return found
+        h = fit.hypothesis
+        return [
+            effect.name
+            for effect, own in zip(h.effects, h.sizes, strict=True)
+            if own and not isinstance(effect.family, ParamFamily)
+            if (np.abs(h.theta[own]) < NO_SIZE * std[own]).all()
+        ]
 
     def less(self, option: Option, cause: str) -> Option | None:
         """Return a set without one cause, fitted from the values and the noise of the larger one.
@@ -230,7 +229,7 @@ class Options:
             return None
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
-        loose = cause != CALIBRATION and one_group(search, fit, less, cause)
+        loose = cause != CALIBRATION and one_group(search, fit, cause)
         return None if cut or loose else self.option(own)
 
 
@@ -242,25 +241,26 @@ def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
     return [name for (name, param), value in params if param.stopped(float(value))]
 
 
-def one_group(search: HypothesisSearch, fit: Fitted, less: Fitted, name: str) -> int:
+def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> int:
     """Return the number of trials of the only group that shows an effect; 0 if several do.
 
-    So the evidence of the group that has most of it is not counted. Where all trials are of one
-    group, no effect can be asked for a second one but those that name no mechanism: along one
-    motion, any error of the model is the same function of time and of every state, and each repeat
-    raises the evidence of an effect that fits it. (Of a single log, its pieces are the groups.)
+    By the trials outside that group, it has no size. Where all trials are of one group, no effect
+    can be asked for a second one but those that name no mechanism: along one motion, any error of
+    the model is the same function of time and of every state, and each repeat raises the evidence
+    of an effect that fits it. (Of a single log, its pieces are the groups.)
     """
-    data, h = search.data, fit.hypothesis
-    family = h.effects[h.names.index(name)].family
+    data, h, worth = search.data, fit.hypothesis, search.tempering.factor
+    i = h.names.index(name)
+    family, own = h.effects[i].family, h.sizes[i]
     several = len(data.groups) > 1 and not isinstance(family, ParamFamily)
     if not (family.loose or several):
         return 0
-    lost = 0.5 * (less.rss + less.logdet - fit.rss - fit.logdet)
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
-    nats = search.tempering.factor * np.bincount(group, lost)
-    most = int(nats.argmax())
-    alone = nats.sum() - nats.max() < CLAIM
-    return len(np.unique(data.trial_of[group == most])) if alone else 0
+    for g, shift in zip(np.unique(group), leave_one_out(fit, group)[0], strict=True):
+        others = worth * fit.gram[group != g].sum(axis=0) + np.diag(fit.prior)
+        if (np.abs(h.theta[own] + shift[own]) < NO_SIZE * fisher(others)[own]).all():
+            return len(np.unique(data.trial_of[group == g]))
+    return 0
 
 
 def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, ...]:
@@ -272,7 +272,7 @@ def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, .
             (name,) = option.causes - own
             fit = options.fits[option.causes]
             if name in equations(fit) and rule.unsupported(option):
-                alone = one_group(search, fit, options.fits[own], name)
+                alone = one_group(search, fit, name)
                 found.append(Doubtful(name, nats, fit, alone))
     return tuple(sorted(found, key=lambda one: -one.nats))
 
