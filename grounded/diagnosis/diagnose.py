@@ -234,17 +234,22 @@ def diagnose(
             decision, left_out = decide(search, ruler), set[str]()
             while decision.gap or options.max_effects:
                 leader, before = decision.leader, decision.fit
+                again = decision.gap and leader and not left_out and len(candidates) > PAIR
+                size = len(before.hypothesis.names)
+                other = decision.gap and 0 < size < most and before is not search.of_size(size)[0]
+                more = most < limit and (options.max_effects or size >= most)
+                if not (again or other or more):
+                    break
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
-                again = decision.gap and leader and leader not in left_out and not left_out
                 if again:
                     left_out.add(leader)
-                    regrown(search, leader, max(len(before.hypothesis.names), PAIR))
-                elif most < limit and (options.max_effects or len(before.hypothesis.names) >= most):
+                    regrown(search, leader, max(size, PAIR))
+                elif other:
+                    grown(search, before, size + 1)
+                else:
                     most += 1
                     grown(search, search.chosen(most), most)
-                else:
-                    break
                 decision = decide(search, ruler)
                 if not again and not ruler.gain(before, decision.fit).clear:
                     break

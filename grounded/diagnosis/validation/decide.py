@@ -135,16 +135,20 @@ class Options:
         self._sizeless: dict[frozenset[str], list[str]] = {}
 
     def hopeful(self) -> list[Option]:
-        """Return the likeliest sets of each size, with and without free parameters."""
-        count = dict[tuple[int, bool], int]()
+        """Return the likeliest sets of each size, with and without free parameters.
+
+        Those under white noise are ranked for themselves: coloured noise may be likelier by far,
+        and hide what predictions need.
+        """
+        count = dict[tuple[int, bool, bool], int]()
         for fit in sorted(self.search.fits.values(), key=self.search.score, reverse=True):
             own, h = frozenset(causes(fit)), fit.hypothesis
-            if not np.isfinite(self.search.score(fit)) or own in self.fits:
+            kind = len(h.names), h.spread > 0, fit.noise.structure == Structure()
+            if not np.isfinite(self.search.score(fit)) or not own:
                 continue
-            kind = len(h.names), h.spread > 0
             count[kind] = count.get(kind, 0) + 1
-            if count[kind] <= MEASURED:
-                self.fits[own] = fit
+            if own not in self.fits and count[kind] <= MEASURED:
+                self.fits[own] = self._best(own)
         # the likeliest without what the log refutes, and with exact parameters
         for own in [own for own in self.fits if own]:
             rest: frozenset[str] | None = own
@@ -160,27 +164,41 @@ class Options:
     def _fitted_without(self, causes_: frozenset[str], cause: str) -> frozenset[str] | None:
         """Fit a set without one cause, if it was not; return its causes, None if that fails."""
         own, fit, search = causes_ - {cause}, self.fits[causes_], self.search
-        if own not in self.fits:
+        structure = fit.noise.structure
+        known = any(f.noise.structure == structure for f in self._of(own))
+        if not known and (own not in self.fits or structure == Structure()):
             h = fit.hypothesis
             free = replace(h, shift=None, spread=0.0) if cause == CALIBRATION else h.minus(cause)
-            same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not any(f.noise.structure == fit.noise.structure for f in same):
-                search.refined([(free, fit.noise, fit.track)], REFIT)
-                same = [f for f in search.fits.values() if frozenset(causes(f)) == own]
-            if not same:
-                return None
-            self.fits[own] = max(same, key=search.score)
-        return own
+            search.refined([(free, fit.noise, fit.track)], REFIT)
+            self._known.pop(own, None)
+            self.fits.pop(own, None)
+        if own not in self.fits and self._of(own):
+            self.fits[own] = self._best(own)
+        return own if own in self.fits else None
+
+    def _of(self, own: frozenset[str]) -> list[Fitted]:
+        """Return the fits of a set of causes, likeliest first."""
+        fits = [f for f in self.search.fits.values() if frozenset(causes(f)) == own]
+        return sorted(fits, key=self.search.score, reverse=True)
+
+    def _best(self, own: frozenset[str]) -> Fitted:
+        """Return the likeliest fit of a set, or that under white noise if it predicts better."""
+        likeliest, *others = self._of(own)
+        white = [fit for fit in others if fit.noise.structure == Structure()]
+        if likeliest.noise.structure == Structure() or not white or not self.ruler.held_out:
+            return likeliest
+        return white[0] if self.ruler.gain(likeliest, white[0]).clear else likeliest
 
     def option(self, own: frozenset[str]) -> Option:
         """Return a set of causes as an option."""
         if own not in self._known:
-            fit, search = self.fits[own], self.search
+            fit, likeliest = self.fits[own], self._of(own)[0]
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            self._known[own] = Option(own, search.score(fit), self.ruler.errors(fit), order)
+            evidence = self.search.score(likeliest)
+            self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
         return self._known[own]
 
     def alone(self, fit: Fitted) -> tuple[Array, Array]:
