@@ -57,9 +57,14 @@ VERDICTS = {
     "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
 )
 @click.option("--data", is_flag=True, help="The log ran no candidate: for fit and diagnose only.")
+@click.option(
+    "--group", default="", metavar="NAME", help="The condition of the run that no signal shows: wet."
+)
 @in_workspace
 @as_json
-def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bool) -> None:
+def command(
+    files: tuple[str, ...], candidate: str | None, data: bool, group: str, json_: bool
+) -> None:
     """Check, resample and store logs of any format that `inspect` reads.
 
     Ingesting a file again succeeds and names the trial it is stored as. Trials written by grounded
@@ -70,7 +75,7 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
     done = []
     for name in files:
         with progress(f"reading {name}"):
-            done.append(workspace.ingest(name, candidate=candidate, data=data))
+            done.append(workspace.ingest(name, candidate=candidate, data=data, group=group))
         if not json_:
             _tell(name, done[-1], _best(workspace, done[-1]), workspace.base_model)
     if json_:

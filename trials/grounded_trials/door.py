@@ -130,7 +130,12 @@ class Workspace(Folder):
         return run_candidate(self.forget(), candidate, anyway=anyway, warn=warn)
 
     def ingest(
-        self, path: str | Path, *, candidate: str | None = None, data: bool = False
+        self,
+        path: str | Path,
+        *,
+        candidate: str | None = None,
+        data: bool = False,
+        group: str = "",
     ) -> Ingested:
         """Check, resample and store a trial; a trial that is already stored is not added again.
 
@@ -138,10 +143,13 @@ class Workspace(Folder):
             path: a trial file of grounded's, a log of another format, or the folder of a bag.
             candidate: the candidate that was run, or `best`; None: the log's, else the outstanding.
             data: the log ran no candidate and serves fitting and diagnosis only.
+            group: the condition that it was run in ("wet"); a diagnosis fits its values without a
+                group and predicts that.
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
 
-        return ingest_log(self.forget(), path_of(path), candidate, data=data, ahead=True)
+        here = self.forget()
+        return ingest_log(here, path_of(path), candidate, data=data, group=group, ahead=True)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True

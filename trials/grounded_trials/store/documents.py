@@ -135,10 +135,10 @@ class Notes:
         self.store.add(text.encode(), ".json", again=again)
 
     @contextmanager
-    def adding(self, note: Mapping[str, str]) -> Iterator[None]:
-        """Add a note unless an equal one exists; removed if the `with` body raises."""
+    def adding(self, note: Mapping[str, str], *, again: bool = False) -> Iterator[None]:
+        """Add a note as `add` does; removed if the `with` body raises."""
         text = json.dumps(dict(note), sort_keys=True)
-        with self.store.adding(text.encode(), ".json"):
+        with self.store.adding(text.encode(), ".json", again=again):
             yield
 
     def read(

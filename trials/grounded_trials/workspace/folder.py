@@ -33,6 +33,7 @@ from grounded_trials.workspace.identity import (
     StoredTrial,
     candidate_of,
     encoded,
+    grouped,
     named_apart,
     noted,
     sha256,
@@ -325,7 +326,7 @@ class Folder:
         self.save_index()
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *known.gone(self.store))]
-        trials = named_apart(found, known, self.candidate_path)
+        trials = named_apart([*grouped(found, known)], known, self.candidate_path)
         if not broken:
             vars(self)["_trials"] = trials
         return trials

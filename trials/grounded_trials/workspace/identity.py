@@ -126,6 +126,7 @@ class Noted:
     since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
     told: dict[str, str] = field(default_factory=dict)  # what was told once -> of which trial
     asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> why
+    groups: dict[str, str] = field(default_factory=dict)  # trial -> the condition it was run in
 
     @property
     def last(self) -> set[str]:
@@ -168,6 +169,8 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.ran[note["trial"]] = note["sha256"]
         elif kind == "asked":
             found.asked[note["trial"]] = note["said"]
+        elif kind == "group":
+            found.groups[note["trial"]] = note["group"]
         elif kind == "told":
             found.told.setdefault(note["what"], note["trial"])
     return found
@@ -203,6 +206,15 @@ _DECODED = _Recent[tuple[Candidate, dict[str, str]]]()
 def sha256(data: bytes) -> str:
     """Return the hash that identifies a candidate's file."""
     return _HASHES.get(data) or _HASHES.add(data, hashlib.sha256(data).hexdigest())
+
+
+def grouped(trials: Iterable[StoredTrial], known: Noted) -> Iterator[StoredTrial]:
+    """Yield the trials, each with the condition that the user named for it, if any."""
+    for one in trials:
+        if group := known.groups.get(one.stored.digest, ""):
+            trial, measured = (replace(each, group=group) for each in (one.trial, one.measured))
+            one = replace(one, trial=trial, measured=measured)
+        yield one
 
 
 def named_apart(

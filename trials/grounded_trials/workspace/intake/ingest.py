@@ -113,6 +113,7 @@ def ingest_log(
     candidate: str | None = None,
     *,
     data: bool = False,
+    group: str = "",
     ahead: bool = False,
 ) -> Ingested:
     """Check a log and store it as a trial, see `Workspace.ingest`; store nothing on an error.
@@ -146,6 +147,9 @@ def ingest_log(
             ran = sha256(workspace.candidate_bytes(read.trial.candidate))
             note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": ran}
             new.enter_context(workspace.notes.adding(note))
+        if group:
+            note = {"note": "group", "trial": added.sha256[:DIGITS], "group": group}
+            new.enter_context(workspace.notes.adding(note, again=True))
         workspace.forget_trials()
         return _judged(workspace, read, added, before, ahead=ahead)
 
