@@ -59,7 +59,6 @@ def test_the_list_of_commands_is_in_the_order_of_use():
 
 
 def test_help_needs_no_numpy():
-    """`grounded --help` is quick: it imports no command and no array library."""
     code = (
         "import sys, atexit\nsys.argv = ['grounded', '--help']\n"
         "from grounded_cli.main import main\n"
@@ -251,27 +250,6 @@ def test_export_holds_the_policy_with_units_and_time_base(w, tmp_path, form):
         assert len(rows) == 40 and rows[1]["t"] == "0.05" and "gain.force.force[t-1]" in rows[0]
 
 
-def test_the_three_exports_say_the_same(w, tmp_path):
-    step(w)
-    for form in ("json", "npz", "csv"):
-        grounded("-C", w, "export", "c0001", "--format", form, "-o", tmp_path / f"c.{form}")
-    a = load(tmp_path / "c.npz").policy
-    b = json.loads((tmp_path / "c.json").read_text())
-    rows = list(
-        csv.DictReader(
-            line for line in (tmp_path / "c.csv").read_text().splitlines() if line[0] != "#"
-        )
-    )
-    np.testing.assert_array_equal(a.feedforward, b["feedforward"])
-    np.testing.assert_array_equal(a.gain, b["gain"])
-    np.testing.assert_array_equal(
-        a.feedforward[:, 0], [float(r["feedforward.force"]) for r in rows]
-    )
-    np.testing.assert_array_equal(
-        a.reference[:, 2], [float(r["reference.force[t-1]"]) for r in rows]
-    )
-
-
 def test_export_without_a_best_or_into_nowhere(w, tmp_path):
     none = grounded("-C", w, "export", "best")
     assert none.code == 1 and holds(none.err, "best") and not list(w.glob("*.json"))
@@ -321,20 +299,6 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     assert set(only["params"]) == {"drag"}
     wrong = grounded("-C", w, "fit", "--params", "drg")
     assert wrong.code == 1 and holds(wrong.err, "drg", "'drag'")
-
-
-def test_fit_without_trials_says_so(w):
-    done = grounded("-C", w, "fit")
-    assert done.code == 1 and holds(done.err, "ingest", "--data")
-
-
-@pytest.mark.slow
-def test_narration_is_not_data(w):
-    """stdout of every --json command is one document and nothing else."""
-    for args in (["propose"], ["run"], ["status"], ["verify"], ["learn", "--trials", "1"]):
-        done = process("-C", w, *args, "--json")
-        assert done.code == 0 and isinstance(done.json, dict), done.err
-        assert "\r" not in done.out + done.err  # no progress bar in a pipe
 
 
 def test_a_closed_pipe_is_no_traceback(w):

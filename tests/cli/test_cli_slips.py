@@ -8,13 +8,9 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.errors import NextCommand
-from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.workspace.last_diagnosis import usable_ids
 from reported import DIAGNOSIS, cart, copied
-from workspaces import make
 
 __all__ = ["cart"]
 
@@ -52,7 +48,6 @@ def test_a_line_of_a_billion_seconds_is_refused_without_a_warning_of_numpy(w):
 
 
 def test_a_stored_trial_its_file_and_its_table_are_targets(w):
-    """`t0001` was no shape, its file needed [log], and its table had a NaN in an input."""
     table, (own,) = w / "t0001.csv", (w / "trials").glob("t0001-*.mcap")
     assert grounded("-C", w, "export", "t0001", "--format", "csv", "-o", table).code == 0
     ran = read_trial(own)[0].states
@@ -67,24 +62,6 @@ def test_a_stored_trial_its_file_and_its_table_are_targets(w):
     assert done.code == 1 and holds(done.err, "set aside", "restore")
 
 
-def test_a_folder_of_runs_names_the_file_of_the_last_one(tmp_path):
-    """It was `not a trial written by grounded`, and `next:` led to `inspect`."""
-    w = Workspace(make(tmp_path / "w").folder)
-    w.propose()
-    file = w.run().trial_file
-    done = grounded("-C", w.folder, "ingest", file.parent)
-    assert done.code == 1 and holds(done.err, "grounded wrote", "ingest", file.name)
-    assert grounded("-C", w.folder, "ingest", file).code == 0
-
-
-def test_too_few_of_many_trials_are_answered_with_a_diagnosis_of_all(w):
-    """`run a second one` was the advice beside stored trials that were not named."""
-    found = Workspace(w).diagnose(["t0001"])
-    more = len(usable_ids(Workspace(w))) - 1
-    assert found.no_cause and found.then == NextCommand("diagnose")
-    assert more > 0 and found.next_trial.startswith(f"{more} stored trial")
-
-
 @pytest.mark.parametrize("changed", [True, False])
 def test_nothing_is_adopted_from_two_robots_compared(w, changed):
     value = {"value": 0.1, "std": 0.01}
@@ -97,19 +74,3 @@ def test_nothing_is_adopted_from_two_robots_compared(w, changed):
     assert done.code == changed and ((w / "grounded.toml").read_text() == before) == changed
     if changed:
         assert holds(" ".join(done.err.replace("\\", " ").split()), "diagnose --trials t0002")
-
-
-def test_a_path_that_never_reaches_its_speed_says_so(tmp_path):
-    w = make(tmp_path / "w", "car-circle").folder
-    slow = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "1")
-    fast = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "9", "--json")
-    assert slow.code == fast.code == 0 and "--lateral" not in slow.err
-    assert fast.json["columns"]["v"][1] == pytest.approx(2.0, rel=0.01)  # sqrt(4 m/s^2 * 1 m)
-    said = grounded("-C", w, "target", "circle", "--size", "1", "--speed", "9")
-    assert holds(said.err, "2 m/s", "--speed 9", "--lateral 4", "--accel 1")
-
-
-def test_the_nearest_option_alone_is_suggested():
-    """`--hmtl` was said to mean `--help` or `--html`."""
-    done = grounded("report", "--hmtl")
-    assert done.code == 2 and "'--html'" in done.err and "--help'?" not in done.err

@@ -34,7 +34,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_control_characters_of_a_file_do_not_reach_the_terminal(tmp_path: Path) -> None:
-    """Fails on 0.1: errors were printed as they were, and any colour passed (FACTS 9)."""
     path = tmp_path / "log.mcap"
     data = log("json", None, [b"{}"]).replace(b"/t", b"\x1b[")
     path.write_bytes(data.replace(b"json", b"\x1b[8m"))
@@ -62,7 +61,6 @@ def test_our_own_marks_colour_only_a_terminal() -> None:
 @pytest.mark.parametrize("what", ["pipe", "device", "folder"])
 @pytest.mark.parametrize("name", ["grounded.toml", "target.csv", "model.py", "log.mcap"])
 def test_what_is_no_file_is_refused_at_once(what: str, name: str, folder: Path) -> None:
-    """Fails on 0.1: a pipe in the place of a file was waited for for ever."""
     path = folder / name
     path.unlink(missing_ok=True)
     if what == "pipe":
@@ -92,7 +90,6 @@ def test_a_link_is_no_stored_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", [".", "model.py", "grounded.toml", "__pycache__"])
 @pytest.mark.parametrize("mode", [0o777, 0o775])
 def test_code_that_others_may_change_is_not_executed(place: str, mode: int, folder: Path) -> None:
-    """Fails on 0.1: it was (FACTS 9)."""
     (folder / "__pycache__").mkdir(exist_ok=True)
     marker = folder / "executed"
     source = (folder / "model.py").read_text()
@@ -119,7 +116,6 @@ def test_a_stranger_s_file_is_not_executed(folder: Path, monkeypatch: pytest.Mon
 def test_a_kernel_cache_that_others_may_write_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Fails on 0.1: machine code from it was executed (FACTS 9)."""
     monkeypatch.setenv("GROUNDED_CACHE", str(tmp_path / "cache"))
     jit._own.cache_clear()
     jit.store("0" * 64, b"code")
@@ -155,7 +151,6 @@ SHELL = " ".join(f"'{word}'" for word in COMMAND)
     ],
 )
 def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
-    """Fails on 0.1: tracebacks, or Python's own complaint at its end."""
     words = how.format(status=f"-C {folder} status")
     line = f"set -o pipefail; {SHELL} {words}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
@@ -164,8 +159,6 @@ def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
 
 
 def test_an_interrupt_while_a_class_is_made_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python 3.11 raises `RuntimeError: Error calling __set_name__` from it, in an import."""
-
     def made(**_: object) -> None:
         raise RuntimeError("Error calling __set_name__ on 'Field'") from KeyboardInterrupt()
 
@@ -176,7 +169,6 @@ def test_an_interrupt_while_a_class_is_made_is_one(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
-    """Fails on 0.1: an interrupt during imports was a traceback."""
     start = "from grounded_cli.start import main; main()"
     for k in range(10):
         child = subprocess.Popen(
@@ -200,7 +192,6 @@ def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
     [["run", "c0001"], ["learn"], ["report", "--html"], ["init", "new"], ["fit"]],
 )
 def test_a_read_only_folder_is_one_sentence(words: list[str], folder: Path) -> None:
-    """Fails on 0.1 with a traceback, for some of them."""
     limited = ["setpriv", "--bounding-set", "-dac_override"] if os.getuid() == 0 else []
     if limited and not shutil.which("setpriv"):
         pytest.skip("root may write anywhere")
@@ -218,7 +209,6 @@ def test_a_read_only_folder_is_one_sentence(words: list[str], folder: Path) -> N
 
 
 def test_init_that_was_cut_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails on 0.1: "model.py exists already"; and nothing of the user's is overwritten."""
     words = ("init", tmp_path / "w", "--example", "pendulum")
     for count in range(4):
         done = 0

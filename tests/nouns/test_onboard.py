@@ -109,7 +109,6 @@ def test_time_runs_forward_or_stays():
 
 
 def test_a_run_that_is_over_stays_over_where_the_time_begins_anew():
-    """A quadrotor's second flight with the same runner must not get the last step's command."""
     runner, state = Runner(policy()), [0.0, 0.0]
     dt = policy().dt
     for k in range(H):

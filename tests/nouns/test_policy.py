@@ -143,8 +143,6 @@ def test_the_controller_of_the_nearest_step_is_used():
 
 
 def test_called_at_the_rate_of_the_camera_it_sends_one_controller_a_step():
-    """Footnote 18: states come at 30 Hz, controllers are for 20 Hz; the last command of a step
-    counts as the one that was sent."""
     p = policy()
     run = Runner(p)
     for _ in range(3):
@@ -210,7 +208,6 @@ def test_after_the_horizon_the_held_input_is_sent():
 
 @pytest.mark.parametrize("t", [0.949, 0.951, 0.989, 0.991, 1.05, 0.05, 0.15])
 def test_done_agrees_with_action(t):
-    """A loop `while not done(t)` never requests a step beyond the policy's last."""
     p = policy(feedback=False)
     run = Runner(p)
     over = np.array_equal(run.action(t, np.zeros(2)), p.past)
@@ -218,7 +215,6 @@ def test_done_agrees_with_action(t):
 
 
 def test_an_action_can_be_kept_and_changed_by_the_caller():
-    """A driver may modify the returned array without changing the policy or the past inputs."""
     p = policy()
     a, b = Runner(p), Runner(p)
     s = np.zeros(2)
@@ -352,7 +348,6 @@ def test_cut_and_flipped_files_are_refused_or_whole(tmp_path):
 
 
 def test_the_robot_needs_numpy_alone(tmp_path):
-    """Importing the runner does not load the compiler, scipy or the log library."""
     path = saved(tmp_path, policy())
     code = (
         "import sys; from grounded.policy import load; import numpy as np\n"

@@ -116,7 +116,6 @@ def test_an_open_loop_task_has_policies_without_gains():
 
 
 def test_a_model_of_a_thousand_states_is_refused_at_once():
-    """A model this large would take `propose` 70 s and 2.8 GB."""
     names = [f"x{i}" for i in range(1000)]
     states = dict.fromkeys(names, "m")
     began = time.process_time()
@@ -126,7 +125,6 @@ def test_a_model_of_a_thousand_states_is_refused_at_once():
 
 
 def test_nouns_with_arrays_are_shown_in_one_short_line():
-    """`print(task)` shows one line, not the arrays."""
     found = cart_task()
     policy = found.policy(np.zeros((found.horizon, found.model.m)), None, None)
     run = simulate(found.problem(), policy)

@@ -73,7 +73,6 @@ def test_the_input_held_before_the_start_is_the_trials():
 
 
 def test_the_model_judges_as_reality_does():
-    """The cost of a simulated run and the utility of the same run as a trial are one number."""
     task = rover_task()
     u = np.clip(np.random.default_rng(2).normal(size=(60, 2)), task.low, task.high)
     run = simulate(task.problem(exact=True), task.policy(u, None, None))

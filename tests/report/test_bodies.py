@@ -103,7 +103,6 @@ def test_what_has_no_length_has_no_unit():
     ],
 )
 def test_a_link_is_as_long_as_the_model_says(params, lengths):
-    """A rope of L = 0.6 m was drawn 1 m long, and distances of its tip were given in m."""
     model = replace(pendulum.model, params=params)
     body = _body(model)
     assert body.unit == ("m" if lengths else "")
@@ -155,8 +154,6 @@ def test_a_mujoco_model_looks_as_its_file_says():
 
 
 def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
-    """A crane's trolley was drawn 0.43 m wide beside 1.5 m of travel."""
-
     def half(size):
         return body_of(cart_pole.model, scene_of(cart_pole.model), size).parts[-1].size[0]
 
@@ -167,7 +164,6 @@ def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
 
 
 def test_a_robot_on_wheels_is_watched_at_its_position_not_at_a_tip():
-    """A balancing robot's page showed the "Error of the tip", l above its axle."""
     roles = {"rail": "x", "upright": ("theta",), "speed": "x_vel"}
     body = _body(replace(cart_pole.model, roles=roles))
     states = np.array([[0.3, 0.4, 0.0, 0.0], [0.5, -0.2, 0.0, 0.0]])
@@ -178,7 +174,6 @@ def test_a_robot_on_wheels_is_watched_at_its_position_not_at_a_tip():
 
 
 def test_a_rope_is_thin_and_its_load_is_at_its_end():
-    """The rope of a crane of 0.55 m was a rod, 6.6 cm thick."""
     params = {"L": Param(0.55, "m")}
     crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)}, params=params)
     body, states = _body(crane), np.array([[0.3, 0.4, 0.0, 0.0]])

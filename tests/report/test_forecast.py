@@ -37,7 +37,6 @@ def test_a_late_log_is_not_taken_for_what_the_model_lacks():
 
 
 def test_a_forecast_starts_where_a_late_and_filtered_log_says_that_the_robot_was():
-    """With its lags adopted a ball seemed to be missed three times as far as without."""
     task = cart_task()
     effects = [
         {"name": "sensor_delay:x", "d": DELAY * task.dt},

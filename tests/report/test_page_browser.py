@@ -91,15 +91,6 @@ def test_time_panels_zoom_together(opened):
     assert _range(opened, "states-3") == pytest.approx(home)
 
 
-def test_keys_zoom_where_the_focus_is(opened):
-    home = _range(opened, "states-1")
-    opened.key("states-1", "+")
-    low, high = _range(opened, "states-1")
-    assert high - low == pytest.approx((home[1] - home[0]) / 2)
-    opened.key("states-1", "ArrowRight")
-    assert _range(opened, "states-1")[0] > low
-
-
 def test_a_trial_is_switched_off_and_on(opened):
     visible = (
         "return document.getElementById('paths-0')._fullData.filter(t => t.visible === true)"
@@ -297,22 +288,6 @@ def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     assert window.errors() == []
 
 
-def test_on_paper_a_short_table_is_whole_and_a_long_one_leaves_no_row_alone(window, car_page):
-    """A table of errors began at the foot of a page with one row."""
-    window.resize(1400, 900)
-    window.open(car_page)
-    window.devtools("Emulation.setEmulatedMedia", {"media": "print"})
-    said = window.run(
-        "const style = (s, of) => getComputedStyle(document.querySelector(s))[of];"
-        "return [style('#errors', 'breakInside'), style('#errors thead', 'breakAfter'),"
-        "style('#errors tbody tr', 'breakAfter'),"
-        "style('#errors tbody tr:last-child', 'breakBefore'),"
-        "style('.figure .key', 'breakInside'), style('.wide', 'overflowX')]"
-    )
-    window.devtools("Emulation.setEmulatedMedia", {"media": ""})
-    assert said == ["avoid"] * 5 + ["visible"]
-
-
 def test_print_shows_every_panel_in_light_colours(window, car_page):
     window.dark(True)
     window.resize(1400, 900)
@@ -335,7 +310,6 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_text_of_every_bar_is_in_its_panel(cart, tmp_path, window, width):
-    """`40 % of the time` behind a long bar was cut off at the panel's edge."""
     path = tmp_path / "page.html"
     path.write_text(page(gather(Folder(cart))))
     window.resize(1400, 900)
@@ -406,14 +380,3 @@ def test_the_first_figure_is_drawn_before_the_others_which_follow_unscrolled(tmp
         if counts[-1] == window.run(f"{shown}.length"):
             break
     assert counts[0] < counts[-1] == window.run(f"{shown}.length")
-
-
-def test_fifty_long_trials_open_at_once(tmp_path, window):
-    path = tmp_path / "page.html"
-    path.write_text(page(many_flights(50)))
-    assert path.stat().st_size < 4e6
-    window.resize(390, 900)
-    window.open(path)
-    window.draw_all()
-    assert window.run("return document.documentElement.scrollWidth") <= 390
-    assert window.errors() == []

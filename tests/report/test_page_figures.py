@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -23,20 +22,16 @@ from grounded.figures.figure import (
     DASHES,
     STEPS,
     Band,
-    Bar,
-    Bars,
     Curve,
     Dot,
     Figure,
     Panel,
-    fitted,
     log_ticks,
     loss_ticks,
     rgb,
     thinned,
-    without_astray,
 )
-from grounded.figures.interactive import LONG, PAPER, coloured, in_lines, packed, plotted
+from grounded.figures.interactive import PAPER, coloured, packed, plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -44,9 +39,9 @@ from grounded.search.first_policy import first_policy
 from grounded.search.pictures import search_figure
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
-from grounded_trials.report.figures.paths import _level, path_figure
-from grounded_trials.report.figures.png import _bars, png
+from grounded_trials.report.figures.gap import residual_figures
+from grounded_trials.report.figures.paths import path_figure
+from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
@@ -54,7 +49,7 @@ from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from page_browser import unpacked
-from reported import DIAGNOSIS, car, cart, many_flights
+from reported import car, cart, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -103,13 +98,6 @@ def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
     assert np.isfinite(known["y"]).all() and np.isfinite(known["error_y"]["array"]).all()
     low, high = panel.ranges()[1]
     assert failed["text"] == ["failed"] and low <= failed["y"][0] <= low + 0.1 * (high - low)
-
-
-def test_a_run_that_went_astray_does_not_flatten_the_others():
-    calm = np.sin(np.linspace(0, 6, 50))
-    wild = np.linspace(0, 1e6, 50)
-    low, high = fitted(without_astray([calm], [wild]))
-    assert low > -6 and high < 6
 
 
 @given(
@@ -194,30 +182,6 @@ def test_a_position_along_one_axis_is_drawn_over_its_speed(roles, axes):
     assert "3D!grounded" not in foxglove_layout(model)["configById"]
 
 
-@pytest.mark.extra("png")
-def test_the_text_of_a_negative_bar_stays_clear_of_the_labels():
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Sheet
-
-    sheet = Sheet(figsize=(4.8, 2.0), dpi=100)
-    canvas, axes = FigureCanvasAgg(sheet), sheet.add_subplot()
-    _bars(
-        axes, Bars("evidence", tuple(Bar(f"{v:g}", v, f"{v:.3g}") for v in (444.9, -3.21))), most=2
-    )
-    canvas.draw()
-    edge = axes.get_window_extent().x0
-    assert all(text.get_window_extent().x0 > edge for text in axes.texts)
-
-
-@pytest.mark.slow
-def test_an_enlarged_path_that_leaves_the_frame_is_said(car):
-    figure = path_figure(gather(Folder(car)))
-    large = next(p for p in figure.panels if p.title.startswith("Deviations"))
-    cut = any(np.isnan(curve.x).any() for curve in large.curves)
-    assert cut == ("where they fit" in large.title)
-    assert cut or large.note  # or left out as a whole
-
-
 def test_rotations_are_right_handed_and_point_along_the_heading():
     task = many_flights(1).task
     scene = scene_of(task.model)
@@ -261,56 +225,12 @@ def test_a_forecast_of_a_wrong_model_parts_from_the_trial():
     assert 1e-6 < short < long
 
 
-def test_the_error_of_forecasts_is_taken_from_more_of_them_than_are_drawn():
-    """In a trial of 1.5 s one was drawn, whose end lay on the log by chance: an error of 0."""
-    task = pendulum_task(pendulum.model)
-    t = 0.02 * np.arange(76)
-    states = np.column_stack([np.where(np.abs(t - 1.0) < 1e-9, 0.0, 1.0), 0 * t])
-    names = (task.model.state_names, task.model.input_names)
-    trial = Trial(states, np.zeros((75, 1)), 0.02, *names)
-    few = forecast(Planner(task, task), trial)
-    many = forecast(Planner(task, task), trial, every=1)
-    assert [int((f.steps[:, -1] >= 0).sum()) for f in (few, many)] == [1, 26]
-    ends = task.model.difference(many.states[:26, -1], states[50:])
-    expected = np.sqrt(np.mean(ends**2, axis=0))
-    np.testing.assert_allclose(forecast_error(Planner(task, task), trial), expected)
-
-
-def test_forecasts_go_no_farther_than_the_diagnosis_could_judge():
-    """Of a robot that falls without its feedback no model tells where it is after a second."""
-    findings = many_flights(2)
-    titles = [figure.title for figure in forecast_figures(findings)]
-    assert findings.ahead_s == 1.0 and all("every 1 s" in title for title in titles)
-    rows = (RulerRow(0.1), RulerRow(0.5), RulerRow(1.0, drowned=True))
-    fallen = replace(findings, diagnosis=Diagnosis(Verdict("none"), prediction_error=rows))
-    titles = [figure.title for figure in forecast_figures(fallen)]
-    assert fallen.ahead_s == 0.5 and all("every 0.5 s" in title for title in titles)
-    assert titles
-
-
 def test_a_forecast_of_a_trial_without_steps_is_none():
     task = pendulum_task(pendulum.model)
     names = (task.model.state_names, task.model.input_names)
     trial = Trial(np.full((3, 2), np.nan), np.zeros((2, 1)), task.dt, *names)
     assert forecast(Planner(task, task), trial) is None
     assert np.isnan(forecast_error(Planner(task, task), trial)).all()
-
-
-def test_what_is_cut_off_is_marked(cart):
-    findings = gather(Folder(cart))
-    first = findings.first
-    assert first is not None
-    whole = error_figure(findings)
-    assert whole is not None and not any("cut off" in panel.note for panel in whole.panels)
-    states = first.trial.states.copy()
-    states[20, 0] = findings.task.target[20, 0] - 490.0
-    wild = replace(first, trial=replace(first.trial, states=states))
-    runs = tuple(wild if run is first else run for run in findings.runs)
-    cut = error_figure(replace(findings, runs=runs))
-    assert cut is not None
-    panel = cut.panels[0]
-    assert panel.note == "model’s policy is cut off: it reaches −490"
-    assert panel.y_range[0] > -490
 
 
 @pytest.mark.extra("notebook")
@@ -329,18 +249,6 @@ def test_results_plot_what_the_page_shows(cart):
         assert len(drawn.data) >= len(titles)
     traces = findings.best.candidate.plot().data
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
-
-
-def test_steps_show_their_damping_where_none_was_shortened(cart):
-    now = gather(Folder(cart)).standing
-    damped = [replace(t, candidate=replace(t.candidate, alpha=1.0)) for t in now.history]
-    for history, name in ((now.history, "log₂ α"), (damped, "log₁₀ damping")):
-        if name == "log₂ α":
-            last = history[-1]
-            history = (*history[:-1], replace(last, candidate=replace(last.candidate, alpha=0.5)))
-        panel = replace(now, history=tuple(history)).figures()[0].panels[-1]
-        assert panel.y_name == name
-        assert all(panel.y_range[0] < dot.y < panel.y_range[1] for dot in panel.dots)
 
 
 def test_a_result_without_a_figure_says_so(cart):
@@ -397,57 +305,6 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
 
 
-def test_a_state_that_was_never_measured_and_a_horizon_that_noise_fills_have_no_bars():
-    """An empty chart, `- rad/s`; and bars of equal length where noise alone is all that shows."""
-    lost = math.nan
-    row = RulerRow(
-        1.0,
-        unit_by_channel={"x": "m", "v": "m/s"},
-        crude={"x": 0.3, "v": lost},
-        with_effects={"x": 0.1, "v": lost},
-    )
-    credit = (Credit("delay:u", 0.6, {"x": 0.2, "v": lost}),)
-    found = Diagnosis(Verdict("effect"), prediction_error=(row,), credit=credit)
-    figure = worth_figure(found, [(["v"], "v")])
-    assert figure is not None and [p.title.partition(":")[0] for p in figure.panels] == ["x"]
-    assert [p.title for p in credit_figure(found, 2).panels[1:]] == ["x: error 1 s ahead"]
-    short = replace(row, horizon_s=0.5)
-    drowned = replace(found, prediction_error=(short, replace(row, drowned=True)))
-    assert worth_figure(drowned, [(["x"], "x")]) is None
-    assert len(credit_figure(drowned).panels) == 1
-
-
-def test_a_cause_is_drawn_where_it_shows():
-    """Both bars shown were shorter without a claimed cause, and no word said why it is claimed."""
-    credit = (
-        Credit("delay:u", 0.6, {"x": 0.2, "v": 0.3}),
-        Credit("gain:u", 0.2, {"x": 0.09, "v": 0.4}),
-    )
-    hidden = Credit("drag:v", 0.1, {"x": 0.1, "v": 0.3})
-    now = {"x": 0.1, "v": 0.3}
-    row = RulerRow(
-        1.0, unit_by_channel={"x": "m", "v": "m/s"}, crude={"x": 0.3, "v": 0.5}, with_effects=now
-    )
-    found = Diagnosis(Verdict("several"), prediction_error=(row,), credit=(*credit, hidden))
-    figure = worth_figure(found, [(["x"], "x")])
-    assert figure is not None
-    assert [panel.title.partition(":")[0] for panel in figure.panels] == ["x", "v"]
-    assert "drag:v" in figure.caption and "gain:u" not in figure.caption
-
-
-def test_a_mean_of_two_trials_is_no_trial(cart):
-    """Of a candidate that was run twice the page said that the diagnosis never saw it."""
-    findings = gather(Folder(cart))
-    best = findings.runs_of(findings.best.candidate.id)[-1]
-    again = replace(best, trial=replace(best.trial, id="t0099", states=best.trial.states + 1e-3))
-    seen = {"trials": [*(r.trial.id for r in findings.runs), "t0099"], "adopted": []}
-    diagnosis = Diagnosis.from_json(DIAGNOSIS | {"diagnosed": seen})
-    twice = replace(findings, runs=(*findings.runs, again), diagnosis=diagnosis)
-    figure = forecast_figures(twice)[0]
-    assert "t0099" in figure.title and "used this trial" in figure.caption
-    np.testing.assert_array_equal(figure.panels[0].curves[0].y, again.trial.states[:, 0])
-
-
 def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
     findings = gather(Folder(cart))
     over, rest = residual_figures(findings)
@@ -462,15 +319,6 @@ def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
     assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
 
 
-def test_a_line_of_means_goes_from_the_least_to_the_largest():
-    x = np.concatenate([np.linspace(0.0, 1.0, 80), [2.0, 6.3]])
-    at, mean = _binned(x, 2 * x)
-    assert at[0] < 0.1 and at[-1] == 6.3 and (np.diff(at) > 0).all()
-    np.testing.assert_allclose(mean, 2 * at)
-    at, mean = _binned(np.ones(9), np.arange(9.0))
-    assert at.tolist() == [1.0] and mean.tolist() == [4.0]
-
-
 def test_held_commands_are_drawn_as_steps(cart):
     findings = gather(Folder(cart))
     (panel,) = input_figure(findings).panels
@@ -478,21 +326,6 @@ def test_held_commands_are_drawn_as_steps(cart):
         assert curve.style == "steps" and len(curve.y) == findings.task.horizon + 1
         assert curve.y[-1] == curve.y[-2]
     assert {t["line"]["shape"] for t in plotted(panel)["data"]} == {"hv"}
-
-
-def test_models_that_predict_alike_are_one_curve():
-    def row(seconds, **more):
-        errors = {"outset": 1.0, "crude": 0.5, "calibrated": 0.5, "with_effects": 0.5} | more
-        columns = {key: {"x": seconds * value} for key, value in errors.items()}
-        return RulerRow(seconds, unit_by_channel={"x": "m"}, **columns)
-
-    def named(*rows):
-        found = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows))
-        return [curve.name for curve in found.panels[0].curves]
-
-    assert named(row(0.5), row(1.0)) == ["model.py", "model = calibrated = as diagnosed"]
-    apart = row(1.0, with_effects=0.4)
-    assert named(row(0.5), apart) == ["model.py", "model = calibrated", "as diagnosed"]
 
 
 def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
@@ -510,15 +343,6 @@ def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
     expected = figure.panels[0].dots[-1]  # as the table has it
     assert (expected.shape, expected.y) == ("dash", last.promised)
     assert not any("waiting" in key.name for key in search_figure(now).key)
-
-
-def test_the_first_candidate_is_not_said_to_replay_a_trial():
-    """A dash was "predicted by the model, which replays the trial before" before any trial."""
-    now = many_flights(3).standing
-    alone = search_figure(replace(now, history=now.history[:1], incumbent=now.history[0]))
-    assert alone is not None and "replays" not in alone.caption
-    several = search_figure(now)
-    assert several is not None and "for all but the first candidate, it replays" in several.caption
 
 
 def _linear(colour):
@@ -559,13 +383,6 @@ def test_colours_stand_out_and_are_told_apart_by_the_colour_blind(dark):
                 assert apart or DASHES.get(a) != DASHES.get(b), (a, b)
 
 
-def test_bars_leave_room_for_what_stands_behind_them():
-    bars = Bars("b", (Bar("a", 100.0, "100"), Bar("delay:torque", -0.07, "-0.0689")))
-    low, high = bars.ends
-    assert low < -20 and high > 110
-    assert plotted(bars)["layout"]["xaxis"]["range"] == [low, high]
-
-
 def test_logarithmic_panels_show_what_has_a_logarithm():
     curve = Curve(np.array([0.1, 1.0, 10.0]), np.array([1e-5, 0.0, 10.0]), "best", "b")
     panel = Panel("p", "x", "y", (curve,), log=True)
@@ -601,36 +418,3 @@ def test_a_crash_is_marked_where_it_happened(car):
         (mark,) = panel.dots  # as in the figures of states
         (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
         assert mark.shape == "cross" and mark.y == off[19]
-
-
-def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):
-    """Means of runs have no id of their own: the best one took the other's place."""
-    findings = gather(Folder(car))
-    own = {findings.first.candidate.id, findings.best.candidate.id}
-    again = [run for run in findings.runs if run.candidate.id in own]
-    runs = [
-        *findings.runs,
-        *(replace(r, trial=replace(r.trial, id=f"{r.trial.id}b")) for r in again),
-    ]
-    figure = path_figure(replace(findings, runs=tuple(runs)))
-    roles = [curve.role for curve in figure.panels[0].curves if curve.style == "line"]
-    assert len(own) == 2 and roles.count("model") == roles.count("best") == 1
-    assert roles.count("other") == len(runs)
-
-
-def test_a_level_flight_looks_level_in_the_view_from_the_side():
-    """Scaled to the sensor's noise of millimetres, a level flight looked like a storm."""
-    x, noise = np.linspace(-2, 2, 50), 0.01 * np.sin(np.arange(50))
-    low, high = _level([Curve(x, 2 + noise, "best", "", 1.0)])
-    assert high - low == pytest.approx(0.4, rel=0.05) and low < 2 < high
-    assert _level([Curve(x, x, "best", "", 1.0)]) is None
-
-
-def test_long_names_are_broken_where_they_are_joined():
-    """In a small panel they were cut, and so were the values behind the bars."""
-    whole = "without delay:roll_command+pitch_command+thrust"
-    lines = in_lines(whole).split("<br>")
-    assert max(map(len, lines)) <= LONG and "".join(lines).replace(" ", "") == whole.replace(
-        " ", ""
-    )
-    assert in_lines("without calibration") == "without calibration"

@@ -23,7 +23,6 @@ from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.recording.recording import rate, write_recording
-from grounded_trials.report.recording.texts import credit, summary, verdict
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
@@ -111,7 +110,6 @@ def _origins(container):
 
 @pytest.mark.parametrize("logs", [False, True])
 def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
-    """The credit was below the fold of the verdict; with logs alone, both were in a hidden tab."""
     findings = gather(Folder(cart))
     causes = (Credit("calibration", 1.0),)
     findings = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
@@ -124,15 +122,6 @@ def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
     while shown.active_tab is not None or isinstance(shown, rrb.Tabs):
         shown = shown.contents[shown.active_tab or 0]
     assert _origins(shown)[:2] == ["/verdict", "/credit"]
-
-
-@needs_tool
-def test_car_and_aircraft(car, tmp_path):
-    for name, findings in (("car", gather(Folder(car))), ("aircraft", many_flights(2))):
-        path = tmp_path / f"{name}.rrd"
-        write_recording(findings, path)
-        assert _rerun("rrd", "verify", path).returncode == 0
-        assert "/paths/desired " in _entities(path)
 
 
 @needs_tool
@@ -228,7 +217,6 @@ def _ended(command: list[str], log: Path, seconds: float) -> str:
 @needs_tool
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed")
 def test_the_viewer_shows_the_paths(car, tmp_path):
-    """Half a minute: the viewer draws in software."""
     path, shot = tmp_path / "car.rrd", tmp_path / "shot.png"
     write_recording(gather(Folder(car)), path)
     screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
@@ -245,24 +233,3 @@ def test_the_viewer_shows_the_paths(car, tmp_path):
     for colour in ((213, 94, 0), (86, 180, 233), (170, 170, 170)):  # model's policy, best, desired
         near = (np.abs(left - colour).max(axis=2) < 25).sum()
         assert near > 300, colour
-
-
-def test_the_texts_begin_with_the_next_command_and_name_a_crash(cart):
-    """`next:` was below the fold, and the utility of a crashed first run was -inf."""
-    findings = gather(Folder(cart))
-    lines = verdict(findings).splitlines()
-    assert lines[0] == f"next: `{findings.next_command}`" and len(lines) > 2
-    assert credit(findings) == ""  # this diagnosis has none
-    causes = (Credit("calibration", 0.75), Credit("delay:force", 0.25))
-    known = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
-    rows = credit(known).splitlines()[2:]
-    assert [row.count("█") for row in rows] == [15, 5]
-    assert "█" not in verdict(known)
-    assert credit(replace(known, diagnosis=None)) == ""
-    assert findings.first is not None
-    crashed = tuple(
-        replace(run, utility=-np.inf) if run is findings.first else run for run in findings.runs
-    )
-    text = summary(replace(findings, runs=crashed))
-    assert "inf" not in text and "failed by the model's policy" in text
-    assert "0 logs" not in text

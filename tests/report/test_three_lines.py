@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.report import Diagnosis, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.result import measured, measured_alike
 from grounded.utility import Reward
-from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained, gained_most, three_lines
 from reported import DIAGNOSIS
 from small_tasks import cart_task
@@ -58,7 +57,6 @@ def test_causes_gain_and_what_is_left(diagnosis):
 
 
 def test_what_is_equal_as_printed_is_left_out(diagnosis):
-    """`x by 7.8 mm instead of 9.7 mm and v by 0.020 m/s instead of 0.020 m/s`."""
     (row,) = diagnosis.prediction_error
     row = replace(row, crude={"x": 0.25, "v": 0.02001}, with_effects={"x": 0.012, "v": 0.02})
     reward = Reward(np.array([10.0, 1.0]), np.zeros(2), np.zeros(1), np.ones(1))
@@ -83,32 +81,6 @@ def test_what_is_weighed_is_spoken_of(diagnosis):
     assert names == [["x"]]  # v has no weight
 
 
-def test_what_alone_improved_is_spoken_of_though_it_has_no_weight(diagnosis):
-    """The verdict named v; the page told of the heading "by 0.0066 rad instead of 0.0065 rad"."""
-    (row,) = diagnosis.prediction_error
-    speed = replace(row, crude={"x": 0.0065, "v": 0.31}, with_effects={"x": 0.0066, "v": 0.04})
-    found = replace(diagnosis, prediction_error=(speed,))
-    assert gained_most(found, cart_task()) == [(["v"], "v")]
-    text = gained(found, cart_task())
-    assert "v by 0.040 m/s instead of 0.31 m/s" in text and "x by" not in text
-
-
-def test_ties_are_named_and_nothing_left_is_said(diagnosis):
-    tied = replace(diagnosis, indistinguishable=(("a:v", "b:v"),), leftover=())
-    assert "a:v from b:v" in three_lines(tied, cart_task())[-1]
-    clean = replace(diagnosis, leftover=())
-    assert "1.3 times the noise" in three_lines(clean, cart_task())[-1]
-    (row,) = diagnosis.prediction_error
-    quiet = replace(clean, prediction_error=(replace(row, noise_floor=row.with_effects),))
-    assert "above the noise" in three_lines(quiet, cart_task())[-1]
-
-
-def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
-    verdict = Verdict("unknown", sentence="No cause is named: one trial.")
-    unknown = replace(diagnosis, verdict=verdict, credit=())
-    assert three_lines(unknown, cart_task()) == ["No cause is named: one trial."]
-
-
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [
@@ -123,16 +95,6 @@ def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
 )
 def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
     assert measured(value, unit) == text
-
-
-def test_each_of_several_causes_stands_on_a_line_of_its_own(diagnosis):
-    told = replace(diagnosis.verdict, sentences=("All three.", "What is left."))
-    causes, others = verdict_lines(replace(diagnosis, verdict=told))
-    worth = "(without this, errors are 2.4 times as large)"
-    assert causes[1] == f"{CAUSES[1][:1].upper()}{CAUSES[1][1:]} {worth}"
-    assert len(causes) == len(CAUSES) and others == ["What is left."]
-    old = Verdict("effect", sentence="Friction slows v.")
-    assert verdict_lines(replace(diagnosis, verdict=old)) == ([], ["Friction slows v."])
 
 
 @pytest.mark.parametrize(

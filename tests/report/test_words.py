@@ -6,9 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.cause_words import give_or_take
-from grounded.diagnosis.report import Estimate
-from grounded.result import begun, measured_alike
+from grounded.result import measured_alike
 from grounded_trials.report.findings import by_state
 from grounded_trials.wording import (
     count,
@@ -59,21 +57,6 @@ def test_what_rounding_left_of_zero_reads_zero():
     assert moved(1.0, -7e-17, "m").startswith("1.00 -> 0 ")
 
 
-@pytest.mark.parametrize(
-    ("value", "std", "text"),
-    [
-        (7e-17, 0.01, "0 +- 0.010 N"),
-        (-2e-5, 0.01, "0 +- 0.010 N"),
-        (2e-4, 0.01, "0.000200 +- 0.010 N"),
-        (0.3, 1e-18, "0.3 N"),
-        (1234.0, 300.0, "1,234 +- 300 N"),
-        (0.018089, 0.00088, "0.01809 +- 0.00088 N"),
-    ],
-)
-def test_a_value_is_zero_where_its_deviation_shows_no_digit_of_it(value, std, text):
-    assert give_or_take(Estimate(value, std, unit="N")) == text
-
-
 def test_an_error_that_is_rounding_noise_beside_its_row_is_zero():
     errors = [np.array([0.3, 2e-17]), np.array([-1e-18, 3e-17])]
     model = SimpleNamespace(states={"x": "m", "v": "m/s"}, n=2)
@@ -114,10 +97,3 @@ def test_trials_are_named_without_hiding_those_between():
 )
 def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
-
-
-def test_a_sentence_that_begins_with_an_effect_keeps_its_name():
-    """The page said "Coriolis:v and rate_gain:v are equivalent", a name that `adopt` refuses."""
-    assert begun("coriolis:v and rate_gain:v are") == "coriolis:v and rate_gain:v are"
-    assert begun("t_end is") == "t_end is"
-    assert begun("the state v: 3 m") == "The state v: 3 m"

@@ -165,3 +165,8 @@ def many_flights(trials: int = 50) -> Findings:
         optimum=None,
         then=NextCommand("propose"),
     )
+
+
+def diagnosed(folder: Path, **changes: Any) -> None:
+    """Write the diagnosis of a workspace, with some of its parts changed."""
+    write_document(folder / "reports" / "diagnosis.json", {**DIAGNOSIS, **changes})

@@ -9,12 +9,11 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded import places
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.search.returned.by_motion import exchanged
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.starting.shapes import Drive, path_target
-from grounded_trials.store.trial_file import write_trial
 from workspaces import make
 
 MODEL = """import numpy as np
@@ -71,7 +70,6 @@ def driven(w, seed=0, crossed=False, scale=1.0):
 
 
 def test_roles_are_offered_as_the_equations_have_them(w):
-    """`"speed": "v"`, it said to a boat whose v is sway: pasted, its target had the sway drive."""
     with pytest.raises(GroundedError, match=holding(ROLES)):
         path_target("circle", Drive(), w.base_model, 0.05)
     odd = replace(w.base_model, roles={"position": ("x", "y"), "heading": "psi", "speed": "v"})
@@ -82,7 +80,6 @@ def test_roles_are_offered_as_the_equations_have_them(w):
 
 
 def test_a_heading_without_a_declared_angle_is_one_all_the_same(w, tmp_path):
-    """Neither Coriolis forces nor a drift over the ground were tried: "no known effect"."""
     model = w.base_model
     bare = replace(model, angles=())
     for one in (model, bare):
@@ -101,7 +98,6 @@ def test_a_heading_without_a_declared_angle_is_one_all_the_same(w, tmp_path):
 
 @pytest.mark.parametrize("chosen", [False, True])
 def test_weights_of_a_target_before_roles_were_added_are_nobody_s_choice(w, chosen):
-    """Kept as "chosen", without a word: the next plan ended 260 mm off."""
     toml = w.folder / "grounded.toml"
     w.target({"x": 3 * T, "y": T, "u": T, "v": T / 9})
     before = tomllib.loads(toml.read_text())["reward"]["state"]
@@ -116,22 +112,9 @@ def test_weights_of_a_target_before_roles_were_added_are_nobody_s_choice(w, chos
     assert holds(told, "[reward] state is kept", "y = 7.500") == chosen
 
 
-def test_logs_of_another_dt_are_told_as_left_out(w):
-    """A log by hand, the only varied one, was in no later diagnosis, and nothing said so."""
-    write_trial(w.folder / "hand.mcap", driven(w), {"kind": "trial"})
-    w.ingest(w.folder / "hand.mcap", data=True)
-    assert not any("left out" in one or "leave" in one for one in w.status().notes)
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text().replace("dt = 0.05", "dt = 0.1"))
-    w.target({"x": 3 * T, "y": T})
-    (told,) = [one for one in Workspace(w.folder).status().notes if "leave it out" in one]
-    assert holds(told, "t0001 was sampled every 0.05 s", "dt is 0.1 s now", "`discard`")
-
-
 @pytest.mark.parametrize("crossed", [False, True])
 @pytest.mark.parametrize("scale", [0.8, 1.0])
 def test_inputs_that_acted_in_each_other_s_place_are_told_by_the_motion(w, crossed, scale):
-    """Of nine runs with exchanged plugs, one was named; the others were asked about."""
     planner = w.planner
     before = [driven(w, seed, scale=scale) for seed in (1, 2)]
     found = exchanged(planner, driven(w, 3, crossed, scale), before)
@@ -140,21 +123,3 @@ def test_inputs_that_acted_in_each_other_s_place_are_told_by_the_motion(w, cross
         assert found.inputs == ("left", "right") and found.shown == ("t0002", "t0003")
         assert holds(found.said, "did with left what was sent as right", "times as well")
     assert exchanged(planner, driven(w, 3, True, scale), [driven(w, 1, True, scale)]) is None
-
-
-def test_who_proposes_at_the_end_of_a_search_has_gone_on_with_the_run(w, monkeypatch):
-    """`propose goes on`: it said so again and again, and asked for the discard each time."""
-    from grounded.search.standing import Proposal
-    from grounded_trials.workspace.candidates import proposing
-
-    write_trial(w.folder / "hand.mcap", driven(w), {"kind": "trial"})
-    w.ingest(w.folder / "hand.mcap", data=True)
-    digest = w.store.find("t0001").digest
-    asked = ("t0001: why",), NextCommand("discard", ("t0001",))
-    monkeypatch.setattr(
-        "grounded_trials.workspace.intake.remarks.gone_wrong.unanswered",
-        lambda here: ((), None) if digest in here.noted.kept else asked,
-    )
-    ended = Proposal(w.status().standing, None, False)
-    monkeypatch.setattr(proposing, "_handed_over", lambda here: (ended, {}))
-    assert w.propose().then.verb != "discard" and digest in w.noted.kept

@@ -6,19 +6,14 @@ import sys
 
 import numpy as np
 import pytest
-from test_next_step import diagnosed
 
 from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, plain
-from grounded.rollout import simulate
-from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.adopted import planner_of
-from reported import cart, copied
-from workspaces import CONFIG, make
+from reported import cart, copied, diagnosed
+from workspaces import make
 
 __all__ = ["cart"]
 
@@ -75,7 +70,6 @@ def test_a_session_from_an_example_to_a_report(tmp_path):
     ],
 )
 def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, options):
-    """Two copies of one folder, each the current one when it is asked."""
     for side in ("a", "b"):
         copied(cart, tmp_path / side)
         (first, *_) = (tmp_path / side / "trials").glob("t0001-*")
@@ -138,48 +132,6 @@ def test_fit_says_how_its_values_are_written(tmp_path):
     again = w.fit(["mass"], apply=True)
     assert again.then == NextCommand("propose")
     assert w.base_model.params["mass"].value == pytest.approx(again.fit.params["mass"].value)
-
-
-@pytest.mark.slow
-def test_fit_knows_the_effects_that_were_adopted(tmp_path):
-    """The robot has a delay, a lag and a dead zone, the model too: only mass and drag are off."""
-    listed = """file = "model.py"
-effects = [
-    {name = "delay:force", d = 0.02},
-    {name = "first_order_lag:force", tau = 0.2},
-    {name = "dead_zone:force", c = 0.6},
-]"""
-    folder = make(tmp_path / "w", config=CONFIG.replace('file = "model.py"', listed)).folder
-    w, rng = Workspace(folder), np.random.default_rng(0)
-    true = w.task.with_model(w.base_model.with_values({"mass": 1.4, "drag": 0.5}))
-    robot = planner_of(true, w.config.model.effects).plan
-    names = (w.base_model.state_names, w.base_model.input_names)
-    for k in range(8):
-        force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)
-        run = simulate(robot.problem(exact=True), robot.policy(force, None, None))
-        seen = run.states[:, :2] + rng.normal(0, 0.002, (41, 2))
-        write_trial(tmp_path / f"{k}.mcap", Trial(seen, force, 0.05, *names), {"kind": "data"})
-        w.ingest(tmp_path / f"{k}.mcap", data=True)
-    found = w.fit().fit
-    for name, value in {"mass": 1.4, "drag": 0.5}.items():
-        assert found.params[name].low < value < found.params[name].high
-        assert found.params[name].std < 0.1 * value
-    assert found.params["first_order_lag_force_tau"].value == pytest.approx(0.2, abs=0.05)
-    assert found.after.ahead[0] < 0.01 < found.before.ahead[0]
-
-    w.fit(apply=True)
-    assert w.base_model.params["mass"].value == pytest.approx(1.4, abs=0.1)
-    before = w.planner.plan.latency
-    kept = {effect["name"]: effect for effect in w.config.model.effects}
-    assert kept["delay:force"]["d"] == 0.02
-    assert kept["dead_zone:force"]["c"] == pytest.approx(0.6, abs=0.1)
-    assert kept["first_order_lag:force"]["tau"] == pytest.approx(
-        found.params["first_order_lag_force_tau"].value
-    )
-
-    w.fit(["mass"], latency=True, apply=True)  # the whole delay: it is not counted twice
-    assert "delay:force" not in {effect["name"] for effect in w.config.model.effects}
-    assert w.planner.plan.latency == pytest.approx(before, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,6 @@ def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_p
 
 
 def test_parameters_are_fitted_without_a_speed_that_follows_from_positions(tmp_path):
-    """Nothing was fitted: "the filter diverged at step 1", and `next: fit --apply`."""
     w, rng = Workspace(make(tmp_path / "w").folder), np.random.default_rng(0)
     robot = w.task.with_model(w.base_model.with_values({"mass": 1.4}))
     names = (w.base_model.state_names, w.base_model.input_names)
@@ -164,7 +163,6 @@ def test_the_fit_after_a_diagnosis_of_some_trials_is_of_the_same_trials(misled):
 
 
 def test_a_fit_in_vain_is_not_asked_for_again(misled):
-    """`diagnose` said fit, and `fit` said diagnose, for ever."""
     claimed(misled)
     assert misled.status().then == NextCommand("fit")
     adopt = NextCommand("adopt", ("parameter:mass",))
@@ -194,7 +192,6 @@ def test_a_fit_of_other_trials_or_another_model_says_nothing_of_these(misled):
 
 @pytest.mark.parametrize(("value", "adopted"), [(1.2, True), (1.19, True), (1.4, False)])
 def test_another_value_than_was_claimed_was_not_adopted(misled, value, adopted):
-    """`fit --apply` wrote k = 1.20 where 1.58 was claimed: the page said that was adopted."""
     claimed(misled)
     text = misled.config.file.read_text()
     told = f'file = "model.py"\nparams = {{ mass = {value} }}'

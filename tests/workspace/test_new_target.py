@@ -75,7 +75,6 @@ model = Model(states={"x": "mm", "v": "mm/s"}, inputs={"u": "mm/s^2"},
 
 @pytest.mark.parametrize("size", [180.0, 1800.0])
 def test_weights_of_large_ranges_are_not_taken_for_chosen_ones(tmp_path, size):
-    """In mm: 1/180^2 was written as 3.1e-05 and never changed again, 1/1800^2 as 0."""
     (tmp_path / "cart.py").write_text(CART)
     w = Workspace.create(tmp_path / "w", model=tmp_path / "cart.py")
     for far in (size, 1.0):
@@ -112,7 +111,6 @@ def plate(folder, first=23.0, x=3.0):
 
 
 def test_a_step_begins_where_the_trials_rest_if_nobody_said_where(tmp_path):
-    """It was drawn from 0 degC in a room of 23 degC."""
     w = plate(tmp_path)
     done = grounded("-C", w.folder, "target", "step", "--to", "T=45", "--seconds", "60")
     assert holds(" ".join(done.out.split()), "23.00 to 45.00 degC", "t0001 rests: T = 23.00")
@@ -135,39 +133,6 @@ def test_a_start_that_was_chosen_stays_as_it_is(tmp_path):
     assert "0 to 45.00" in done.out and not Workspace(moving.folder).config.task.start
 
 
-def test_what_a_target_replaced_in_a_search_is_said_and_kept(w):
-    old = files(w)
-    w.propose()
-    done = grounded("-C", w.folder, "target", "step", "--to", "theta=1", "--seconds", "2")
-    told = " ".join(done.out.split())
-    assert holds(told, "before: horizon = ", "the target in target.csv.bak", "grounded.toml.bak")
-    assert files(w)["grounded.toml.bak"] == old["grounded.toml"]
-    assert files(w)["target.csv.bak"] == old["target.csv"]
-
-
-def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
-    """A balancer's tilt was drawn to 0 without a word, with its sensor 0.0044 rad off."""
-    config = w.folder / "grounded.toml"
-    text = config.read_text()
-    assert "effects = [" not in text
-    config.write_text(
-        text.replace("[model]\n", '[model]\neffects = [{ name = "sensor_bias:theta", b = 0.02 }]\n')
-    )
-    said = grounded("-C", w.folder, "target", "step", "--to", "theta=1")
-    assert said.code == 0, said.err
-    assert holds(said.err, "in readings of its sensor", "0.02 rad too high", "sensor_bias:theta")
-    assert holds(said.err, "the target ends at 1.000 rad and [task] start is 0 rad")
-    config.write_text(config.read_text().replace("start = { }", "start = { theta = 0.02 }"))
-    there = np.column_stack([t := 0.05 * np.arange(41), 0.02 + 0.3 * np.sin(np.pi * t / 2) ** 2])
-    np.savetxt(w.folder / "there.csv", there, "%.6f", ",", header="t,theta", comments="")
-    drawn = grounded("-C", w.folder, "target", str(w.folder / "there.csv"))
-    assert drawn.code == 0 and "in readings" not in drawn.err
-    there[:, 1] -= 0.02
-    np.savetxt(w.folder / "there.csv", there, "%.6f", ",", header="t,theta", comments="")
-    drawn = grounded("-C", w.folder, "target", str(w.folder / "there.csv"))
-    assert holds(drawn.err, "but the target ends at 0 rad. If") and "start is" not in drawn.err
-
-
 @pytest.mark.parametrize(
     ("table", "named"),
     [
@@ -177,7 +142,6 @@ def test_a_target_beside_an_adopted_bias_is_told_to_be_in_readings(w):
     ],
 )
 def test_a_broken_grounded_toml_is_told_before_a_target_is_written(w, table, named):
-    """`target` wrote, and said `next: propose`, which then refused an unknown key."""
     head, _, rest = table.partition("\n")
     text = w.config.file.read_text()
     start = text.index(head)
@@ -212,18 +176,7 @@ CIRCLE = {"x": np.sin(2 * np.pi * T), "y": 1 - np.cos(2 * np.pi * T)}
     ],
 )
 def test_a_heading_in_degrees_beside_its_positions_is_refused(path, heading, ok):
-    """A lane change "psi 0 to 33.81 rad" became the target: the weight on psi was 8.7e-4."""
     if ok:
         return refuse_degrees({**path, "psi": heading}, rover)
     with pytest.raises(GroundedError, match=holding("psi", "rad", "degrees", "pi / 180")):
         refuse_degrees({**path, "psi": heading}, rover)
-
-
-def test_a_table_with_its_heading_in_degrees_is_no_target(tmp_path):
-    w = Workspace.create(tmp_path / "w", example="car-turn")
-    columns = {**S_CURVE, "psi": np.degrees(COURSE)}
-    table = np.column_stack([w.task.dt * np.arange(len(T)), *columns.values()])
-    file = tmp_path / "lane.csv"
-    np.savetxt(file, table, "%.6f", ",", header="t,x,y,psi", comments="")
-    done = grounded("-C", w.folder, "target", file)
-    assert done.code == 1 and holds(done.err, "psi", "degrees")

@@ -86,24 +86,6 @@ def test_a_damaged_trial_that_was_set_aside_stays_so_when_its_log_comes_again(tm
     assert any("stays set aside" in one for one in found.warnings)
 
 
-def test_a_robot_driven_by_hand_is_told_to_export_the_best_again(tmp_path, monkeypatch):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.learn(2)
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text().partition("[system]")[0])
-    monkeypatch.chdir(tmp_path)
-    status = w.status()
-    best = status.standing.incumbent.candidate.id
-    assert (status.again.verb, status.again.arguments) == ("export", (best, "--runner"))
-    assert f"export {best} --runner`" in plain(grounded("-C", w.folder, "status").out)
-    w.export(best, w.folder / f"{best}.npz", runner=True)
-    again = w.status().again
-    assert (again.verb, again.arguments) == ("next", ("LOG", "--candidate", best))
-    with pytest.raises(GroundedError) as refused:
-        w.run(best)
-    assert refused.value.then.verb == "next"
-
-
 def test_an_empty_candidate_is_deleted_and_its_trial_carries_it(ran):
     path = ran.candidate_path("c0001")
     whole = path.read_bytes()

@@ -19,7 +19,6 @@ from workspaces import CONFIG, MODEL, make
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_examples_files_say_what_its_task_is(name, tmp_path):
-    """The files that `init` writes give the very task that the studies use."""
     write_example(tmp_path, name)
     found, own = Folder(tmp_path).task, EXAMPLES[name].task()
     assert (found.dt, found.horizon, found.feedback) == (own.dt, own.horizon, own.feedback)

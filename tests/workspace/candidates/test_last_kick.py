@@ -25,7 +25,6 @@ ENDS = CONFIG.replace("{ x = 10.0 }", "{ }\nterminal = { x = 100.0 }")
     ],
 )
 def test_what_is_on_target_for_one_sample_only_is_told(tmp_path, last, lag, said):
-    """`at the end x 1.009 m` stood where the robot was 4 cm away a second later."""
     assert ENDS != CONFIG
     planner = Folder(make(tmp_path / "w", config=ENDS).folder).planner
     task = planner.task
@@ -41,7 +40,6 @@ def test_what_is_on_target_for_one_sample_only_is_told(tmp_path, last, lag, said
 
 
 def test_a_plan_that_rests_against_a_force_is_no_kick(tmp_path):
-    """An arm that stood still within 1 mrad was to let its target rest for longer."""
     model = MODEL.replace("a.force - p", "a.force - 5.0 * s.x - p")
     assert model != MODEL
     planner = Folder(make(tmp_path / "w", config=ENDS, model=model).folder).planner
@@ -56,10 +54,6 @@ def test_a_plan_that_rests_against_a_force_is_no_kick(tmp_path):
 
 @pytest.mark.parametrize(("turned", "noise"), [(0.0, 0.0), (0.008, 0.0), (0.0, 0.003)])
 def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(turned, noise):
-    """A robot docked within 0.6 mrad, by the last sample, and stood there turned by 7.5 mrad.
-
-    An aircraft's roll was off by as much in one sample of a second, by its sensor's noise.
-    """
     task = rover_task()
     weights = replace(task.reward, terminal=np.array([100.0, 100.0, 300.0]))
     T, rest = task.horizon, 12
