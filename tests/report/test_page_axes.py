@@ -28,15 +28,14 @@ from grounded_trials.report.page.tables import forecast_table
 from grounded_trials.report.reporting import Report
 from grounded_trials.report.scene import reading_order
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracked
-from reported import car, cart, copied, many_flights
+from reported import car, cart, copied, gathered, many_flights
 
 __all__ = ["car", "cart"]
 
 
 def test_every_axis_has_a_name(cart):
-    for figure in residual_figures(gather(Folder(cart))):
+    for figure in residual_figures(gathered(cart)):
         assert all(panel.x_name and panel.y_name for panel in figure.panels), figure.name
 
 
@@ -56,7 +55,7 @@ def test_powers_of_ten_that_are_too_many_are_left_out():
 
 
 def test_charts_begin_with_the_position_and_what_has_a_target(car):
-    findings = gather(Folder(car))
+    findings = gathered(car)
     task, names = findings.task, findings.task.model.state_names
     order = [names[i] for i in reading_order(task)]
     wanted = [names[i] for i in tracked(task)]
@@ -85,7 +84,7 @@ def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
 
 
 def test_a_calm_bias_is_drawn_step_by_step(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     for panel in bias_figure(findings).panels:
         assert len(panel.curves[0].x) == len(findings.improvements[0].residual) and not panel.note
     steady = np.full(300, 2.0) + np.random.default_rng(0).normal(0, 0.5, 300)
@@ -98,7 +97,7 @@ def test_a_calm_bias_is_drawn_step_by_step(cart):
 
 @pytest.mark.parametrize(("logs", "states_first"), [(1, True), (24, False)])
 def test_many_logs_are_rows_of_the_table_of_forecasts(cart, logs, states_first):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     trial = findings.runs[0].trial
     data = tuple(
         Log(replace(trial, id=f"d{k:02d}"), findings.runs[0].residual) for k in range(logs)

@@ -17,7 +17,7 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
-from reported import car, cart, copied, many_flights
+from reported import car, cart, copied, gathered, many_flights
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -37,7 +37,7 @@ def window():
 @pytest.fixture(scope="module")
 def car_page(car, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "page.html"
-    path.write_text(page(gather(Folder(car))))
+    path.write_text(page(gathered(car)))
     return path
 
 
@@ -124,7 +124,7 @@ def test_one_cursor_in_all_panels(opened, car):
 
 
 def test_the_slider_moves_the_run_along_its_path(opened, car):
-    findings = gather(Folder(car))
+    findings = gathered(car)
     best = findings.best
     assert best is not None
     opened.run("document.getElementById('paths-0').scrollIntoView({block: 'center'})")
@@ -145,18 +145,6 @@ def test_the_slider_moves_the_run_along_its_path(opened, car):
         ("desired", findings.task.target),
     ):
         np.testing.assert_allclose(at[name], states[k, columns], atol=0.01, err_msg=name)
-
-
-def test_playing_moves_time_on(opened):
-    slider = "const at = document.getElementById('time'); at.value = 0;"
-    opened.run(f"{slider} at.dispatchEvent(new Event('input'))")
-    assert float(opened.run("return document.documentElement.dataset.time")) == 0
-    opened.click("#play")
-    time.sleep(0.6)
-    opened.click("#play")
-    t = float(opened.run("return document.documentElement.dataset.time"))
-    assert t > 0.1
-    assert float(opened.run("return document.documentElement.dataset.time")) == t  # it stands
 
 
 @pytest.fixture(scope="module")
@@ -311,7 +299,7 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_text_of_every_bar_is_in_its_panel(cart, tmp_path, window, width):
     path = tmp_path / "page.html"
-    path.write_text(page(gather(Folder(cart))))
+    path.write_text(page(gathered(cart)))
     window.resize(1400, 900)
     window.open(path)
     window.draw_all()

@@ -11,10 +11,8 @@ from facts import holds
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure
 from grounded_trials.report.findings import AT_END, ESTIMATED, Log, improvements_in
-from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.workspace.folder import Folder
-from reported import car, cart
+from reported import car, cart, gathered
 
 __all__ = ["car", "cart"]
 
@@ -34,7 +32,7 @@ def weighed(findings, **weights):
 
 
 def test_no_path_is_desired_of_a_state_without_a_weight(car):
-    findings = weighed(gather(Folder(car)), x=10.0, y=10.0)
+    findings = weighed(gathered(car), x=10.0, y=10.0)
     states, errors = state_figure(findings), error_figure(findings)
     assert states is not None and errors is not None
     desired = {p.title for p in states.panels if any(c.role == "desired" for c in p.curves)}
@@ -44,7 +42,7 @@ def test_no_path_is_desired_of_a_state_without_a_weight(car):
 
 
 def test_of_a_state_that_only_counts_at_the_end_the_end_is_desired(cart):
-    findings = weighed(gather(Folder(cart)), x=10.0)
+    findings = weighed(gathered(cart), x=10.0)
     reward = replace(findings.task.reward, terminal=np.array([0.0, 5.0]))
     states = state_figure(replace(findings, task=replace(findings.task, reward=reward)))
     assert states is not None
@@ -56,7 +54,7 @@ def test_of_a_state_that_only_counts_at_the_end_the_end_is_desired(cart):
 
 
 def test_the_weighed_place_is_told_before_speeds_that_changed(cart):
-    findings = weighed(gather(Folder(cart)), x=10.0, v=1.0)
+    findings = weighed(gathered(cart), x=10.0, v=1.0)
     first, best = findings.first, findings.best
     assert first is not None and best is not None
     states = best.trial.states.copy()
@@ -71,7 +69,7 @@ def test_the_weighed_place_is_told_before_speeds_that_changed(cart):
 
 
 def test_what_a_forecast_is_stands_above_the_first_alone(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     logs = tuple(
         Log(replace(r.trial, id=f"t010{k}"), r.residual) for k, r in enumerate(findings.runs[:2])
     )
@@ -81,7 +79,7 @@ def test_what_a_forecast_is_stands_above_the_first_alone(cart):
 
 
 def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     assert findings.estimated == () and ESTIMATED not in page(findings)
     findings = replace(findings, estimated=("v",))
     states = state_figure(findings)

@@ -26,7 +26,7 @@ from grounded_trials.report.recording.recording import rate, write_recording
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
-from reported import car, cart, many_flights
+from reported import car, cart, gathered, many_flights
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -48,7 +48,7 @@ def _entities(path: Path) -> str:
 @needs_tool
 def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     path = tmp_path / "cart.rrd"
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     write_recording(findings, path)
     done = _rerun("rrd", "verify", path)
     assert done.returncode == 0, done.stderr
@@ -78,7 +78,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
 
 @needs_tool
 def test_crashes_are_marked_where_and_when(car, tmp_path):
-    findings = gather(Folder(car))
+    findings = gathered(car)
     (first, *rest), names = findings.runs, findings.task.model.state_names
     states, inputs = first.trial.states[:20], first.trial.inputs[:19]
     cut = replace(first.trial, states=states, inputs=inputs)
@@ -110,7 +110,7 @@ def _origins(container):
 
 @pytest.mark.parametrize("logs", [False, True])
 def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     causes = (Credit("calibration", 1.0),)
     findings = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
     if logs:
@@ -139,7 +139,7 @@ def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
 
 @needs_tool
 def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     parts = []
     for run in findings.runs[:2]:
         parts.append(tmp_path / f"{run.trial.id}.rrd")
@@ -157,7 +157,7 @@ def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
 @needs_tool
 def test_a_damaged_recording_is_noticed(cart, tmp_path):
     path = tmp_path / "cart.rrd"
-    write_recording(gather(Folder(cart)), path)
+    write_recording(gathered(cart), path)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 0xFF
     path.write_bytes(bytes(data[: len(data) // 2]))
@@ -190,7 +190,7 @@ def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
     from grounded.errors import GroundedError
 
     with pytest.raises(GroundedError, match=holding(tmp_path / "missing")):
-        write_recording(gather(Folder(cart)), tmp_path / "missing" / "cart.rrd")
+        write_recording(gathered(cart), tmp_path / "missing" / "cart.rrd")
 
 
 def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
@@ -218,7 +218,7 @@ def _ended(command: list[str], log: Path, seconds: float) -> str:
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed")
 def test_the_viewer_shows_the_paths(car, tmp_path):
     path, shot = tmp_path / "car.rrd", tmp_path / "shot.png"
-    write_recording(gather(Folder(car)), path)
+    write_recording(gathered(car), path)
     screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
     flags = ["--new", "--bind", "127.0.0.1", "--window-size", "1400x900", "--renderer", "vulkan"]
     command = [*screen, str(RERUN), *flags, "--screenshot-to", str(shot), str(path)]

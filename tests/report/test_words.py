@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded.result import measured_alike
+from grounded.result import measured, measured_alike
 from grounded_trials.report.findings import by_state
 from grounded_trials.wording import (
     count,
@@ -97,3 +97,37 @@ def test_trials_are_named_without_hiding_those_between():
 )
 def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.17, "m", "170 mm"),
+        (2.0, "m", "2.0 m"),
+        (4e-4, "m", "0.40 mm"),
+        (3e-6, "rad", "3.0 µrad"),
+        (0.3, "rad/s", "0.30 rad/s"),
+        (3e-4, "V", "3.0e-04 V"),
+        (0.0, "m", "0 m"),
+    ],
+)
+def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
+    assert measured(value, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "texts"),
+    [
+        ((1.6e-4, 1.6e-3), "m", ["0.16 mm", "1.6 mm"]),  # it was 0.16 mm -> 0.16 cm
+        ((1.6e-3, 9.1e-4), "m", ["1.6 mm", "0.91 mm"]),
+        ((8.2e-4, 0.045), "m", ["0.82 mm", "45 mm"]),
+        ((1.75, 0.012), "m", ["1,750 mm", "12 mm"]),
+        ((0.31, 1.6e-3), "m", ["310 mm", "1.6 mm"]),
+        ((1.2e-3, 7.3e-4), "rad", ["1.2 mrad", "0.73 mrad"]),
+        ((0.12, 5.8e-4), "rad", ["0.12 rad", "0.00058 rad"]),
+        ((0.2, 0.0), "m", ["200 mm", "0 mm"]),
+        ((0.17,), "m", ["170 mm"]),
+    ],
+)
+def test_errors_that_are_compared_have_one_unit(values, unit, texts):
+    assert measured_alike(values, unit) == texts
