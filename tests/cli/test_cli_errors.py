@@ -254,14 +254,6 @@ def test_a_model_without_numbers_proposes_nothing_and_says_why(tmp_path, rate, w
     assert not list((folder / "candidates").iterdir())
 
 
-def test_a_warning_of_the_model_is_no_failure(tmp_path):
-    noisy = MODEL.replace("def dyn", "print('loading')\nimport warnings\n\n\ndef dyn")
-    folder = make(tmp_path / "w", model=noisy).folder
-    done = process("-C", folder, "propose", "--json")
-    assert done.code == 0
-    assert done.json["candidate"] == "c0001"  # what model.py prints is not data
-
-
 # target.csv
 
 GRID = "".join(f"{0.05 * i:.2f},0,1\n" for i in range(41))
@@ -337,39 +329,6 @@ def test_the_users_own_command_end_to_end(tmp_path):
     assert done.json["trials"] == 3 and len(done.json["utilities"]) >= 2
     assert "drove c0001" in done.err  # its output is narration
     assert done.json["utilities"][-1] > done.json["utilities"][0]
-
-
-EXPORTED = """import subprocess, sys
-from pathlib import Path
-
-import numpy as np
-from grounded_trials.store.trial_file import TrialWriter
-
-from grounded.policy import load
-
-name = Path(sys.argv[1]).stem
-subprocess.run([sys.executable, "-c", "from grounded_cli.main import main; main()", "export", name,
-                "--format", "npz", "-o", "c.npz"], check=True, stdout=2)
-runner = load("c.npz", states=("x", "v"), inputs=("force",))
-policy, x = runner.policy, np.zeros(2)
-with TrialWriter(sys.argv[2], policy.dt, {"x": "m", "v": "m/s"}, {"force": "N"}, {}) as trial:
-    k = 0
-    while not runner.done(k * policy.dt):
-        u = runner.action(k * policy.dt, x)
-        trial.append(k * policy.dt, x, u)
-        x = x + policy.dt * np.array([x[1], (u[0] - 0.5 * x[1]) / 1.4])
-        k += 1
-    trial.append(k * policy.dt, x, None)
-"""
-
-
-@pytest.mark.slow
-def test_an_exported_policy_drives_and_its_trial_is_the_outstanding_ones(tmp_path):
-    command = f"{sys.executable} drive.py {{candidate}} {{trial}}"
-    folder = with_command(tmp_path, command, EXPORTED)
-    done = process("learn", "--trials", "2", "--json", cwd=folder)
-    assert done.code == 0, done.err
-    assert [h["trials"] for h in done.json["history"]] == [["t0001"], ["t0002"]]
 
 
 COMMANDS = {  # [system] command, and what the message names

@@ -153,26 +153,6 @@ def test_a_mujoco_model_looks_as_its_file_says():
     np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)
 
 
-def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
-    def half(size):
-        return body_of(cart_pole.model, scene_of(cart_pole.model), size).parts[-1].size[0]
-
-    assert half(0.05) == pytest.approx(0.05) and half(0.05) < half(10.0) == half(20.0)
-    assert _body(cart_pole.model).watched == "the tip" == _body(pendulum.model).watched
-    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)})
-    assert "load" in _body(crane).watched
-
-
-def test_a_robot_on_wheels_is_watched_at_its_position_not_at_a_tip():
-    roles = {"rail": "x", "upright": ("theta",), "speed": "x_vel"}
-    body = _body(replace(cart_pole.model, roles=roles))
-    states = np.array([[0.3, 0.4, 0.0, 0.0], [0.5, -0.2, 0.0, 0.0]])
-    rail = cart_pole.model.state_names.index("x")
-    assert "tip" not in body.watched
-    np.testing.assert_allclose(body.path(states)[:, 0], states[:, rail])
-    assert not body.path(states)[:, 2].any() and reach(body, states)[:, 2].max() > 0.1
-
-
 def test_a_rope_is_thin_and_its_load_is_at_its_end():
     params = {"L": Param(0.55, "m")}
     crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)}, params=params)

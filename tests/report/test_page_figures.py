@@ -21,9 +21,7 @@ from grounded.figures.figure import (
     COLOURS,
     DASHES,
     STEPS,
-    Band,
     Curve,
-    Dot,
     Figure,
     Panel,
     log_ticks,
@@ -31,7 +29,7 @@ from grounded.figures.figure import (
     rgb,
     thinned,
 )
-from grounded.figures.interactive import PAPER, coloured, packed, plotted
+from grounded.figures.interactive import PAPER, plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -46,7 +44,6 @@ from grounded_trials.report.figures.runs import all_figures, error_figure, input
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
-from page_browser import unpacked
 from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
@@ -77,44 +74,6 @@ def test_loss_axes_put_better_higher_and_space_by_ratio():
     ticks = loss_ticks(low, high)
     assert ticks == sorted(ticks) and 2 <= len(ticks) <= 5
     assert plotted(panel)["layout"]["yaxis"]["ticktext"] == [f"{t:g}" for t in ticks]
-
-
-def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
-    dots = (
-        Dot(1.0, -50.0, "best", "a", error=60.0),
-        Dot(2.0, -2.0, "best", "b", error=7.0),
-        Dot(3.0, float("nan"), "model", "failed", "cross"),
-    )
-    panel = Panel("p", "x", "y", dots=dots, bands=(Band(-9.0, 5.0, "other", "n"),), loss=True)
-    known, failed = plotted(panel)["data"]
-    assert np.isfinite(known["y"]).all() and np.isfinite(known["error_y"]["array"]).all()
-    low, high = panel.ranges()[1]
-    assert failed["text"] == ["failed"] and low <= failed["y"][0] <= low + 0.1 * (high - low)
-
-
-@given(
-    st.floats(-1e6, 1e6), st.sampled_from([0.0, 1e-6, 1.0, 1e6]), st.sampled_from([0.0, 1.0, 1e5])
-)
-def test_packed_numbers_are_what_they_were_where_one_can_see_it(offset, span, outlier):
-    values = offset + span * np.linspace(0, 1, 50)
-    values[7] = np.inf
-    values[9] += outlier
-    back = unpacked(packed(values))
-    assert np.isnan(back[7])
-    inner = np.ptp(np.quantile(np.delete(values, 7), [0.02, 0.98]))
-    np.testing.assert_allclose(
-        np.delete(back, 7), np.delete(values, 7), atol=1e-3 * inner + 1e-9, rtol=1e-6
-    )
-
-
-def test_roles_become_colours_light_and_dark():
-    trace = {"line": {"color": "@best"}, "fill": "@best/0.15", "name": "v @ 2 m/s"}
-    assert coloured(trace) == {
-        "line": {"color": "#0072b2"},
-        "fill": "rgba(0,114,178,0.15)",
-        "name": "v @ 2 m/s",
-    }
-    assert coloured(trace, dark=True)["line"] == {"color": "#56b4e9"}
 
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")

@@ -16,14 +16,9 @@ import pytest
 
 from cli import grounded
 from facts import holding
-from grounded.diagnosis.error_report import Credit
-from grounded_trials.report.bodies import body_in
 from grounded_trials.report.figures.paths import ended
-from grounded_trials.report.findings import Log
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.recording.recording import rate, write_recording
-from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from reported import car, cart, gathered, many_flights
@@ -31,7 +26,6 @@ from workspaces import make
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-rrb = pytest.importorskip("rerun.blueprint")
 RERUN = Path(sys.executable).with_name("rerun")
 needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")
 
@@ -100,30 +94,6 @@ def test_crashes_are_marked_where_and_when(car, tmp_path):
     assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
 
 
-def _origins(container):
-    """The origins of a blueprint's views, in order."""
-    parts = getattr(container, "contents", None)
-    if hasattr(container, "class_identifier"):
-        return [container.origin]
-    return [origin for part in parts or () for origin in _origins(part)]
-
-
-@pytest.mark.parametrize("logs", [False, True])
-def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
-    findings = gathered(cart)
-    causes = (Credit("calibration", 1.0),)
-    findings = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
-    if logs:
-        run = findings.runs[0]
-        findings = replace(findings, runs=(), logs=(Log(run.trial, run.residual),))
-    scene, body = scene_of(findings.task.model), body_in(findings)
-    root = blueprint(findings, Space(findings, scene, body)).root_container
-    shown = root
-    while shown.active_tab is not None or isinstance(shown, rrb.Tabs):
-        shown = shown.contents[shown.active_tab or 0]
-    assert _origins(shown)[:2] == ["/verdict", "/credit"]
-
-
 @needs_tool
 def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
     make(tmp_path / "p", "pendulum")
@@ -135,33 +105,6 @@ def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
     assert (
         "/paths/model_policy/body/link1 " in found and "/trials/t0001/predicted/body/link1" in found
     )
-
-
-@needs_tool
-def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
-    findings = gathered(cart)
-    parts = []
-    for run in findings.runs[:2]:
-        parts.append(tmp_path / f"{run.trial.id}.rrd")
-        write_recording(replace(findings, runs=(run,)), parts[-1])
-    whole = tmp_path / "whole.rrd"
-    done = _rerun("rrd", "merge", *parts, "-o", whole)
-    assert done.returncode == 0, done.stderr
-    assert _rerun("rrd", "verify", whole).returncode == 0
-    found = _entities(whole)
-    assert all(f"/trials/{run.trial.id}/state" in found for run in findings.runs[:2])
-    ids = {line for line in found.split() if line.startswith("recording_id")}
-    assert len(ids) <= 1
-
-
-@needs_tool
-def test_a_damaged_recording_is_noticed(cart, tmp_path):
-    path = tmp_path / "cart.rrd"
-    write_recording(gathered(cart), path)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    path.write_bytes(bytes(data[: len(data) // 2]))
-    assert _rerun("rrd", "verify", path).returncode != 0
 
 
 @pytest.mark.slow

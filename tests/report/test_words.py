@@ -1,20 +1,12 @@
 """Numbers and units as people read them."""
 
-import math
-from types import SimpleNamespace
-
-import numpy as np
 import pytest
 
 from grounded.result import measured, measured_alike
-from grounded_trials.report.findings import by_state
 from grounded_trials.wording import (
     count,
-    extent,
     glued,
     labelled,
-    moved,
-    or_zero,
     per_second,
     percent,
     ranges,
@@ -48,20 +40,6 @@ def test_the_unit_one_is_not_printed():
 )
 def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
     assert per_second(unit) == rate
-
-
-def test_what_rounding_left_of_zero_reads_zero():
-    assert extent(-1e-18, 0.3) == (0.0, 0.3) and extent(-0.3, 7e-17) == (-0.3, 0.0)
-    assert extent(-1e-18, 2e-18) == (-1e-18, 2e-18)  # small in itself, not beside anything
-    assert or_zero(1e-12, math.inf) == 1e-12 and math.isnan(or_zero(math.nan, 1.0))
-    assert moved(1.0, -7e-17, "m").startswith("1.00 -> 0 ")
-
-
-def test_an_error_that_is_rounding_noise_beside_its_row_is_zero():
-    errors = [np.array([0.3, 2e-17]), np.array([-1e-18, 3e-17])]
-    model = SimpleNamespace(states={"x": "m", "v": "m/s"}, n=2)
-    x, v = by_state(model, errors)
-    assert x[-1] == "0" != v[-1] and measured_alike([0.1, 2e-16], "m") == ["100 mm", "0 mm"]
 
 
 @pytest.mark.parametrize(

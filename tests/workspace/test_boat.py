@@ -10,7 +10,6 @@ from cli import grounded
 from facts import holding, holds
 from grounded import places
 from grounded.errors import GroundedError
-from grounded.search.returned.by_motion import exchanged
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.starting.shapes import Drive, path_target
@@ -110,16 +109,3 @@ def test_weights_of_a_target_before_roles_were_added_are_nobody_s_choice(w, chos
     assert (now.get("y") == 7.5) == chosen and (set(now) == {"x", "y", "psi", "u"}) != chosen
     told = " ".join(done.err.split())
     assert holds(told, "[reward] state is kept", "y = 7.500") == chosen
-
-
-@pytest.mark.parametrize("crossed", [False, True])
-@pytest.mark.parametrize("scale", [0.8, 1.0])
-def test_inputs_that_acted_in_each_other_s_place_are_told_by_the_motion(w, crossed, scale):
-    planner = w.planner
-    before = [driven(w, seed, scale=scale) for seed in (1, 2)]
-    found = exchanged(planner, driven(w, 3, crossed, scale), before)
-    assert (found is not None) == crossed
-    if found is not None:
-        assert found.inputs == ("left", "right") and found.shown == ("t0002", "t0003")
-        assert holds(found.said, "did with left what was sent as right", "times as well")
-    assert exchanged(planner, driven(w, 3, True, scale), [driven(w, 1, True, scale)]) is None
