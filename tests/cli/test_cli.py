@@ -211,31 +211,32 @@ def test_run_may_name_any_candidate_and_needs_one(w):
     assert wrong.code == 1 and holds(wrong.err, "'c0009'", "c0001")
 
 
-@pytest.mark.parametrize("form", ["json", "npz", "csv"])
-def test_export_holds_the_policy_with_units_and_time_base(w, tmp_path, form):
+def test_exports_hold_the_same_policy_with_units_and_time_base(w, tmp_path):
     step(w)
-    path = tmp_path / f"best.{form}"
-    done = grounded("-C", w, "export", "best", "--format", form, "-o", path, "--json")
-    assert done.json["file"] == str(path) and done.json["candidate"] == "c0001"
-    content = path.read_bytes()
-    assert b"kg" not in content  # units of states and inputs, not of parameters
-    if form == "npz":
-        run = load(path, states=("x", "v"), inputs=("force",))
-        assert run.policy.dt == 0.05 and run.policy.horizon == 40
-        with np.load(path) as data:
-            assert json.loads(str(data["units"])) == {"x": "m", "v": "m/s", "force": "N"}
-            assert str(data["time_unit"]) == "s"
-    elif form == "json":
-        data = json.loads(content)
-        assert (data["dt"], data["time_unit"], data["units"]["v"]) == (0.05, "s", "m/s")
-        assert np.shape(data["gain"]) == (40, 1, 3)
-    else:
-        head = [line for line in content.decode().splitlines() if line.startswith("#")]
-        assert any('"v": "m/s"' in line for line in head) and "# dt [s]: 0.05" in head
-        rows = list(
-            csv.DictReader(line for line in content.decode().splitlines() if line[0] != "#")
-        )
-        assert len(rows) == 40 and rows[1]["t"] == "0.05" and "gain.force.force[t-1]" in rows[0]
+    for form in ("json", "npz", "csv"):
+        path = tmp_path / f"c.{form}"
+        done = grounded("-C", w, "export", "best", "--format", form, "-o", path, "--json")
+        assert done.json["file"] == str(path) and done.json["candidate"] == "c0001"
+        assert b"kg" not in path.read_bytes()  # units of states and inputs, not of parameters
+    units = {"x": "m", "v": "m/s", "force": "N"}
+    made = load(tmp_path / "c.npz", states=("x", "v"), inputs=("force",)).policy
+    assert (made.dt, made.horizon) == (0.05, 40)
+    with np.load(tmp_path / "c.npz") as data:
+        assert json.loads(str(data["units"])) == units and str(data["time_unit"]) == "s"
+    data = json.loads((tmp_path / "c.json").read_text())
+    assert (data["dt"], data["time_unit"], data["units"]) == (0.05, "s", units)
+    for part in ("feedforward", "gain", "reference"):
+        np.testing.assert_array_equal(getattr(made, part), data[part])
+    lines = (tmp_path / "c.csv").read_text().splitlines()
+    assert "# dt [s]: 0.05" in lines and any('"v": "m/s"' in line for line in lines)
+    rows = list(csv.DictReader(line for line in lines if line[0] != "#"))
+    assert len(rows) == 40 and rows[1]["t"] == "0.05"
+    for name, values in (
+        ("feedforward.force", made.feedforward[:, 0]),
+        ("gain.force.force[t-1]", made.gain[:, 0, 2]),
+        ("reference.force[t-1]", made.reference[:, 2]),
+    ):
+        np.testing.assert_array_equal(values, [float(row[name]) for row in rows])
 
 
 def test_export_without_a_best_or_into_nowhere(w, tmp_path):
