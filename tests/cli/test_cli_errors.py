@@ -10,7 +10,6 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded_trials.store.trial_file import TrialWriter
 from workspaces import CONFIG, MODEL, make
 
 DART_LOG = """
@@ -153,7 +152,8 @@ def rewritten(trial, path, change):
     """The same trial with other arrays."""
     from dataclasses import replace
 
-    from grounded_trials.store.trial_file import read_trial, write_trial
+    from grounded.errors import GroundedError
+from grounded_trials.store.trial_file import read_trial, write_trial
 
     found, meta, policy = read_trial(trial)
     states, inputs = change(np.array(found.states), np.array(found.inputs))
@@ -424,7 +424,5 @@ def test_a_damaged_candidate_says_what_to_do(w, trial):
 def test_live_writing_refuses_to_overwrite(tmp_path):
     path = tmp_path / "t.mcap"
     TrialWriter(path, 0.1, {"x": "m"}, {"u": "1"}, {}).close()
-    from grounded.errors import GroundedError
-
     with pytest.raises(GroundedError, match="never overwritten"):
         TrialWriter(path, 0.1, {"x": "m"}, {"u": "1"}, {})

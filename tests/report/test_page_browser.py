@@ -17,7 +17,7 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
-from reported import car, cart, copied, gathered, many_flights
+from reported import car, cart, copied, gathered
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -103,24 +103,6 @@ def test_a_trial_is_switched_off_and_on(opened):
     assert chip in names and chip not in opened.run(visible)
     opened.click(other)
     assert opened.run(visible) == names
-
-
-def test_one_cursor_in_all_panels(opened, car):
-    opened.point("#states-1", 0.5, 0.5)
-    time.sleep(0.5)
-    t = float(opened.run("return document.documentElement.dataset.time"))
-    assert 0.5 < t < 2.5
-    for plot in ("states-0", "states-4", "error-1", "inputs-0"):
-        at = opened.run(
-            "const p = document.getElementById(arguments[0]), { xaxis } = p._fullLayout;"
-            "const mark = p.querySelector('.over');"
-            "return xaxis.p2l(parseFloat(mark.style.left) - xaxis._offset)",
-            plot,
-        )
-        assert at == pytest.approx(t, abs=0.01), plot
-    assert opened.run("return Number(document.getElementById('time').value)") == pytest.approx(
-        t, abs=0.05
-    )
 
 
 def test_the_slider_moves_the_run_along_its_path(opened, car):
@@ -296,24 +278,6 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
     assert window.errors() == []
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-def test_the_text_of_every_bar_is_in_its_panel(cart, tmp_path, window, width):
-    path = tmp_path / "page.html"
-    path.write_text(page(gathered(cart)))
-    window.resize(1400, 900)
-    window.open(path)
-    window.draw_all()
-    window.resize(width, 900)  # a drawn page whose window changes
-    time.sleep(1.0)
-    over = window.run(
-        "return [...document.querySelectorAll('.plot')].flatMap(p => {"
-        "const box = p.getBoundingClientRect();"
-        "return [...p.querySelectorAll('.barlayer text')].map(t => t.getBoundingClientRect())"
-        ".map(t => Math.max(t.right - box.right, box.left - t.left)); })"
-    )
-    assert len(over) > 5 and max(over) <= 0, (width, over)
-
-
 def test_hostile_names_run_nothing(cart, tmp_path, window):
     path = tmp_path / "page.html"
     path.write_text(page(hostile(cart)))
@@ -323,20 +287,6 @@ def test_hostile_names_run_nothing(cart, tmp_path, window):
     window.run("document.querySelectorAll('.plot').forEach(e => e.focus())")
     assert window.run("return window.hacked") is None
     assert window.errors() == []
-
-
-def test_tables_can_be_copied(opened):
-    opened.run(
-        "let text = ''; const area = () => document.querySelector('textarea').value;"
-        "document.execCommand = () => { text = area(); };"
-        "navigator.clipboard.writeText = () => Promise.reject();"
-        "window.copiedText = () => text;"
-    )
-    opened.click("button[data-copy=errors]")
-    copied_text = opened.run("return window.copiedText()")
-    rows = [line.split("\t") for line in copied_text.split("\n")]
-    assert rows[0][:2] == ["state", "unit"] and rows[1][:2] == ["delta", "rad"]
-    assert len({len(row) for row in rows}) == 1
 
 
 def test_a_watched_page_reloads_itself(cart, tmp_path, window):
@@ -353,18 +303,3 @@ def test_a_watched_page_reloads_itself(cart, tmp_path, window):
             break
     assert window.run("return document.documentElement.dataset.watched") != before
     assert window.errors() == []
-
-
-def test_the_first_figure_is_drawn_before_the_others_which_follow_unscrolled(tmp_path, window):
-    path = tmp_path / "page.html"
-    path.write_text(page(many_flights(3)))
-    window.resize(1400, 900)
-    window.open(path)
-    shown = "return [...document.querySelectorAll('.plot')].filter(p => p.offsetParent)"
-    counts = [window.run(f"{shown}.filter(p => p.drawn).length")]
-    for _ in range(100):
-        time.sleep(0.2)
-        counts.append(window.run(f"{shown}.filter(p => p.drawn).length"))
-        if counts[-1] == window.run(f"{shown}.length"):
-            break
-    assert counts[0] < counts[-1] == window.run(f"{shown}.length")

@@ -1,6 +1,5 @@
 """A boat with thrusters, as engineers wrote it: no roles at first, another dt, plugs exchanged."""
 
-import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -93,19 +92,3 @@ def test_a_heading_without_a_declared_angle_is_one_all_the_same(w, tmp_path):
     made = grounded("init", folder, "--from", log, "--model", tmp_path / "model.py", "--yes")
     told = " ".join((made.out + made.err).split())
     assert made.code == 0 and holds(told, "psi is an angle", 'angles=("psi",)')
-
-
-@pytest.mark.parametrize("chosen", [False, True])
-def test_weights_of_a_target_before_roles_were_added_are_nobody_s_choice(w, chosen):
-    toml = w.folder / "grounded.toml"
-    w.target({"x": 3 * T, "y": T, "u": T, "v": T / 9})
-    before = tomllib.loads(toml.read_text())["reward"]["state"]
-    if chosen:
-        toml.write_text(toml.read_text().replace(f"y = {before['y']:g}", "y = 7.5"))
-    file = w.folder / "model.py"
-    file.write_text(file.read_text().replace('angles=("psi",),', f'angles=("psi",), {ROLES},'))
-    done = grounded("-C", w.folder, "target", "circle", "--size", "1")
-    now = tomllib.loads(toml.read_text())["reward"]["state"]
-    assert (now.get("y") == 7.5) == chosen and (set(now) == {"x", "y", "psi", "u"}) != chosen
-    told = " ".join(done.err.split())
-    assert holds(told, "[reward] state is kept", "y = 7.500") == chosen

@@ -12,8 +12,7 @@ from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, plain
 from grounded_trials import Workspace
-from reported import cart, copied, diagnosed
-from workspaces import make
+from reported import cart, copied
 
 __all__ = ["cart"]
 
@@ -87,20 +86,6 @@ def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, option
     assert "<table>" in found._repr_html_()
 
 
-def test_what_was_changed_on_the_disk_is_seen_by_the_next_call(cart, tmp_path):
-    w = Workspace(copied(cart, tmp_path / "w"))
-    before = w.planner.plan.model.state_names
-    assert w.status().then == NextCommand("adopt", ("viscous_friction:v",))
-    done = w.adopt("viscous_friction:v")
-    assert [effect["name"] for effect in done.effects] == ["viscous_friction:v"]
-    assert w.config.model.effects and w.planner.plan.model.state_names == before
-    assert w.status().then.verb in ("propose", "diagnose")  # the diagnosis is of another model
-    diagnosed(w.folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
-    (w.folder / "grounded.toml").write_text("[model]\nfile = 3\n")
-    with pytest.raises(GroundedError, match=holding("[model]", "file")):
-        w.status()
-
-
 def test_one_reader_strict_or_telling_what_it_lost(cart, tmp_path):
     w = Workspace(copied(cart, tmp_path / "w"))
     whole = w.read()
@@ -121,17 +106,6 @@ def test_one_reader_strict_or_telling_what_it_lost(cart, tmp_path):
     assert np.array_equal(
         found.candidates[0].predicted_states, whole.candidates[0].predicted_states
     )
-
-
-def test_fit_says_how_its_values_are_written(tmp_path):
-    folder = make(tmp_path / "w").folder
-    w = Workspace(folder)
-    w.learn(2)
-    found = w.fit(["mass"])
-    assert found.then == NextCommand("fit", ("--params", "mass", "--apply")) and not found.applied
-    again = w.fit(["mass"], apply=True)
-    assert again.then == NextCommand("propose")
-    assert w.base_model.params["mass"].value == pytest.approx(again.fit.params["mass"].value)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ averaged two policies called c0002, one bit in diagnosis.json was adopted as 9.5
 """
 
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,11 +15,8 @@ from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import StudyStore, proven
-from grounded_trials.workspace.candidates.search_state import standing_in
-from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from reported import cart, copied
-from small_tasks import cart_task, rover_task
 from workspaces import CONFIG, make
 
 __all__ = ["cart"]
@@ -187,15 +183,6 @@ def test_a_hand_out_is_recorded_once(w):
     assert set(w.noted.handed) == {"c0001", "c0002", identity}
 
 
-def test_a_workspace_of_an_older_version_is_read_as_it_is(w):
-    before = standing_in(w).utilities
-    for note in w.store.folder.glob("n*.json"):
-        note.unlink()
-    w.forget()
-    assert standing_in(w).utilities == before and w.verify().damaged == ()
-    assert w.propose().candidate is not None
-
-
 def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):
     from grounded_trials.store.trial_file import read_trial, write_trial
 
@@ -204,14 +191,3 @@ def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):
     write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial", "task": meta["task"]})
     found = w.ingest(tmp_path / "bare.mcap")
     assert w.noted.ran.keys() == {found.sha256[:16]}
-
-
-def test_a_candidate_of_another_model_is_told_as_that():
-    rover, cart = rover_task(), cart_task()
-    made = SimpleNamespace(
-        policy=SimpleNamespace(
-            state_names=rover.model.state_names, input_names=rover.model.input_names
-        ),
-        predicted_states=[rover.start],
-    )
-    assert other_task(cart, made) == "a model with other states or inputs"
