@@ -2,10 +2,11 @@
 
 import json
 import shutil
+from importlib.util import find_spec
 
 import pytest
 
-from cli import grounded, process
+from cli import grounded
 from facts import holds
 from reported import cart, copied
 from workspaces import make
@@ -23,8 +24,13 @@ def test_learn_reaches_the_papers_figures_within_40_trials(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_demo_prints_utilities_trials_and_the_optimum(tmp_path):
-    done = process("demo", "pendulum", "--json", cwd=tmp_path)
+def test_demo_prints_utilities_trials_and_the_optimum(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    there = find_spec  # no recording without rerun
+    monkeypatch.setattr(
+        "grounded_cli.studies.demo.find_spec", lambda name: None if name == "rerun" else there(name)
+    )
+    done = grounded("demo", "pendulum", "--json")
     assert done.code == 0, done.err
     found = done.json
     assert {"workspace", "utilities", "verdict", "trials", "optimum"} <= set(found)
@@ -32,8 +38,9 @@ def test_demo_prints_utilities_trials_and_the_optimum(tmp_path):
     assert found["optimum"] >= found["utilities"][-1] - 1e-3 * abs(found["optimum"])
     folder = tmp_path / found["workspace"]
     assert (folder / "grounded.toml").is_file() and (folder / "reports").is_dir()
+    assert "rrd" not in found["paths"] and found["paths"]["html"]
     assert all((tmp_path / path).is_file() for path in found["paths"].values())
-    again = process("demo", "pendulum", cwd=tmp_path)
+    again = grounded("demo", "pendulum")
     assert again.code == 1 and holds(again.err, found["workspace"], "--dir")
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from grounded.figures.body import motion
 from grounded.model import Param
-from grounded.models import arm, buggy, cart_pole, lift, pendulum
-from grounded_trials.report.bodies import body_of, is_mechanism, reach
+from grounded.models import arm, cart_pole, lift, pendulum
+from grounded_trials.report.bodies import body_of, is_mechanism
 from grounded_trials.report.scene import scene_of
 
 
@@ -51,14 +51,6 @@ def test_links_hang_together(model):
     for (_, end), (start, _) in pairwise(ends):
         np.testing.assert_allclose(end, start, atol=1e-12)
     np.testing.assert_allclose(ends[-1][1], body.path(states), atol=1e-12)
-
-
-def test_a_mark_along_a_path_and_a_state_that_is_unknown():
-    body = _body(buggy.model)
-    assert not is_mechanism(body) and len(body.parts) == 1
-    states = np.zeros((3, 2))
-    states[1] = np.nan
-    assert len(reach(_body(pendulum.model), states)) == 4  # two tips, two joints
 
 
 @pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model, lift.model])
@@ -151,18 +143,3 @@ def test_a_mujoco_model_looks_as_its_file_says():
     assert seen is not None
     rod = seen.lines(0)[2][0]  # after the cart's two rings
     np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)
-
-
-def test_a_rope_is_thin_and_its_load_is_at_its_end():
-    params = {"L": Param(0.55, "m")}
-    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)}, params=params)
-    body, states = _body(crane), np.array([[0.3, 0.4, 0.0, 0.0]])
-    parts = {part.name: k for k, part in enumerate(body.parts)}
-    rope, load = (body.parts[parts[name]] for name in ("link1", "load"))
-    assert rope.size[0] < 0.005 and rope.size[1] == 0.55 and load.shape == "box"
-    poses = body.poses(states)
-    assert len(poses) == len(body.parts)
-    np.testing.assert_allclose(poses[parts["load"]][0], body.path(states))
-    (_, width), *_ = motion(body, states, 0.1).lines(0)
-    assert width == 2 * rope.size[0]
-    assert "load" not in [part.name for part in _body(cart_pole.model).parts]

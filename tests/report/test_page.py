@@ -13,13 +13,10 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
-from grounded.model import Param
-from grounded_trials.report.findings import improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.report.page.tables import UNKNOWN, parameter_table
+from grounded_trials.report.page.tables import UNKNOWN
 from grounded_trials.workspace.folder import Folder, Lost
-from grounded_trials.workspace.off_target import tracking_error
 from pace import slowness
 from page_browser import unpacked
 from reported import DIAGNOSIS, car, cart, gathered, many_flights
@@ -115,58 +112,12 @@ def test_the_panels_hold_the_numbers(cart):
     assert {t["meta"]["trial"] for t in ghosts} == {run.trial.id for run in findings.runs}
 
 
-def test_a_gain_at_the_end_is_said_first_and_the_terms_add_up(cart):
-    findings = gathered(cart)
-    reward = replace(findings.task.reward, terminal=np.array([1e4, 0.0]))
-    task = replace(findings.task, reward=reward)
-    runs = tuple(replace(r, utility=task.utility(r.trial)) for r in findings.runs)
-    findings = replace(findings, task=task, runs=runs)
-    first, best = findings.first, findings.best
-    assert first is not None and best is not None
-    found = improvements_in(findings)[0]
-    assert found.what.startswith("at the end: x")
-    off = tracking_error(task, first.trial)[-1, 0], tracking_error(task, best.trial)[-1, 0]
-    np.testing.assert_allclose((found.before, found.after), np.abs(off))
-    for run in (first, best):
-        assert sum(task.terms(run.trial).values()) == pytest.approx(run.utility)
-    rows, header = utility_terms(findings)
-    assert header[1:] == (first.candidate.id, best.candidate.id)
-    assert [row[0] for row in rows][1] == "states, at the end" and rows[-1][0] == "utility"
-    assert 'id="terms"' in page(findings)
-
-
-def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
-    findings = gathered(cart)
-    new = ("split", "whiteness")
-    where = {key: value for key, value in DIAGNOSIS["where"].items() if key not in new}
-    old = {k: v for k, v in DIAGNOSIS.items() if k not in ("utility_prediction", "lookalikes")}
-    text = page(replace(findings, diagnosis=Diagnosis.from_json(old | {"where": where})))
-    for words in (
-        "What the error is made of",
-        "a pattern in the rest",
-        "Look-alikes",
-        "predicted<",
-    ):
-        assert words not in text
-
-
 def test_commands_name_the_workspace_as_it_was_named(car):
     findings = replace(gathered(car), folder="my robot")
     text = unwrapped(page(findings))
     assert "<code>grounded diagnose" not in text
     assert text.count("grounded -C &#39;my robot&#39; diagnose") >= 2
     assert f"grounded -C &#39;my robot&#39; {findings.then.verb}" in text
-
-
-def test_a_parameter_without_bounds_is_a_constant(cart):
-    findings = gathered(cart)
-    model = findings.task.model
-    name, other = list(model.params)[:2]
-    params = {name: Param(1.0, "kg"), other: Param(1.0, "kg", std=0.1)}
-    task = findings.task.with_model(replace(model, params=dict(model.params) | params))
-    (block,) = parameter_table(replace(findings, task=task))
-    bounds = {row[0]: row[-1] for row in block.rows}
-    assert bounds[name] == "constant" and bounds[other] == "none"
 
 
 def test_page_is_the_same_every_time(cart):

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from grounded.diagnosis.report import Diagnosis
-from grounded_trials.report.calmed import WINDOWS, averaged, window_of
+from grounded_trials.report.calmed import WINDOWS
 from grounded_trials.report.figures.gap import (
     forecast_figures,
 )
 from grounded_trials.report.figures.runs import (
-    all_figures,
     bias_figure,
     error_figure,
     state_figure,
@@ -22,25 +21,10 @@ from grounded_trials.report.findings import ESTIMATED, Log
 from grounded_trials.report.page.causes import adopted, causes
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
-from grounded_trials.report.scene import reading_order
 from grounded_trials.report.settled import Settled
-from grounded_trials.workspace.off_target import tracked
 from reported import DIAGNOSIS, car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
-
-
-def test_charts_begin_with_the_position_and_what_has_a_target(car):
-    findings = gathered(car)
-    task, names = findings.task, findings.task.model.state_names
-    order = [names[i] for i in reading_order(task)]
-    wanted = [names[i] for i in tracked(task)]
-    assert sorted(order) == sorted(names) and order[:2] == ["x", "y"]
-    assert set(order[: len(wanted)]) == set(wanted) and list(names[:2]) != order[:2]
-    for figure in (state_figure(findings), bias_figure(findings), *forecast_figures(findings)):
-        assert [panel.title.split(" [")[0] for panel in figure.panels] == order, figure.name
-    drawn = [figure.name for figure in all_figures(findings)]
-    assert drawn.index("states") < drawn.index("inputs") < drawn.index("error")
 
 
 def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
@@ -57,18 +41,6 @@ def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
         assert curve.x[0] == pytest.approx(0.5 * (window - 1) * dt) and panel.note
         drawn = np.interp(curve.x, dt * np.arange(steps), course[:, 0] / dt)
         assert np.abs(curve.y - drawn).max() < 0.05 < np.ptp(noise) / dt
-
-
-def test_a_calm_bias_is_drawn_step_by_step(cart):
-    findings = gathered(cart)
-    for panel in bias_figure(findings).panels:
-        assert len(panel.curves[0].x) == len(findings.improvements[0].residual) and not panel.note
-    steady = np.full(300, 2.0) + np.random.default_rng(0).normal(0, 0.5, 300)
-    noise = np.random.default_rng(0).normal(0, 0.5, 300)
-    slow = np.sin(np.linspace(0, 20, 300))
-    assert window_of([steady]) == window_of([slow, 0.2 * noise]) == 1 < window_of([noise])
-    assert window_of([noise[:100]]) == window_of([np.full(300, np.nan)]) == window_of([]) == 1
-    np.testing.assert_allclose(averaged(np.arange(7.0), 3), [1.0, 4.0])
 
 
 @pytest.mark.parametrize(("logs", "states_first"), [(1, True), (24, False)])

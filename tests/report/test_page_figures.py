@@ -11,11 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facts import holding
-from grounded.diagnosis.error_report import Credit, RulerRow
-from grounded.diagnosis.pictures import accuracy_figure, credit_figure, worth_figure
-from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     COLOURS,
@@ -34,10 +29,8 @@ from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
-from grounded.search.pictures import search_figure
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.gap import residual_figures
 from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
@@ -184,60 +177,6 @@ def test_results_plot_what_the_page_shows(cart):
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
 
 
-def test_a_result_without_a_figure_says_so(cart):
-    nothing = replace(gathered(cart).standing, history=())
-    with pytest.raises(GroundedError, match=holding(type(nothing).__name__)):
-        nothing.plot()
-
-
-def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
-    row = RulerRow(
-        horizon_s=1.0,
-        held_out="trials",
-        unit_by_channel={"x": "m", "v": "m/s"},
-        crude={"x": 0.2, "v": 0.5},
-        calibrated={"x": 0.1, "v": 0.4},
-        with_effects={"x": 0.1, "v": 0.05},
-        noise_floor={"x": 0.05, "v": 0.04},
-    )
-    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
-    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
-    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
-    figure = credit_figure(found)
-    assert figure is not None
-    share, worth = figure.panels
-    assert [bar.label for bar in share.bars] == ["delay:u", "dead_zone:u"]
-    assert share.bars[0].value == 0.9
-    assert share.bars[0].text == "2.4 times"
-    assert worth.title == "v: error 1 s ahead"  # what predictions improved most
-    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
-    names = ["model before these causes", "with all causes", "all but delay:u"]
-    names += ["all but dead_zone:u", "noise alone"]
-    assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
-    alone = credit_figure(replace(found, credit=(late,)))  # without it, it is the model before
-    assert [bar.label for bar in alone.panels[1].bars] == [*names[:2], "noise alone"]
-    later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
-    settled = replace(found, credit=(), prediction_error=(later,))
-    (bars,) = worth_figure(settled, [(["v"], "v")]).panels
-    assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]
-    (x, v) = accuracy_figure(found).panels
-    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
-
-
-def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
-    findings = gathered(cart)
-    over, rest = residual_figures(findings)
-    velocity = next(panel for panel in over.panels if panel.title.startswith("v:"))
-    points, line = velocity.curves
-    assert points.style == "points" and line.name.startswith("added by the model")
-    run = findings.best
-    assert run is not None and run.explained is not None
-    added = (run.residual - run.explained)[:, 1] / findings.task.dt
-    assert added.min() <= line.y.min() <= line.y.max() <= added.max()
-    assert all(len(panel.bands) == 1 for panel in rest.panels)
-    assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
-
-
 def test_held_commands_are_drawn_as_steps(cart):
     findings = gathered(cart)
     (panel,) = input_figure(findings).panels
@@ -245,23 +184,6 @@ def test_held_commands_are_drawn_as_steps(cart):
         assert curve.style == "steps" and len(curve.y) == findings.task.horizon + 1
         assert curve.y[-1] == curve.y[-2]
     assert {t["line"]["shape"] for t in plotted(panel)["data"]} == {"hv"}
-
-
-def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
-    findings = many_flights(20)
-    now = findings.standing
-    last = replace(now.history[-1], trials=(), utilities=(), accepted=None)
-    waiting = replace(now, history=(*now.history[:-1], last), outstanding=last.candidate)
-    figure = search_figure(waiting)
-    steps = figure.panels[-1]
-    at, names = zip(*steps.x_ticks, strict=True)
-    assert len(names) <= 8 and names[0] == "c0001" and at[0] == 1.0
-    assert plotted(steps)["layout"]["xaxis"]["ticktext"] == list(names)
-    assert steps.dots[-1].role == "predicted" and steps.dots[-1].shape == "ring"
-    assert any("waiting" in key.name for key in figure.key)
-    expected = figure.panels[0].dots[-1]  # as the table has it
-    assert (expected.shape, expected.y) == ("dash", last.promised)
-    assert not any("waiting" in key.name for key in search_figure(now).key)
 
 
 # of linear RGB: how two kinds of colour blindness see it (Machado et al., 2009), and XYZ

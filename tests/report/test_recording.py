@@ -18,7 +18,7 @@ from cli import grounded
 from facts import holding
 from grounded_trials.report.figures.paths import ended
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.recording.recording import rate, write_recording
+from grounded_trials.report.recording.recording import write_recording
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from reported import car, cart, gathered, many_flights
@@ -39,6 +39,13 @@ def _entities(path: Path) -> str:
     return _rerun("rrd", "print", path).stdout
 
 
+ENTITIES = """
+/paths/model_policy /paths/best/body /paths/predicted /state/x/desired /state/x/best
+/input/force/low /bias/v/c0001 /bias/v/left_as_diagnosed /ahead/real/body /ahead/off/body
+/ahead/on/body /ahead/v/off /ahead/v/on /utilities /summary
+"""
+
+
 @needs_tool
 def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     path = tmp_path / "cart.rrd"
@@ -47,23 +54,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     done = _rerun("rrd", "verify", path)
     assert done.returncode == 0, done.stderr
     found = _entities(path)
-    for entity in (
-        "/paths/model_policy",
-        "/paths/best/body",
-        "/paths/predicted",
-        "/state/x/desired",
-        "/state/x/best",
-        "/input/force/low",
-        "/bias/v/c0001",
-        "/bias/v/left_as_diagnosed",
-        "/ahead/real/body",
-        "/ahead/off/body",
-        "/ahead/on/body",
-        "/ahead/v/off",
-        "/ahead/v/on",
-        "/utilities",
-        "/summary",
-    ):
+    for entity in ENTITIES.split():
         assert f"{entity} " in found, entity
     for run in findings.runs:
         for part in ("path", "predicted", "body", "state", "input", "bias", "explained"):
@@ -134,15 +125,6 @@ def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
 
     with pytest.raises(GroundedError, match=holding(tmp_path / "missing")):
         write_recording(gathered(cart), tmp_path / "missing" / "cart.rrd")
-
-
-def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
-    residual = np.random.default_rng(0).normal(size=(3000, 2))
-    rates, dt = rate(residual, 0.02, 1)
-    assert len(rates) <= 600 and dt == pytest.approx(0.1)
-    np.testing.assert_allclose(rates.mean(axis=0), residual.mean(axis=0) / 0.02)
-    same, dt = rate(residual[:100], 0.02)
-    np.testing.assert_array_equal(same, residual[:100] / 0.02)
 
 
 def _ended(command: list[str], log: Path, seconds: float) -> str:

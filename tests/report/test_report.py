@@ -15,11 +15,9 @@ from grounded_trials.report.findings import (
     prediction_error,
     rms,
 )
-from grounded_trials.store.documents import write_document
-from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error
-from reported import DIAGNOSIS, car, cart, copied, damage, gathered
+from reported import DIAGNOSIS, car, cart, copied, damage, gathered, stored
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -33,25 +31,6 @@ def test_text_fits_a_terminal_and_ends_with_the_next_command(cart, car):
         assert max(map(len, lines)) <= 80
         assert plain(done.out).split("\n")[-2] == f"next: grounded {command}"
         assert "\x1b" not in done.out
-
-
-def test_text_shows_the_ruler(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    row = {
-        "horizon_s": 1.0,
-        "unit_by_channel": {"v": "m/s"},
-        "crude": {"v": 0.31},
-        "calibrated": {"v": 0.12},
-        "with_effects": {"v": 0.08},
-        "noise_floor": {"v": None},
-    }
-    credit = [{"of": "viscous_friction:v", "share": 0.62, "times": 1.83}]
-    document = DIAGNOSIS | {"prediction_error": [row], "credit": credit}
-    write_document(folder / "reports" / "diagnosis.json", document)
-    lines = grounded("-C", folder, "report").out.splitlines()
-    (line,) = [x for x in lines if x.startswith("v, 1 s ahead")]
-    assert line.split()[4:] == ["0.310", "0.120", "0.0800", "-", "m/s"]
-    assert any("viscous_friction:v" in x and "+83 %" in x for x in lines)
 
 
 def test_json_holds_what_the_contract_says(cart):
@@ -140,12 +119,6 @@ def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     assert lost["file"] == "diagnosis.json" and lost["reason"]
 
 
-def added(w, trial, about, policy=None):
-    """Store a trial in a workspace."""
-    units = {"state_units": dict(w.base_model.states), "input_units": dict(w.base_model.inputs)}
-    w.store.add(trial_bytes(replace(trial, id=""), about, policy, start_ns=0, **units))
-
-
 @pytest.mark.extra("view")
 def test_the_first_trial_may_be_lost_and_a_short_one_is_shown_as_failed(cart, tmp_path):
     w = Folder(copied(cart, tmp_path / "w"))
@@ -154,7 +127,7 @@ def test_the_first_trial_may_be_lost_and_a_short_one_is_shown_as_failed(cart, tm
     states[7:] = np.nan
     short = replace(trial, states=states, inputs=trial.inputs[:10])
     about = {"kind": "trial", "task": w.task.hash}
-    added(w, short, about, w.candidate_bytes(short.candidate))
+    stored(w, short, about, w.candidate_bytes(short.candidate))
     assert "failed" in grounded("-C", w.folder, "report").out
     damage(w.folder, "trials/t0001-*")
     assert grounded("-C", w.folder, "report", "--html", "--rrd").code == 3
@@ -163,7 +136,7 @@ def test_the_first_trial_may_be_lost_and_a_short_one_is_shown_as_failed(cart, tm
 def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path):
     w = Folder(copied(cart, tmp_path / "w"))
     (tmp_path / "outside.mcap").write_bytes(w.candidate_bytes("c0001"))
-    added(w, replace(w.trials()[0].trial, candidate="../../outside"), {"kind": "trial"})
+    stored(w, replace(w.trials()[0].trial, candidate="../../outside"), {"kind": "trial"})
     before, after = (grounded("-C", f, "report", "--json").json for f in (cart, w.folder))
     assert after["utilities"] == before["utilities"]
 

@@ -24,6 +24,7 @@ from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
+from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.folder import Folder
 from workspaces import make
 
@@ -180,3 +181,9 @@ def many_flights(trials: int = 50) -> Findings:
 def diagnosed(folder: Path, **changes: Any) -> None:
     """Write the diagnosis of a workspace, with some of its parts changed."""
     write_document(folder / "reports" / "diagnosis.json", {**DIAGNOSIS, **changes})
+
+
+def stored(w: Folder, trial: Trial, about: dict[str, Any], policy: bytes | None = None) -> None:
+    """Store a trial in a workspace."""
+    units = {"state_units": dict(w.base_model.states), "input_units": dict(w.base_model.inputs)}
+    w.store.add(trial_bytes(replace(trial, id=""), about, policy, start_ns=0, **units))

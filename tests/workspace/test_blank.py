@@ -2,7 +2,6 @@
 
 import importlib.util
 import tomllib
-from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -84,29 +83,6 @@ def test_the_first_plan_says_what_the_task_leaves_open(sled):
     assert [("force" in one, "41 rows" in one) for one in notes[-2:]] == [(1, 0), (0, 1)]
 
 
-def rewarded(w):
-    return tomllib.loads((w.folder / "grounded.toml").read_text())["reward"]
-
-
-def test_a_target_renews_the_weight_on_changes_that_limits_give(sled):
-    sled.target({"x": np.linspace(0, 1, 41)})
-    assert rewarded(sled)["input_change"] == {"force": 0.01}  # no limits
-    edit(sled.folder, limits="force = [-45, 45]")
-    sled.target({"x": np.linspace(0, 1, 41)})
-    assert rewarded(sled)["input_change"] == {"force": 4.938e-06}
-    assert Workspace(sled.folder).task.reward.input_change[0] == 4.938e-06
-
-
-@pytest.mark.parametrize(
-    "chosen", [{"input_change": "{ force = 0.02 }"}, {"state": "{ x = 3.0, v = 1.0 }"}]
-)
-def test_a_weight_that_somebody_chose_stays(sled, chosen):
-    edit(sled.folder, limits="force = [-45, 45]", **chosen)
-    before = rewarded(sled)["input_change"]
-    sled.target({"x": np.linspace(0, 1, 41)})
-    assert rewarded(sled)["input_change"] == before
-
-
 HOVER = """from grounded import Model, Param
 
 def rate(s, a, p):
@@ -172,14 +148,6 @@ def test_a_friction_too_steep_for_a_step_is_followed_by_a_plan(sled):
     assert found[1] == pytest.approx(found[0], rel=0.1, abs=0.01)
 
 
-def test_a_target_is_read_once(sled, monkeypatch):
-    reads, read = [], sled.read_target.__wrapped__
-    monkeypatch.setattr(sled, "read_target", cache(lambda path: reads.append(path) or read(path)))
-    sled.propose()
-    assert len(reads) == 1 and sled.origin.horizon == sled.task.horizon
-    assert len(reads) == 1
-
-
 def test_a_workspace_in_a_folder_of_this_one_is_named(sled):
     done = grounded("-C", sled.folder.parent, "status")
     assert done.code == 1 and f"-C {sled.folder}" in done.err
@@ -209,11 +177,6 @@ def test_nothing_is_overwritten(sled):
     with pytest.raises(GroundedError, match="exists already"):
         Workspace.create(sled.folder, model=sled.folder / "model.py")
     assert (sled.folder / "drive.py").read_bytes() == before
-
-
-def test_a_blank_workspace_takes_the_control_interval(tmp_path):
-    made = blank(tmp_path / "w", MODEL, dt=0.02)
-    assert made.propose().candidate.policy.dt == made.config.task.dt == 0.02
 
 
 def test_a_model_that_needs_its_neighbours_leaves_nothing_behind(tmp_path):

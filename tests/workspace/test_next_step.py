@@ -10,7 +10,7 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded.diagnosis.report import Diagnosis, Made
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import MOST_EFFECTS
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
@@ -167,11 +167,6 @@ def test_a_damaged_diagnosis_is_made_again(w):
     assert following(w.folder) == "diagnose"
 
 
-def test_a_look_at_the_instruments_ends_with_what_is_next(w):
-    done = grounded("-C", w.folder, "diagnose", "--instruments")
-    assert last(done) == "grounded adopt viscous_friction:v"
-
-
 def test_gains_in_the_place_of_a_load_are_not_offered(w, monkeypatch):
     diagnosed(w.folder, **TWO)
     asked = []
@@ -180,15 +175,6 @@ def test_gains_in_the_place_of_a_load_are_not_offered(w, monkeypatch):
     )
     assert following(w.folder) == "export best --runner"
     assert asked and set(asked[0]) == set(BOTH["effects"])
-
-
-def test_numbers_found_beside_adopted_effects_are_adopted(w):
-    drag = {"name": "quadratic_drag:v", "k": 0.01}
-    set_in_model(w.config.file, params={}, effects=[drag])
-    made = {"trials": [], "adopted": [drag], "params": {}, "nominal": {"mass": 1.0}}
-    found = one_effect("parameter:mass", d=0.4)
-    diagnosed(w.folder, **found, diagnosed=made, **predicted(0.1))
-    assert following(w.folder) == "adopt parameter:mass"
 
 
 def test_what_is_listed_as_alike_was_not_fitted_and_another_diagnosis_fits_it(w):
@@ -339,14 +325,6 @@ def test_without_the_effects_of_its_diagnosis_a_model_is_diagnosed_before_it_pla
     diagnosed(w.folder, diagnosed=made)
     set_in_model(w.config.file, effects=[effect | {"k": 0.2}])
     assert following(w.folder) == "propose"
-
-
-def test_after_a_verdict_of_none_a_search_goes_on(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.learn(2)
-    found = Diagnosis.from_json({**DIAGNOSIS, "verdict": NONE, "next_trial": ""})
-    made = replace(Made(), params=dict(w.config.model.params))
-    assert after_diagnosis(w, replace(found, made=made)).verb == "propose"
 
 
 # after a search

@@ -51,18 +51,6 @@ def test_input_columns_of_the_target_are_what_inputs_are_compared_with(tmp_path)
     assert w.task.input_target.tolist() == [[1.0], [2.0]] and w.task.past.tolist() == [1.0]
 
 
-def test_a_longer_target_is_cut_and_may_start_at_any_time(tmp_path):
-    config = CONFIG.replace("horizon = 40", "horizon = 2")
-    rows = "".join(f"{7 + 0.05 * i:.2f},{i}\n" for i in range(9))
-    assert make(tmp_path / "a", config=config, target="t,x\n" + rows).task.target[
-        :, 0
-    ].tolist() == [
-        0,
-        1,
-        2,
-    ]
-
-
 def test_two_workspaces_in_one_process_have_their_own_models(tmp_path):
     from grounded_trials.workspace.candidates.running import simulated_plant
 

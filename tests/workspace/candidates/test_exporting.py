@@ -95,16 +95,6 @@ def test_a_csv_is_read_by_any_reader_that_skips_hashes(tmp_path):
     np.testing.assert_array_equal(gain, policy.gain)
 
 
-def test_the_same_candidate_is_the_same_file(tmp_path):
-    w = make(tmp_path / "w")
-    for form in ("json", "csv", "npz"):
-        path = exported(w, tmp_path, form)
-        first = path.read_bytes()
-        export_candidate(w, "c0001", form, path)
-        if form != "npz":  # a zip holds the time
-            assert path.read_bytes() == first
-
-
 def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     w = make(tmp_path / "w")
     (tmp_path / "robot").mkdir()

@@ -257,18 +257,6 @@ def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(ball):
     assert not told(ball, "leaves [safety]")
 
 
-def test_a_plan_that_stops_short_says_that_its_speed_weighs_as_much(ball):
-    drawn(ball, *LINE)
-    short = []
-    for speed in (0.1, 10.0, 1000.0):
-        edit(ball.folder, state=f"{{ x = 25, v = {speed} }}", terminal="{ }")
-        proposed = Workspace(ball.folder).propose()
-        short.append(proposed.off_target[0].end)
-        said = [note for note in proposed.proposal.notes if "x = 250" in note]
-        assert bool(said) == (speed == 1000.0)
-    assert short == sorted(short)
-
-
 def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_path):
     (tmp_path / "ball.py").write_text(BALL)
     t = np.arange(200) * 0.05

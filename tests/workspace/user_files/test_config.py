@@ -258,7 +258,7 @@ GOOD = tomllib.loads(CONFIG + LOG)
 
 @pytest.mark.slow
 @given(st.sampled_from(sorted(keys_of(GOOD))), VALUES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, value):
     from grounded_trials.workspace.user_files import config as module
 
@@ -277,7 +277,7 @@ def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, val
 
 
 @given(st.text(max_size=200))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
     folder = tmp_path_factory.getbasetemp() / "text"
     folder.mkdir(exist_ok=True)
