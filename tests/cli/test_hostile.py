@@ -58,8 +58,16 @@ def test_our_own_marks_colour_only_a_terminal() -> None:
     assert harmless(style("a"), coloured=True) == "\x1b[1ma\x1b[0m"
 
 
-@pytest.mark.parametrize("what", ["pipe", "device", "folder"])
-@pytest.mark.parametrize("name", ["grounded.toml", "target.csv", "model.py", "log.mcap"])
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        *((name, "pipe") for name in ("grounded.toml", "target.csv", "model.py", "log.mcap")),
+        ("target.csv", "device"),
+        ("log.mcap", "device"),
+        ("grounded.toml", "folder"),
+        ("model.py", "folder"),
+    ],
+)
 def test_what_is_no_file_is_refused_at_once(what: str, name: str, folder: Path) -> None:
     path = folder / name
     path.unlink(missing_ok=True)
@@ -184,8 +192,7 @@ def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
-    [["run", "c0001"], ["learn"], ["report", "--html"], ["init", "new"], ["fit"]],
+    "words", [["run", "c0001"], ["learn"], ["report", "--html"], ["init", "new"], ["fit"]]
 )
 def test_a_read_only_folder_is_one_sentence(words: list[str], folder: Path) -> None:
     limited = ["setpriv", "--bounding-set", "-dac_override"] if os.getuid() == 0 else []

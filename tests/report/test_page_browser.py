@@ -203,35 +203,6 @@ def test_a_pendulum_swings_as_its_states_say(window, swing):
     assert window.errors() == []
 
 
-def test_the_keyboard_reaches_every_control(window, swing):
-    window.resize(1400, 900)
-    window.open(swing[1])
-    window.draw_all()
-    controls = (
-        "[...document.querySelectorAll('a[href], button, input, select, summary, .plot')]"
-        ".filter(e => !e.disabled && e.getClientRects().length && !e.closest('.modebar'))"
-    )
-    total = window.run(
-        f"{controls}.forEach((e, k) => {{ e.dataset.k = k; }}); return {controls}.length"
-    )
-    window.run("document.activeElement.blur(); window.scrollTo(0, 0)")
-    reached = []
-    for _ in range(2 * total):
-        window.tab()
-        at = window.run(
-            "const e = document.activeElement, look = getComputedStyle(e);"
-            "const seen = look.outlineStyle !== 'none' && parseFloat(look.outlineWidth) > 0;"
-            "return [e === document.body, e.dataset.k, seen]"
-        )
-        if at[0]:
-            break
-        if at[1] is not None:  # else a table that scrolls
-            assert at[2], at  # one sees where the focus is
-            reached.append(int(at[1]))
-    assert reached == sorted(reached) and set(reached) == set(range(total))
-    assert total > 20
-
-
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])
 def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     window.resize(width, 900)

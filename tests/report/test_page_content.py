@@ -9,14 +9,8 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.calmed import WINDOWS
-from grounded_trials.report.figures.gap import (
-    forecast_figures,
-)
-from grounded_trials.report.figures.runs import (
-    bias_figure,
-    error_figure,
-    state_figure,
-)
+from grounded_trials.report.figures.gap import forecast_figures
+from grounded_trials.report.figures.runs import bias_figure, error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED, Log
 from grounded_trials.report.page.causes import adopted, causes
 from grounded_trials.report.page.page import page
@@ -78,18 +72,6 @@ def test_no_path_is_desired_of_a_state_without_a_weight(car):
     assert desired == {"x [m]", "y [m]"} and "v [m/s]" in {p.title for p in states.panels}
     assert not any(p.title.startswith(("v ", "psi ")) for p in errors.panels)
     assert not any(dot.role == "desired" for p in states.panels for dot in p.dots)
-
-
-def test_of_a_state_that_only_counts_at_the_end_the_end_is_desired(cart):
-    findings = weighed(gathered(cart), x=10.0)
-    reward = replace(findings.task.reward, terminal=np.array([0.0, 5.0]))
-    states = state_figure(replace(findings, task=replace(findings.task, reward=reward)))
-    assert states is not None
-    (v,) = (p for p in states.panels if p.title == "v [m/s]")
-    assert not any(c.role == "desired" for c in v.curves)
-    (dot,) = (d for d in v.dots if d.role == "desired")
-    assert dot.y == findings.task.target[-1, 1] and v.y_range[0] < dot.y < v.y_range[1]
-    assert dot.note in {key.name for key in states.key}
 
 
 def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):

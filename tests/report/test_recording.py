@@ -14,15 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import holding
 from grounded_trials.report.figures.paths import ended
-from grounded_trials.report.gathering import gather
 from grounded_trials.report.recording.recording import write_recording
-from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from reported import car, cart, gathered, many_flights
-from workspaces import make
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -83,19 +79,6 @@ def test_crashes_are_marked_where_and_when(car, tmp_path):
     assert f"/state/{names[0]}/ended_best " not in found
     write_recording(findings, path)
     assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
-
-
-@needs_tool
-def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
-    make(tmp_path / "p", "pendulum")
-    assert grounded("-C", tmp_path / "p", "learn", "--trials", 1).code == 0
-    path = tmp_path / "pendulum.rrd"
-    write_recording(gather(Folder(tmp_path / "p")), path)
-    assert _rerun("rrd", "verify", path).returncode == 0
-    found = _entities(path)
-    assert (
-        "/paths/model_policy/body/link1 " in found and "/trials/t0001/predicted/body/link1" in found
-    )
 
 
 @pytest.mark.slow

@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
-from grounded_trials.report.findings import (
-    prediction_error,
-    rms,
-)
+from grounded_trials.report.findings import prediction_error, rms
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error
 from reported import DIAGNOSIS, car, cart, copied, damage, gathered, stored

@@ -24,13 +24,7 @@ from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis
-from grounded_trials.workspace.next_step import (
-    DIAGNOSE,
-    EXPORT,
-    after_diagnosis,
-    to_adopt,
-    to_look_deeper,
-)
+from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis, to_look_deeper
 from grounded_trials.workspace.user_files.config import set_in_model
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied, diagnosed
@@ -189,18 +183,6 @@ def test_what_is_listed_as_alike_was_not_fitted_and_another_diagnosis_fits_it(w)
         assert refused.value.then == then
 
 
-def test_what_differs_between_two_robots_is_not_adopted(w):
-    value = {"value": 0.1, "std": 0.01}
-    one = {"effect": "parameter:m", "quantity": "m", "first": value, "second": value}
-    made = {"trials": ["t0001", "t0002"], "named": ["t0002"], "compared": ["t0001"]}
-    for changed, follows in (([one], True), ([], False)):
-        then = to_adopt(
-            w, Diagnosis.from_json({**DIAGNOSIS, "changed": changed, "diagnosed": made})
-        )
-        assert then is not None
-        assert (then == NextCommand("diagnose", ("--trials", "t0002"))) == follows
-
-
 # before and during a search
 
 
@@ -353,9 +335,7 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
 
     plainly = module.standing
     monkeypatch.setattr(
-        module,
-        "standing",
-        lambda *given, **more: replace(plainly(*given, **more), then=DIAGNOSE),
+        module, "standing", lambda *given, **more: replace(plainly(*given, **more), then=DIAGNOSE)
     )
     (w.reports / "diagnosis.json").unlink()
     assert w.status().then == DIAGNOSE

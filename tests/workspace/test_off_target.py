@@ -12,11 +12,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import (
-    off_target_of,
-    position_axes,
-    reaches,
-)
+from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches
 from reported import cart, copied
 
 __all__ = ["cart"]

@@ -60,8 +60,7 @@ def test_a_start_is_offered_only_to_a_robot_that_nothing_but_its_inputs_holds(ba
 
 
 @pytest.mark.parametrize(
-    ("stood", "beam", "told"),
-    [(0.6, 0.0, False), (0.1, 0.0, True), (0.6, B, True)],
+    ("stood", "beam", "told"), [(0.6, 0.0, False), (0.1, 0.0, True), (0.6, B, True)]
 )
 def test_no_start_is_offered_where_the_robot_stood_in_its_logs(ball, tmp_path, stood, beam, told):
     w = stored(ball, driven(stood, x=-0.1, beam=beam), tmp_path)
