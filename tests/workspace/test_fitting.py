@@ -13,10 +13,9 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis, usable_ids
-from reported import DIAGNOSIS
+from reported import diagnosed
 from workspaces import make
 
 DT = 0.05
@@ -64,34 +63,21 @@ def misled(tmp_path: Path) -> Workspace:
     return logs(tmp_path / "w", [1.4, 1.4, 1.4, 1.0] * 2)
 
 
-def claimed(
-    w: Workspace,
-    value: float = 1.2,
-    crude: float = 0.3,
-    after: float = 0.1,
-    named: Sequence[str] = (),
-) -> None:
-    """A diagnosis of today's trials and model that says what the mass should be."""
-    mass = {"value": value - 1.0, "std": 0.01, "interval": [value - 1.02, value - 0.98]}
+def claimed(w: Workspace, after: float = 0.1, named: Sequence[str] = ()) -> None:
+    """A diagnosis of today's trials and model that says that the mass should be 1.2 kg."""
+    mass = {"value": 0.2, "std": 0.01, "interval": [0.18, 0.22]}
     row = {"effect": "parameter:mass", "params": {"d": mass}, "claimed": True, "evidence": 40.0}
-    ruler = {
-        "horizon_s": 1.0,
-        "held_out": "trials",
-        "unit_by_channel": {"x": "m"},
-        "crude": {"x": crude},
-        "with_effects": {"x": after},
-    }
+    errors = {"crude": {"x": 0.3}, "with_effects": {"x": after}, "unit_by_channel": {"x": "m"}}
     made = {"trials": usable_ids(w), "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
-    made["named"] = list(named)
-    changes = {
-        "verdict": {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."},
-        "ranking": [row],
-        "parameters": {},
-        "prediction_error": [ruler],
-        "diagnosed": made,
-    }
     w.reports.mkdir(exist_ok=True)
-    write_document(w.reports / "diagnosis.json", {**DIAGNOSIS, **changes})
+    diagnosed(
+        w.folder,
+        verdict={"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."},
+        ranking=[row],
+        parameters={},
+        prediction_error=[{"horizon_s": 1.0, "held_out": "trials"} | errors],
+        diagnosed=made | {"named": list(named)},
+    )
 
 
 def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_path):

@@ -79,20 +79,6 @@ def test_a_diagnosis_says_how_many_names_it_takes():
         diagnose(model, [logged(model)])
 
 
-def test_steps_are_compiled_where_derivatives_are_too_many():
-    model = ring(100, 20)
-    assert model.system.how == "compiled steps" and "100 states" in model.system.note
-    trial = logged(model)
-    at = (trial.states[:-1], trial.inputs, model.values, 0.05)
-    slow = super(type(model.system).__mro__[1], model.system)
-    assert np.allclose(model.system.step(*at), slow.step(*at), rtol=0, atol=1e-12)
-    f_x, f_u = model.system.linearise(*at)
-    moved = np.array(trial.states[:-1])
-    moved[:, 7] += 1e-6
-    change = (model.system.step(moved, *at[1:]) - model.system.step(*at)) / 1e-6
-    assert np.allclose(change, f_x[:, :, 7], atol=1e-6) and f_u.shape == (60, 100, 20)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("n, m, how", [(10, 60, "step=step"), (100, 20, "derivative=rate")])
 def test_a_wide_model_gets_a_candidate(n, m, how, tmp_path):

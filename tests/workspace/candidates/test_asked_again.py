@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from grounded.errors import GroundedError
-from grounded.search.planner import predicted
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.remarks import initial_state
 from workspaces import make
 
 
@@ -64,27 +62,3 @@ def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
     write_trial(doubtful.unnamed, replace(doubtful.best, states=moved + 1e-6, candidate=""), {})
     with pytest.raises(GroundedError, match="none is waiting"):  # one run was asked for
         ingest_log(doubtful, doubtful.unnamed)
-
-
-def test_a_run_that_lost_by_its_start_is_asked_for_again(tmp_path, monkeypatch):
-    w = make(tmp_path / "w")
-    run_candidate(w, propose_in(w).candidate.id)
-    ingest_log(w, w.folder / "runs" / "c0001-1.mcap")
-    second = propose_in(w).candidate.id
-    ran, *_ = read_trial(run_candidate(w, second).trial_file)
-    planner = w.planner
-    policy = w.candidate(second)[0].policy
-    start = planner.plan.problem(exact=True).start + np.array([0.1, 0.0])
-    there = predicted(replace(planner.plan.problem(exact=True), start=start), policy).states
-    here = predicted(planner.plan.problem(exact=True), policy).states
-    write_trial(w.folder / "off.mcap", replace(ran, states=ran.states + there - here), {})
-    # no state alone spoils the run, or the scatter of runs is as large
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.0)
-    found = ingest_log(w, w.folder / "off.mcap", second)
-    assert (found.verdict, found.to_settle) == ("in doubt", second)
-    again = propose_in(w)
-    assert again.candidate.id == second and not again.proposal.is_new
-    write_trial(w.folder / "on.mcap", ran, {})
-    found = ingest_log(w, w.folder / "on.mcap", second)
-    # its mean is still lower, and it has its two runs: now the best one may have been lucky
-    assert found.verdict == "in doubt" and found.to_settle not in ("", second)
