@@ -308,3 +308,16 @@ def test_repeats_have_a_standard_error(tmp_path):
     done = grounded("-C", folder, "learn", "--trials", "9", "--json").json
     assert done["trials"] == 9 and len(done["history"][0]["trials"]) == 3
     assert done["history"][0]["standard_error"] > 0
+
+
+def test_propose_sets_a_promise_beside_what_was_measured(tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path / "w", "car-turn").folder)
+    for k in range(1, 4):
+        made = grounded("propose", "--json").json
+        shown = grounded("propose")
+        assert shown.code == 0 and f"{made['predicted_utility']:.4g}" in shown.out
+        assert max(map(len, shown.out.splitlines())) <= 80
+        if k > 1:  # the last prediction and what came of it
+            last = grounded("status", "--json").json["history"][-2]
+            assert f"{last['utility']:.4g}" in shown.out
+        assert grounded("learn", "--trials", 1).code == 0

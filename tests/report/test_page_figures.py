@@ -11,6 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grounded.diagnosis.error_report import Credit, RulerRow
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure, worth_figure
+from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     COLOURS,
@@ -254,3 +257,31 @@ def test_a_crash_is_marked_where_it_happened(car, ends):
         (mark,) = panel.dots
         (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
         assert mark.shape == "cross" and mark.y == off[19]
+
+
+def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
+    row = RulerRow(
+        horizon_s=1.0,
+        held_out="trials",
+        unit_by_channel={"x": "m", "v": "m/s"},
+        crude={"x": 0.2, "v": 0.5},
+        calibrated={"x": 0.1, "v": 0.4},
+        with_effects={"x": 0.1, "v": 0.05},
+        noise_floor={"x": 0.05, "v": 0.04},
+    )
+    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
+    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
+    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
+    share, worth = credit_figure(found).panels
+    assert [(bar.label, bar.value) for bar in share.bars] == [
+        ("delay:u", 0.9),
+        ("dead_zone:u", 0.1),
+    ]
+    assert worth.title.startswith("v")  # what predictions improved most
+    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
+    later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
+    settled = replace(found, credit=(), prediction_error=(later,))
+    (bars,) = worth_figure(settled, [(["v"], "v")]).panels
+    assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]
+    (x, v) = accuracy_figure(found).panels
+    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title

@@ -115,6 +115,9 @@ ADOPTIONS = {  # a diagnosis, what is then known only jointly, and what stays be
 def test_what_is_adopted_is_what_the_trials_tell(folder, case):
     changes, jointly, left = ADOPTIONS[case]
     w = written(folder, **changes)
+    shown = grounded("-C", folder, "adopt", FRICTION)
+    assert shown.code == 0 and all(f"{value:.4g}" in shown.err for value in left.values())
+    w.undo_adoption()
     done = w.adopt(FRICTION).to_json()
     assert (done["jointly"], done["left"]) == (jointly, left)
     assert done["params"] == ({} if left else {"mass": 1.4})
@@ -173,3 +176,11 @@ def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(folder):
     w.config.file.write_text(re.sub(r"k = 0\.3\b", "k = 0.7", text))
     settled = gather(Folder(folder)).settled
     assert settled is not None and not settled.gained
+
+
+@pytest.mark.parametrize("value", [0.05, -0.05])
+def test_a_sensor_s_bias_is_said_to_move_start_and_target(folder, value):
+    text = json.dumps(DIAGNOSIS).replace(FRICTION, "sensor_bias:v")
+    written(folder, **json.loads(text.replace('"k": {"value": 0.3', f'"b": {{"value": {value}')))
+    done = grounded("-C", folder, "adopt", "sensor_bias:v")
+    assert done.code == 0 and f"offset {-value:+}" in " ".join(done.err.split())

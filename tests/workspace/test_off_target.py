@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches
+from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches, traded
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -149,3 +150,19 @@ def test_propose_says_how_far_the_predicted_run_is_off(cart, tmp_path):
     told = next(one for one in proposed.off_target if one.what == "x")
     assert told.rms == pytest.approx(np.sqrt(np.mean(error**2))) and told.most == error.max() > 0
     assert proposed.to_json()["off_target"][0]["what"] == "x"
+
+
+def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
+    here = task(state=(1, 1, 0, 0))
+    rough = np.tile([[1.0, 0.0], [0.0, 1.0]], (H // 2, 1))
+
+    def tried(name, far, inputs):
+        states = off(far)
+        states[0] = 0.0  # all began at the start
+        trial = Trial(states, inputs, DT, ROVER.state_names, ROVER.input_names)
+        made = SimpleNamespace(id=name, predicted_states=np.zeros((H + 1, 4)))
+        return SimpleNamespace(candidate=made, trials=(trial,), utility=here.utility(trial))
+
+    before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
+    assert best.utility > before.utility and "c0002" in traded(here, best, before)
+    assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""
