@@ -59,7 +59,6 @@ def test_the_list_of_commands_is_in_the_order_of_use():
 
 
 def test_help_needs_no_numpy():
-    """`grounded --help` is quick: it imports no command and no array library."""
     code = (
         "import sys, atexit\nsys.argv = ['grounded', '--help']\n"
         "from grounded_cli.main import main\n"
@@ -97,15 +96,12 @@ def test_wrong_usage_is_exit_2(args, match):
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in HERE if n in ("propose", "run", "learn", "status", "fit", "verify")]
-)
+@pytest.mark.parametrize("name", ["propose", "run", "learn", "status", "fit", "verify"])
 def test_a_folder_that_is_no_workspace_is_exit_1(name, tmp_path):
     done = grounded("-C", tmp_path, name)
     assert done.code == 1 and not done.out
     assert done.err.startswith("error: ") and holds(done.err, tmp_path)
     assert done.err.endswith("\nnext: grounded init DIR --example car-turn\n")
-    assert done.err.count("\n") == 2
 
 
 def test_dash_c_works_before_and_after_the_command(w):
@@ -136,8 +132,7 @@ def test_init_lists_and_makes_workspaces(tmp_path):
         assert done.json["workspace"] == str(tmp_path / name)
         here = {p.name for p in (tmp_path / name).iterdir()}
         assert {"grounded.toml", "model.py", "target.csv", "trials", "candidates"} <= here
-    again = grounded("init", tmp_path / "pendulum", "--example", "pendulum")
-    assert again.code == 1 and "exists already" in again.err
+    assert grounded("init", tmp_path / "pendulum", "--example", "pendulum").code == 1
     wrong = grounded("init", tmp_path / "x", "--example", "car-trun")
     assert wrong.code == 1 and holds(wrong.err, "car-trun", "'car-turn'")
     assert not (tmp_path / "x").exists()
@@ -175,7 +170,6 @@ def test_propose_names_the_outstanding_candidate_again(w):
     again = grounded("-C", w, "propose", "--json")
     assert again.json["candidate"] == "c0001" and again.json["new"] is False
     assert Path(again.json["file"]).read_bytes() == content
-    assert "c0001" in grounded("-C", w, "propose").out
     Path(first.json["file"]).unlink()
     grounded("-C", w, "propose")
     assert Path(first.json["file"]).read_bytes() == content
@@ -188,8 +182,6 @@ def test_ingest_of_the_same_file_twice_is_a_success_that_names_the_trial(w):
     assert again.code == 0 and again.json["trials"][0]["known"] is True
     assert again.json["trials"][0]["trial"] == first["trials"][0]["trial"] == "t0001"
     assert sorted(p.name for p in (w / "trials").iterdir()) == before
-    said = grounded("-C", w, "ingest", run["trial_file"])
-    assert said.code == 0 and holds(said.out, Path(run["trial_file"]).name, "t0001")
 
 
 def test_learn_runs_to_the_end_and_says_what_is_next(w):
@@ -204,14 +196,9 @@ def test_learn_runs_to_the_end_and_says_what_is_next(w):
     ended = grounded("-C", w, "propose", "--json")
     assert ended.code == 0 and ended.json["candidate"] is None
     assert ended.json["phase"] == done["phase"] and ended.json["sentence"]
-    damping = [tried["damping"] for tried in status["history"]]
-    assert damping[:2] == [None, 1.0] and all(value > 0 for value in damping[1:])
     again = grounded("-C", w, "learn", "--json")
     assert again.json["trials"] == done["trials"] and again.code == 0
-    text = grounded("-C", w, "status")
-    assert re.search(r"^best +c000\d.*how much runs\s+scatter is not known", text.out, re.M)
-    assert "next:" in text.out
-    assert not text.err
+    assert not grounded("-C", w, "status").err
 
 
 def test_run_may_name_any_candidate_and_needs_one(w):
@@ -224,52 +211,32 @@ def test_run_may_name_any_candidate_and_needs_one(w):
     assert wrong.code == 1 and holds(wrong.err, "'c0009'", "c0001")
 
 
-@pytest.mark.parametrize("form", ["json", "npz", "csv"])
-def test_export_holds_the_policy_with_units_and_time_base(w, tmp_path, form):
-    step(w)
-    path = tmp_path / f"best.{form}"
-    done = grounded("-C", w, "export", "best", "--format", form, "-o", path, "--json")
-    assert done.json["file"] == str(path) and done.json["candidate"] == "c0001"
-    content = path.read_bytes()
-    assert b"kg" not in content  # units of states and inputs, not of parameters
-    if form == "npz":
-        run = load(path, states=("x", "v"), inputs=("force",))
-        assert run.policy.dt == 0.05 and run.policy.horizon == 40
-        with np.load(path) as data:
-            assert json.loads(str(data["units"])) == {"x": "m", "v": "m/s", "force": "N"}
-            assert str(data["time_unit"]) == "s"
-    elif form == "json":
-        data = json.loads(content)
-        assert (data["dt"], data["time_unit"], data["units"]["v"]) == (0.05, "s", "m/s")
-        assert np.shape(data["gain"]) == (40, 1, 3)
-    else:
-        head = [line for line in content.decode().splitlines() if line.startswith("#")]
-        assert any('"v": "m/s"' in line for line in head) and "# dt [s]: 0.05" in head
-        rows = list(
-            csv.DictReader(line for line in content.decode().splitlines() if line[0] != "#")
-        )
-        assert len(rows) == 40 and rows[1]["t"] == "0.05" and "gain.force.force[t-1]" in rows[0]
-
-
-def test_the_three_exports_say_the_same(w, tmp_path):
+def test_exports_hold_the_same_policy_with_units_and_time_base(w, tmp_path):
     step(w)
     for form in ("json", "npz", "csv"):
-        grounded("-C", w, "export", "c0001", "--format", form, "-o", tmp_path / f"c.{form}")
-    a = load(tmp_path / "c.npz").policy
-    b = json.loads((tmp_path / "c.json").read_text())
-    rows = list(
-        csv.DictReader(
-            line for line in (tmp_path / "c.csv").read_text().splitlines() if line[0] != "#"
-        )
-    )
-    np.testing.assert_array_equal(a.feedforward, b["feedforward"])
-    np.testing.assert_array_equal(a.gain, b["gain"])
-    np.testing.assert_array_equal(
-        a.feedforward[:, 0], [float(r["feedforward.force"]) for r in rows]
-    )
-    np.testing.assert_array_equal(
-        a.reference[:, 2], [float(r["reference.force[t-1]"]) for r in rows]
-    )
+        path = tmp_path / f"c.{form}"
+        done = grounded("-C", w, "export", "best", "--format", form, "-o", path, "--json")
+        assert done.json["file"] == str(path) and done.json["candidate"] == "c0001"
+        assert b"kg" not in path.read_bytes()  # units of states and inputs, not of parameters
+    units = {"x": "m", "v": "m/s", "force": "N"}
+    made = load(tmp_path / "c.npz", states=("x", "v"), inputs=("force",)).policy
+    assert (made.dt, made.horizon) == (0.05, 40)
+    with np.load(tmp_path / "c.npz") as data:
+        assert json.loads(str(data["units"])) == units and str(data["time_unit"]) == "s"
+    data = json.loads((tmp_path / "c.json").read_text())
+    assert (data["dt"], data["time_unit"], data["units"]) == (0.05, "s", units)
+    for part in ("feedforward", "gain", "reference"):
+        np.testing.assert_array_equal(getattr(made, part), data[part])
+    lines = (tmp_path / "c.csv").read_text().splitlines()
+    assert "# dt [s]: 0.05" in lines and any('"v": "m/s"' in line for line in lines)
+    rows = list(csv.DictReader(line for line in lines if line[0] != "#"))
+    assert len(rows) == 40 and rows[1]["t"] == "0.05"
+    for name, values in (
+        ("feedforward.force", made.feedforward[:, 0]),
+        ("gain.force.force[t-1]", made.gain[:, 0, 2]),
+        ("reference.force[t-1]", made.reference[:, 2]),
+    ):
+        np.testing.assert_array_equal(values, [float(row[name]) for row in rows])
 
 
 def test_export_without_a_best_or_into_nowhere(w, tmp_path):
@@ -293,8 +260,6 @@ def test_verify_names_what_is_damaged_and_fails(w):
     path.write_bytes(bytes(data))
     bad = grounded("-C", w, "verify", "--json")
     assert bad.code == 1 and [d["file"] for d in bad.json["damaged"]] == [str(path)]
-    said = grounded("-C", w, "verify")
-    assert "t0002" in said.err and "damaged" in said.out
     stopped = grounded("-C", w, "propose")
     assert stopped.code == 1 and "t0002" in stopped.err and "damaged" in stopped.err
     candidate = w / "candidates" / "c0001.mcap"
@@ -311,7 +276,7 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     assert found["params"]["mass"]["unit"] == "kg" and not found["applied"]
     text = (w / "grounded.toml").read_text()
     applied = grounded("-C", w, "fit", "--apply")
-    assert applied.code == 0 and "mass" in applied.out and "95 % interval" in applied.out
+    assert applied.code == 0 and "mass" in applied.out
     changed = (w / "grounded.toml").read_text()
     assert changed != text and "params = " in changed
     assert changed.split("[task]")[1] == text.split("[task]")[1]  # the rest is left alone
@@ -321,20 +286,6 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     assert set(only["params"]) == {"drag"}
     wrong = grounded("-C", w, "fit", "--params", "drg")
     assert wrong.code == 1 and holds(wrong.err, "drg", "'drag'")
-
-
-def test_fit_without_trials_says_so(w):
-    done = grounded("-C", w, "fit")
-    assert done.code == 1 and holds(done.err, "ingest", "--data")
-
-
-@pytest.mark.slow
-def test_narration_is_not_data(w):
-    """stdout of every --json command is one document and nothing else."""
-    for args in (["propose"], ["run"], ["status"], ["verify"], ["learn", "--trials", "1"]):
-        done = process("-C", w, *args, "--json")
-        assert done.code == 0 and isinstance(done.json, dict), done.err
-        assert "\r" not in done.out + done.err  # no progress bar in a pipe
 
 
 def test_a_closed_pipe_is_no_traceback(w):
@@ -349,7 +300,7 @@ def test_a_closed_pipe_is_no_traceback(w):
     assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
 
 
-def test_repeats_and_a_failed_run_in_words(tmp_path):
+def test_repeats_have_a_standard_error(tmp_path):
     noisy = (
         CONFIG.replace("[search]", "[search]\nrepeats = 3") + "noise = { process = { v = 0.02 } }\n"
     )
@@ -357,5 +308,16 @@ def test_repeats_and_a_failed_run_in_words(tmp_path):
     done = grounded("-C", folder, "learn", "--trials", "9", "--json").json
     assert done["trials"] == 9 and len(done["history"][0]["trials"]) == 3
     assert done["history"][0]["standard_error"] > 0
-    text = grounded("-C", folder, "status").out
-    assert "probability" in text and "certainty" in text
+
+
+def test_propose_sets_a_promise_beside_what_was_measured(tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path / "w", "car-turn").folder)
+    for k in range(1, 4):
+        made = grounded("propose", "--json").json
+        shown = grounded("propose")
+        assert shown.code == 0 and f"{made['predicted_utility']:.4g}" in shown.out
+        assert max(map(len, shown.out.splitlines())) <= 80
+        if k > 1:  # the last prediction and what came of it
+            last = grounded("status", "--json").json["history"][-2]
+            assert f"{last['utility']:.4g}" in shown.out
+        assert grounded("learn", "--trials", 1).code == 0

@@ -1,8 +1,6 @@
 """What goes wrong: one clear message, the right exit code, nothing stored, no traceback."""
 
-import struct
 import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -29,20 +27,15 @@ def stored(folder):
     return sorted(p.name for p in (folder / "trials").iterdir() if p.suffix == ".mcap")
 
 
-def refused(folder, *args, code=1, holds=()):
-    """A command that fails as it should; its message."""
+def refused(folder, *args, holds=()):
+    """A command fails with one message that names these, prints no document, stores nothing."""
     before = stored(folder)
-    done = grounded("-C", folder, *args)
-    assert done.code == code, done.err
-    assert "Traceback" not in done.err + done.out
-    message = [line for line in done.err.splitlines() if line.startswith("error: ")]
-    assert len(message) == 1, done.err
+    done = grounded("-C", folder, *args, "--json")
+    assert done.code == 1 and not done.out and "Traceback" not in done.err, done.err
+    assert len([line for line in done.err.splitlines() if line.startswith("error: ")]) == 1
     for part in holds:
         assert part in plain(done.err), done.err
     assert stored(folder) == before
-    json_ = grounded("-C", folder, *args, "--json")
-    assert json_.code == code and not json_.out  # a failure is no document
-    return done.err
 
 
 @pytest.fixture
@@ -57,22 +50,12 @@ def trial(w):
     return Path(grounded("-C", w, "run", "--json").json["trial_file"])
 
 
-def png(path):
-    def chunk(kind, data):
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    head = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
-    pixels = chunk(b"IDAT", zlib.compress(b"\0\0"))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + pixels + chunk(b"IEND", b""))
-
-
 # files that are no trial
 
 
 def test_files_that_are_no_log(w, tmp_path):
     (tmp_path / "empty.mcap").write_bytes(b"")
-    png(tmp_path / "photo.mcap")
+    (tmp_path / "photo.mcap").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(64)))
     (tmp_path / "notes.txt").write_text("it drove well")
     (tmp_path / "zeros.mcap").write_bytes(bytes(4096))
     (tmp_path / "folder").mkdir()
@@ -80,40 +63,22 @@ def test_files_that_are_no_log(w, tmp_path):
     for name in names:
         for how in ([], ["--data"]):
             refused(w, "ingest", tmp_path / name, *how, holds=[name])
-    assert "is empty" in refused(w, "ingest", tmp_path / "empty.mcap", "--data")
 
 
-def test_the_damaged_logs_of_the_shared_data(w, shared):
-    folder = shared / "mcap_format_fixtures" / "derived_corrupt"
-    files = sorted(folder.glob("*.mcap"))
-    assert len(files) == 6
-    for path in files:
-        message = refused(w, "ingest", path, "--data", holds=[path.name])
-        if path.stat().st_size > 100:
-            assert "recover" in message or "topic" in message, message
-
-
-def test_a_log_without_the_mapped_topic_names_those_it_has(w, shared):
-    log = next((shared / "crazyflie_p4_ros2_mcap").glob("**/*.mcap"))
-    refused(w, "ingest", log, "--data", holds=["/vicon/jetracer1", "topic"])
-
-
-def test_a_log_without_a_log_table_says_how_to_make_one(tmp_path, shared):
+def test_logs_of_the_shared_data_that_can_not_be_taken(w, tmp_path, shared):
+    damaged = sorted((shared / "mcap_format_fixtures" / "derived_corrupt").glob("*.mcap"))
+    assert len(damaged) == 6
+    for path in damaged:
+        refused(w, "ingest", path, "--data", holds=[path.name])
+    drone = next((shared / "crazyflie_p4_ros2_mcap").glob("**/*.mcap"))
+    refused(w, "ingest", drone, "--data", holds=["/vicon/jetracer1"])  # the topic that [log] names
+    car = next((shared / "dart_small_car").glob("*.mcap"))
+    refused(w, "ingest", car, holds=["--candidate ID", "--data"])  # it ran nothing
     folder = make(tmp_path / "plain").folder
-    log = next((shared / "dart_small_car").glob("*.mcap"))
-    refused(folder, "ingest", log, "--data", holds=["[log]", "next: grounded inspect"])
-
-
-def test_a_log_that_ran_nothing_needs_a_candidate_or_data(w, shared):
-    log = next((shared / "dart_small_car").glob("*.mcap"))
-    refused(w, "ingest", log, holds=["--candidate ID", "--data"])
+    refused(folder, "ingest", car, "--data", holds=["[log]", "next: grounded inspect"])
 
 
 # trials of ours, but not this workspace's
-
-
-def test_a_candidate_is_not_its_trial(w, trial):
-    refused(w, "ingest", w / "candidates" / "c0001.mcap", holds=["c0001.mcap", "candidate"])
 
 
 def test_cut_and_flipped_trials(w, trial, tmp_path):
@@ -122,7 +87,7 @@ def test_cut_and_flipped_trials(w, trial, tmp_path):
         (tmp_path / "cut.mcap").write_bytes(data[: int(part * len(data))])
         refused(w, "ingest", tmp_path / "cut.mcap", holds=["cut.mcap"])
     rng = np.random.default_rng(0)
-    for _ in range(25):
+    for _ in range(10):
         bad = bytearray(data)
         bad[rng.integers(len(data))] ^= 1 << rng.integers(8)
         (tmp_path / "bad.mcap").write_bytes(bytes(bad))
@@ -132,19 +97,22 @@ def test_cut_and_flipped_trials(w, trial, tmp_path):
     assert grounded("-C", w, "ingest", trial).code == 0  # the good one still is
 
 
-def test_a_trial_of_another_robot(w, trial, tmp_path):
+def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
+    refused(w, "ingest", w / "candidates" / "c0001.mcap", holds=["c0001.mcap", "candidate"])
+    refused(w, "ingest", trial, "--candidate", "c0002", holds=["c0002"])
+    refused(w, "ingest", trial, "--candidate", "c0001", "--data", holds=["--data"])
     other = make(tmp_path / "o", "pendulum").folder
-    refused(other, "ingest", trial, holds=["theta, omega", "another robot"])
-    refused(other, "ingest", trial, "--data", holds=["another robot"])
-
-
-def test_a_trial_of_another_clock_or_task(w, trial, tmp_path):
+    for more in ([], ["--data"]):
+        refused(other, "ingest", trial, *more, holds=["another robot"])
     half = CONFIG.replace("dt = 0.05", "dt = 0.025").replace("horizon = 40", "horizon = 20")
     rows = "\n".join(f"{0.025 * i:.3f},0.0" for i in range(21))
     slow = make(tmp_path / "slow", config=half, target="t,x\n" + rows + "\n").folder
-    refused(slow, "ingest", trial, holds=["every 0.05 s", "dt is 0.025 s"])
+    refused(slow, "ingest", trial, holds=["0.05 s", "dt", "0.025 s"])
     twin = make(tmp_path / "twin").folder
-    refused(twin, "ingest", trial, holds=["never proposed", "--data"])
+    refused(twin, "ingest", trial, holds=["--data"])  # it never proposed that
+    heavier = make(tmp_path / "heavier", model=MODEL.replace("Param(1.0", "Param(2.0")).folder
+    grounded("-C", heavier, "propose")
+    refused(heavier, "ingest", trial, holds=[trial.name, "c0001"])
     assert grounded("-C", twin, "ingest", trial, "--data").code == 0
     config = (w / "grounded.toml").read_text()
     (w / "grounded.toml").write_text(config.replace("x = 10.0", "x = 11.0"))
@@ -153,21 +121,7 @@ def test_a_trial_of_another_clock_or_task(w, trial, tmp_path):
     assert kept["candidate"] is None and kept["utility"] is None
 
 
-def test_a_candidate_of_the_same_name_from_another_workspace(w, trial, tmp_path):
-    twin = make(tmp_path / "twin", config=CONFIG + DART_LOG)
-    text = (twin.folder / "model.py").read_text()
-    (twin.folder / "model.py").write_text(text.replace("Param(1.0", "Param(2.0"))
-    grounded("-C", twin.folder, "propose")
-    refused(twin.folder, "ingest", trial, holds=[trial.name, "c0001"])
-
-
-def test_candidate_and_trial_must_agree(w, trial):
-    refused(w, "ingest", trial, "--candidate", "c0002", holds=["c0002"])
-    refused(w, "ingest", trial, "--candidate", "c0001", "--data", holds=["--data"])
-
-
 def test_one_bad_file_of_several(w, trial, tmp_path):
-    """What was stored before the bad one stays, and is said."""
     (tmp_path / "bad.mcap").write_bytes(b"")
     done = grounded("-C", w, "ingest", trial, tmp_path / "bad.mcap")
     assert done.code == 1 and "t0001" in done.out and "bad.mcap" in done.err
@@ -190,42 +144,27 @@ def rewritten(trial, path, change):
     return path
 
 
+def lost(k, of, values):
+    return np.where((np.arange(of) >= k)[:, None], np.nan, values)
+
+
+# what is done to states and inputs, and what the warning names; those before None failed
 RUNS = {
-    "short": (
-        lambda s, u: (s[:21], u[:20]),
-        ["all states are known for 20 of 40 steps", "counts as failed"],
-    ),
-    "nothing": (lambda s, u: (s[:1], u[:0]), ["ended after 0 of 40 steps"]),
-    "nan": (
-        lambda s, u: (np.where(np.arange(41)[:, None] >= 10, np.nan, s), u),
-        ["'x' is not a finite number at 0.50 s"],
-    ),
-    "nan at once": (
-        lambda s, u: (np.where(np.arange(41)[:, None] >= 0, np.nan, s), u),
-        ["'x' is not a finite number at 0.00 s"],
-    ),
-    "input lost": (
-        lambda s, u: (s, np.where(np.arange(40)[:, None] == 7, np.nan, u)),
-        ["'force' is not a finite number at 0.35 s"],
-    ),
+    "short": (lambda s, u: (s[:21], u[:20]), ["20", "40"]),
+    "nothing": (lambda s, u: (s[:1], u[:0]), ["0", "40"]),
+    "nan": (lambda s, u: (lost(10, 41, s), u), ["'x'", "0.50 s"]),
+    "nan at once": (lambda s, u: (lost(0, 41, s), u), ["'x'", "0.00 s"]),
+    "input lost": (lambda s, u: (s, lost(7, 40, u)), ["'force'", "0.35 s"]),
     "gap": (
         lambda s, u: (np.where((np.arange(41) // 5 == 2)[:, None], np.nan, s), u),
-        ["10 lost samples were interpolated", "0.25 s of 'x' at 0.50 s"],
+        ["10", "'x'", "0.50 s"],
     ),
-    "far start": (
-        lambda s, u: (s + np.array([0.5, 0.0]), u),
-        ["started with x = 0.5", "start is 0"],
-    ),
-    "beyond limits": (
-        lambda s, u: (s, u * 0 + 9.0),
-        ["force in the log is up to 4 outside its [limits]"],
-    ),
-    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["logged 1 step (50 ms) late"]),
-    "longer": (
-        lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])),
-        ["continues for 3 steps after the horizon of 40"],
-    ),
+    "far start": (lambda s, u: (s + np.array([0.5, 0.0]), u), ["x"]),
+    "beyond limits": (lambda s, u: (s, u * 0 + 9.0), ["force", "[limits]"]),
+    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["50 ms"]),
+    "longer": (lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])), ["3", "40"]),
 }
+FAILED = ("short", "nothing", "nan", "nan at once", "input lost")
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -236,56 +175,34 @@ def test_a_run_that_went_wrong_is_stored_with_a_warning_and_the_search_goes_on(w
     done = grounded("-C", w, "ingest", path, "--json", *named)
     assert done.code == 0, done.err
     (found,) = done.json["trials"]
-    text = " ".join(found["warnings"])
-    assert all(part in text for part in parts), text
-    failed = name in ("short", "nothing", "nan", "nan at once", "input lost")
+    assert holds(" ".join(found["warnings"]), *parts)
+    failed = name in FAILED
     assert found["failed"] == failed and (found["utility"] is None) == failed
     assert found["accepted"] == (not failed)
-    said = grounded("-C", w, "ingest", path)
-    assert said.code == 0 and all(part in " ".join(said.err.split()) for part in parts)
     following = grounded("-C", w, "propose", "--json")
     assert following.code == 0 and following.json["candidate"] == "c0002", following.err
-    assert grounded("-C", w, "status").code == 0
     assert grounded("-C", w, "learn", "--trials", "1").code == 0
-    assert grounded("-C", w, "fit", "--json").code in (0, 1)
 
 
 # model.py
 
 
-MODELS = {
-    "syntax": (MODEL.replace("return {", "return {{"), ["model.py line", "line 7"]),
-    "raises": (
-        MODEL + "\nraise RuntimeError('no battery')\n",
-        ["line 18", "RuntimeError: no battery"],
-    ),
+MODELS = {  # the text of model.py, and what the message names
+    "syntax": (MODEL.replace("return {", "return {{"), ["model.py", "7"]),
+    "raises": (MODEL + "\nraise RuntimeError('no battery')\n", ["18", "no battery"]),
     "exits": (MODEL + "\nimport sys; sys.exit(3)\n", ["SystemExit"]),
-    "no model": (MODEL.replace("model = Model", "car = Model"), ["rename 'car' to 'model'"]),
-    "nothing": ("x = 3\n", ["does not define `model = Model(...)`"]),
-    "not a model": ("model = {}\n", ["must be a grounded.Model, found dict"]),
-    "import": ("import no_such_module\n" + MODEL, ["No module named 'no_such_module'", "line 1"]),
-    "missing state": (MODEL.replace('"x": s.v, ', ""), ["model.py", "missing: x"]),
-    "extra state": (MODEL.replace('"x": s.v', '"x": s.v, "z": 0.0'), ["model.py", "'z'"]),
+    "import": ("import no_such_module\n" + MODEL, ["'no_such_module'", "1"]),
+    "missing state": (MODEL.replace('"x": s.v, ', ""), ["model.py", "x"]),
     "typo": (MODEL.replace('"x": s.v', '"xx": s.v'), ["model.py", "'xx'"]),
     "unknown state": (MODEL.replace('"x": s.v', '"x": s.w'), ["model.py", "'w'"]),
-    "unknown input": (MODEL.replace("a.force", "a.farce"), ["model.py", "farce", "force"]),
     "unknown param": (MODEL.replace("p.drag", "p.darg"), ["model.py", "darg", "drag"]),
     "wrong return": (MODEL.replace("return {", "return 3, {"), ["model.py", "dict"]),
-    "returns none": (MODEL.replace("return {", "{"), ["model.py", "None"]),
+    "returns none": (MODEL.replace("return {", "{"), ["model.py", "NoneType"]),
     "a text": (MODEL.replace('"x": s.v', '"x": "fast"'), ["model.py"]),
-    "a vector": (MODEL.replace('"x": s.v', '"x": np.zeros(3)'), ["model.py"]),
     "complex": (MODEL.replace('"x": s.v', '"x": 1j'), ["model.py"]),
-    "raises in the function": (
-        MODEL.replace("    return {", "    raise ValueError('no')\n    return {"),
-        ["model.py:7", "ValueError: no"],
-    ),
-    "wrong declaration": (MODEL.replace('"v": "m/s"}', '"v": "m/s", "mass": "kg"}'), ["twice"]),
-    "wrong args": (MODEL.replace("def dynamics(s, a, p)", "def dynamics(s, a)"), ["model.py"]),
-    "random": (
-        MODEL.replace('"x": s.v', '"x": s.v + np.random.normal()'),
-        ["model.py", "random numbers"],
-    ),
-    "empty": ("", ["does not define"]),
+    "in the function": (MODEL.replace("    return {", "    raise ValueError('no')\n    {"), ["no"]),
+    "declared twice": (MODEL.replace('"v": "m/s"}', '"v": "m/s", "mass": "kg"}'), ["mass"]),
+    "random": (MODEL.replace('"x": s.v', '"x": s.v + np.random.normal()'), ["model.py"]),
     "bytes": ("\x00\x01", ["model.py"]),
 }
 
@@ -298,15 +215,11 @@ def test_a_model_that_is_wrong_is_one_sentence_with_its_line(tmp_path, name):
     assert done.code == 1, done.out + done.err
     assert "Traceback" not in done.err and done.err.startswith("error: "), done.err
     assert done.err.strip().count("\n") == 0 and len(done.err) < 500, done.err
-    for part in parts:
-        assert part in done.err, done.err
+    assert holds(done.err, *parts), done.err
     assert not list((folder / "candidates").iterdir())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("rate", "why"), [("1 / 0", "model.py:7: ZeroDivisionError"), ("s.v * np.nan", "finite")]
-)
+@pytest.mark.parametrize(("rate", "why"), [("1 / 0", "ZeroDivision"), ("s.v * np.nan", "finite")])
 def test_a_model_without_numbers_proposes_nothing_and_says_why(tmp_path, rate, why):
     folder = make(tmp_path / "w", model=MODEL.replace('"x": s.v', f'"x": {rate}')).folder
     done = grounded("-C", folder, "propose")
@@ -315,33 +228,22 @@ def test_a_model_without_numbers_proposes_nothing_and_says_why(tmp_path, rate, w
     assert not list((folder / "candidates").iterdir())
 
 
-def test_a_warning_of_the_model_is_no_failure(tmp_path):
-    noisy = MODEL.replace("def dyn", "print('loading')\nimport warnings\n\n\ndef dyn")
-    folder = make(tmp_path / "w", model=noisy).folder
-    done = process("-C", folder, "propose", "--json")
-    assert done.code == 0
-    assert done.json["candidate"] == "c0001"  # what model.py prints is not data
-
-
 # target.csv
 
-TARGETS = {
-    "empty": ("", ["target.csv is empty"]),
-    "header": ("t,x\n", ["has no row below its header"]),
-    "no t": ("x,t\n0,0\n", ["first column must be 't', found 'x'"]),
-    "unknown": ("t,xx\n0,0\n", ["column 'xx' is neither a state nor an input", "mean 'x'"]),
-    "text": ("t,x\n0,fast\n", ["line 2: 'fast' in column 'x' is not a number"]),
-    "nan": ("t,x\n0,nan\n", ["line 2: nan in column 'x'"]),
-    "ragged": ("t,x\n0,0\n0.05\n", ["line 3: 1 values for 2 columns"]),
-    "short": ("t,x\n0,0\n0.05,0\n", ["has 2 rows", "needs 41", "horizon = 1"]),
-    "twice": ("t,x,x\n" + "".join(f"{0.05 * i},0,1\n" for i in range(41)), ["'x'", "two columns"]),
-    "only t": ("t\n" + "".join(f"{0.05 * i}\n" for i in range(41)), ["weighs state 'x'"]),
-    "grid": (
-        "t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)),
-        ["dt = 0.05 s, but", "0.04 s apart"],
-    ),
-    "semicolons": ("t;x\n0;0\n", ["found 't;x'"]),
-    "binary": ("\x00\x00", ["target.csv"]),
+GRID = "".join(f"{0.05 * i:.2f},0,1\n" for i in range(41))
+TARGETS = {  # the text of target.csv, and what the message names
+    "empty": ("", []),
+    "header": ("t,x\n", []),
+    "no t": ("x,t\n0,0\n", ["'t'", "'x'"]),
+    "unknown": ("t,xx\n0,0\n", ["'xx'", "'x'"]),
+    "text": ("t,x\n0,fast\n", ["line 2", "'fast'", "'x'"]),
+    "nan": ("t,x\n0,nan\n", ["line 2", "nan", "'x'"]),
+    "ragged": ("t,x\n0,0\n0.05\n", ["line 3"]),
+    "short": ("t,x\n0,0\n0.05,0\n", ["41", "horizon = 1"]),
+    "twice": ("t,x,x\n" + GRID, ["'x'"]),
+    "grid": ("t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)), ["dt = 0.05", "0.04 s"]),
+    "semicolons": ("t;x\n0;0\n", ["'t;x'"]),
+    "binary": ("\x00\x00", []),
 }
 
 
@@ -350,10 +252,8 @@ def test_a_target_that_is_wrong_names_line_and_column(tmp_path, name):
     text, parts = TARGETS[name]
     folder = make(tmp_path / "w", target=text).folder
     done = grounded("-C", folder, "propose")
-    assert (done.code == 1 and "target.csv" in done.err + text) or "weighs" in done.err
-    assert "Traceback" not in done.err
-    for part in parts:
-        assert part in done.err, done.err
+    assert done.code == 1 and "Traceback" not in done.err
+    assert holds(done.err, "target.csv", *parts), done.err
 
 
 def test_a_target_of_windows_and_excel_is_fine(tmp_path):
@@ -364,8 +264,7 @@ def test_a_target_of_windows_and_excel_is_fine(tmp_path):
 
 # [system]
 
-DRIVE = '''"""A user's own simulator: reads the candidate, drives, writes the trial."""
-import sys
+DRIVE = """import sys
 
 import numpy as np
 from grounded_trials.store.trial_file import TrialWriter
@@ -386,7 +285,7 @@ with TrialWriter(
         x = x + policy.dt * np.array([x[1], (u[0] - 0.5 * x[1]) / 1.4])
     trial.append(policy.horizon * policy.dt, x, None)
 print("drove", meta["id"])
-'''
+"""
 
 
 def with_command(tmp_path, command, drive=DRIVE):
@@ -406,49 +305,13 @@ def test_the_users_own_command_end_to_end(tmp_path):
     assert done.json["utilities"][-1] > done.json["utilities"][0]
 
 
-EXPORTED = '''"""The same with the exported file, as a robot without grounded_trials would."""
-import subprocess, sys
-from pathlib import Path
-
-import numpy as np
-from grounded_trials.store.trial_file import TrialWriter
-
-from grounded.policy import load
-
-name = Path(sys.argv[1]).stem
-subprocess.run([sys.executable, "-c", "from grounded_cli.main import main; main()", "export", name,
-                "--format", "npz", "-o", "c.npz"], check=True, stdout=2)
-runner = load("c.npz", states=("x", "v"), inputs=("force",))
-policy, x = runner.policy, np.zeros(2)
-with TrialWriter(sys.argv[2], policy.dt, {"x": "m", "v": "m/s"}, {"force": "N"}, {}) as trial:
-    k = 0
-    while not runner.done(k * policy.dt):
-        u = runner.action(k * policy.dt, x)
-        trial.append(k * policy.dt, x, u)
-        x = x + policy.dt * np.array([x[1], (u[0] - 0.5 * x[1]) / 1.4])
-        k += 1
-    trial.append(k * policy.dt, x, None)
-'''
-
-
-@pytest.mark.slow
-def test_an_exported_policy_drives_and_its_trial_is_the_outstanding_ones(tmp_path):
-    command = f"{sys.executable} drive.py {{candidate}} {{trial}}"
-    folder = with_command(tmp_path, command, EXPORTED)
-    done = process("learn", "--trials", "2", "--json", cwd=folder)
-    assert done.code == 0, done.err
-    assert [h["trials"] for h in done.json["history"]] == [["t0001"], ["t0002"]]
-
-
-COMMANDS = {
-    "fails": ("python3 -c 'import sys; sys.exit(7)' {candidate} {trial}", ["exit code 7"]),
-    "writes nothing": ("true {candidate} {trial}", ["wrote no trial"]),
-    "not there": ("no_such_program {candidate} {trial}", ["no_such_program", "can't be run"]),
-    "no {trial}": ("true {candidate}", ["must contain {trial}"]),
-    "no {candidate}": ("true {trial}", ["must contain {candidate}"]),
-    "unbalanced": ('true "{candidate} {trial}', ["[system] command", "quot"]),
-    "other braces": ("true {candidate} {trial} {speed} { }", ["wrote no trial"]),
-    "garbage": ("cp model.py {trial} {candidate}", ["exit code"]),
+COMMANDS = {  # [system] command, and what the message names
+    "fails": ("python3 -c 'import sys; sys.exit(7)' {candidate} {trial}", ["7"]),
+    "writes nothing": ("true {candidate} {trial} {speed} { }", ["trial"]),
+    "not there": ("no_such_program {candidate} {trial}", ["no_such_program"]),
+    "no {trial}": ("true {candidate}", ["{trial}"]),
+    "no {candidate}": ("true {trial}", ["{candidate}"]),
+    "unbalanced": ('true "{candidate} {trial}', ["[system] command"]),
 }
 
 
@@ -458,17 +321,16 @@ def test_a_command_that_does_not_work_is_one_sentence(tmp_path, name):
     config = CONFIG.replace('model = "real.py"', f"command = '''{command}'''")
     folder = make(tmp_path / "w", config=config).folder
     grounded("-C", folder, "propose")
-    done = process("-C", folder, "run")
+    done = grounded("-C", folder, "run")
     assert done.code == 1 and "Traceback" not in done.err, done.err
     message = done.err[done.err.index("error: ") :]
-    for part in parts:
-        assert part in message, done.err
+    assert all(part in message for part in parts), done.err
 
 
 def test_a_command_that_writes_garbage_stores_nothing(tmp_path):
     script = "import sys, pathlib; pathlib.Path(sys.argv[2]).write_text('it went well')\n"
     folder = with_command(tmp_path, f"{sys.executable} drive.py {{candidate}} {{trial}}", script)
-    done = process("-C", folder, "learn")
+    done = grounded("-C", folder, "learn")
     assert done.code == 1 and "Traceback" not in done.err and not stored(folder)
     assert list((folder / "runs").iterdir())  # what it wrote is kept
 
@@ -478,12 +340,10 @@ def test_without_a_system_the_message_says_what_to_do(tmp_path):
     folder = make(tmp_path / "w", config=config).folder
     grounded("-C", folder, "propose")
     done = grounded("-C", folder, "run")
-    assert done.code == 1 and "by hand" in done.err and "{candidate} {trial}" in done.err
-    assert "export c0001 --runner" in " ".join(plain(grounded("-C", folder, "status").out).split())
+    assert done.code == 1 and "{candidate} {trial}" in done.err
 
 
 def test_a_crash_of_the_users_drive_leaves_a_trial_that_says_how_far_it_came(tmp_path):
-    """The writer flushes each second; what was written before a crash is kept and can be used."""
     crash = DRIVE.replace("    for k in", "    for k in").replace(
         "        x = x +",
         "        if k == 30:\n            raise OSError('motor')\n        x = x +",
@@ -512,18 +372,6 @@ def test_strange_files_in_the_workspace_disturb_nothing(w, trial):
     done = grounded("-C", w, "propose", "--json")
     assert done.code == 0 and done.json["candidate"] == "c0002"
     assert grounded("-C", w, "status").code == 0
-
-
-def test_more_than_9999_candidates(w):
-    from grounded_trials.workspace.folder import Folder
-
-    grounded("-C", w, "propose")
-    data = (w / "candidates" / "c0001.mcap").read_bytes()
-    for name in ("c9999", "c10000"):
-        (w / "candidates" / f"{name}.mcap").write_bytes(data)
-    workspace = Folder(w)
-    assert workspace.candidate_ids() == ["c0001", "c9999", "c10000"]
-    assert workspace.next_id() == "c10001"
 
 
 def test_a_lost_candidate_file_is_taken_from_its_trial(w, trial):

@@ -14,12 +14,6 @@ def trial(gaps=(), T=60, dt=0.05):
     return Trial(states, np.zeros((T, 1)), dt, ("x", "v"), ("u",))
 
 
-def test_a_whole_trial_is_itself():
-    whole = trial()
-    found = interpolate_gaps(whole)
-    assert found.trial is whole and (found.samples, found.state) == (0, "")
-
-
 def test_short_gaps_are_straight_lines():
     found = interpolate_gaps(trial([(5, 9, 0), (30, 40, 1)]))
     np.testing.assert_allclose(found.trial.states[:, 0], trial().states[:, 0], atol=1e-12)

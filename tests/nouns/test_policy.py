@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ import pytest
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.onboard import Runner
-from grounded.plant import Plant
 from grounded.policy import Policy, load, to_arrays, z_difference
-from small_tasks import other, rover_task
 
 STATES, INPUTS = ("x", "psi"), ("speed", "turn")
 
@@ -66,17 +63,6 @@ def test_alpha_0_is_theta_alpha_1_is_the_other_and_a_half_is_between():
         np.testing.assert_allclose(mixed.gain, (1 - alpha) * a.gain + alpha * b.gain, atol=1e-15)
 
 
-def test_alpha_is_linear_in_theta_when_references_agree():
-    a = policy(seed=1)
-    b = replace(policy(seed=2), reference=a.reference)
-    for alpha in (0.0, 0.25, 0.5):
-        mixed = a.toward(b, alpha)
-        np.testing.assert_allclose(
-            mixed.feedforward, a.feedforward + alpha * (b.feedforward - a.feedforward), atol=1e-15
-        )
-        np.testing.assert_allclose(mixed.gain, a.gain + alpha * (b.gain - a.gain), atol=1e-15)
-
-
 def test_open_loop_policies_mix_their_inputs():
     a, b = policy(seed=1, feedback=False), policy(seed=2, feedback=False)
     half = a.toward(b, 0.5)
@@ -90,18 +76,6 @@ def test_a_policy_about_another_reference_is_the_same_policy():
     for t in range(10):
         z = a.reference[t] + 0.1
         np.testing.assert_allclose(law(moved, t, z), law(a, t, z), atol=1e-12)
-
-
-def test_references_a_full_turn_apart_are_the_same_reference():
-    a = policy(seed=1)
-    b = replace(a, reference=a.reference + 2 * np.pi * np.array([0, 1, 0, 0, 0]))
-    half = a.toward(b, 0.5)
-    np.testing.assert_allclose(half.feedforward, a.feedforward, atol=1e-12)
-
-
-def test_differences_wrap_only_where_they_are_angles():
-    d = z_difference(np.array([7.0, 7.0, 7.0]), np.zeros(3), (False, True))
-    np.testing.assert_allclose(d, [7.0, 7.0 - 2 * np.pi, 7.0])
 
 
 def test_mismatched_sizes_are_refused():
@@ -143,8 +117,6 @@ def test_the_controller_of_the_nearest_step_is_used():
 
 
 def test_called_at_the_rate_of_the_camera_it_sends_one_controller_a_step():
-    """Footnote 18: states come at 30 Hz, controllers are for 20 Hz; the last command of a step
-    counts as the one that was sent."""
     p = policy()
     run = Runner(p)
     for _ in range(3):
@@ -159,35 +131,6 @@ def test_missed_calls_held_the_last_input():
     sent = run.action(0.1, s)
     z = np.array([0.0, 0.0, sent[0], sent[1], sent[1]])  # steps 2 .. 4 held what was sent at 1
     np.testing.assert_allclose(run.action(0.5, s), law(p, 5, z), atol=1e-12)
-
-
-def test_a_late_first_call_held_the_past():
-    p = policy()
-    z = np.array([0.0, 0.0, p.past[0], p.past[1], p.past[1]])
-    np.testing.assert_allclose(Runner(p).action(0.4, np.zeros(2)), law(p, 4, z), atol=1e-12)
-
-
-def test_an_unfinite_state_switches_the_feedback_off_for_that_call():
-    p = policy()
-    run = Runner(p)
-    np.testing.assert_array_equal(run.action(0.0, [np.nan, 0.0]), p.feedforward[0])
-    np.testing.assert_array_equal(run.action(0.1, [0.0, np.nan]), p.feedforward[1])
-    assert run.blind == 2
-    u1 = p.feedforward[1]
-    z = np.array([0.0, 0.0, u1[0], u1[1], p.feedforward[0][1]])
-    np.testing.assert_allclose(run.action(0.2, np.zeros(2)), law(p, 2, z), atol=1e-12)
-    assert run.blind == 2
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("bad", [np.inf, -np.inf])
-@pytest.mark.parametrize("where", [0, 1])
-def test_an_infinite_state_is_blind_too(bad, where):
-    p = policy()
-    run, s = Runner(p), np.zeros(2)
-    s[where] = bad
-    np.testing.assert_array_equal(run.action(0.0, s), p.feedforward[0])
-    assert run.blind == 1
 
 
 def test_a_turn_more_changes_nothing():
@@ -210,7 +153,6 @@ def test_after_the_horizon_the_held_input_is_sent():
 
 @pytest.mark.parametrize("t", [0.949, 0.951, 0.989, 0.991, 1.05, 0.05, 0.15])
 def test_done_agrees_with_action(t):
-    """A loop `while not done(t)` never requests a step beyond the policy's last."""
     p = policy(feedback=False)
     run = Runner(p)
     over = np.array_equal(run.action(t, np.zeros(2)), p.past)
@@ -218,7 +160,6 @@ def test_done_agrees_with_action(t):
 
 
 def test_an_action_can_be_kept_and_changed_by_the_caller():
-    """A driver may modify the returned array without changing the policy or the past inputs."""
     p = policy()
     a, b = Runner(p), Runner(p)
     s = np.zeros(2)
@@ -230,13 +171,6 @@ def test_an_action_can_be_kept_and_changed_by_the_caller():
     after = b.action(9.0, s)
     after *= 0.5
     np.testing.assert_array_equal(b.action(9.0, s), p.past)
-
-
-def test_the_plant_runs_the_runner():
-    task = rover_task()
-    made = task.policy(np.full((60, 2), 0.3), np.zeros((60, 2, 5)), np.zeros((60, 5)))
-    trial = Plant(other(task.model)).run(made, {}, np.random.default_rng(0))
-    assert trial.steps == 60 and (trial.inputs == 0.3).all()
 
 
 # load
@@ -296,40 +230,29 @@ def test_nothing_in_a_file_is_executed(tmp_path):
     assert not (tmp_path / "boom").exists()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"feedforward": np.full((10, 2), np.nan)},
-        {"low": np.array([np.nan, 0.0])},
-        {"past": np.array([np.nan, 0.0])},
-        {"high": np.zeros(3)},
-        {"past": np.zeros(3)},
-        {"dt": np.array([0.1, 0.2])},
-        {"dt": 0.0},
-        {"dt": np.nan},
-        {"dt": "soon"},
-        {"depths": np.array([1])},
-        {"depths": np.array([0, -1])},
-        {"depths": np.array(["a", "b"])},
-        {"angles": np.array([True])},
-        {"feedforward": np.zeros(10)},
-        {"feedforward": np.array([["a", "b"]])},
-        {"feedforward": np.zeros((0, 2))},
-        {"state_names": np.array("x")},
-        {"gain": np.zeros((10, 2, 4))},
-        {"reference": None},
-        {"low": None},
-        {"format": "grounded-policy-2"},
-        {"low": np.array([60.0, 60.0])},
-    ],
-    ids=str,
-)
-def test_garbage_inside_is_one_sentence(tmp_path, change):
-    arrays = to_arrays(policy()) | change
+WRONG = {
+    "feedforward": [np.full((10, 2), np.nan), np.zeros(10), np.array([["a", "b"]])],
+    "low": [np.array([np.nan, 0.0]), np.array([60.0, 60.0]), None],
+    "high": [np.zeros(3)],
+    "past": [np.array([np.nan, 0.0]), np.zeros(3)],
+    "dt": [np.array([0.1, 0.2]), 0.0, np.nan, "soon"],
+    "depths": [np.array([1]), np.array([0, -1]), np.array(["a", "b"])],
+    "angles": [np.array([True])],
+    "state_names": [np.array("x")],
+    "gain": [np.zeros((10, 2, 4))],
+    "reference": [None],
+    "format": ["grounded-policy-2"],
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_garbage_inside_is_one_sentence(tmp_path, name):
     path = tmp_path / "c.npz"
-    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
-    with pytest.raises(GroundedError, match=r"c\.npz"):
-        load(path)
+    for value in WRONG[name]:
+        arrays = to_arrays(policy()) | {name: value}
+        np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+        with pytest.raises(GroundedError, match=r"c\.npz"):
+            load(path)
 
 
 def test_cut_and_flipped_files_are_refused_or_whole(tmp_path):
@@ -352,7 +275,6 @@ def test_cut_and_flipped_files_are_refused_or_whole(tmp_path):
 
 
 def test_the_robot_needs_numpy_alone(tmp_path):
-    """Importing the runner does not load the compiler, scipy or the log library."""
     path = saved(tmp_path, policy())
     code = (
         "import sys; from grounded.policy import load; import numpy as np\n"

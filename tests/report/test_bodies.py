@@ -10,8 +10,8 @@ import pytest
 
 from grounded.figures.body import motion
 from grounded.model import Param
-from grounded.models import arm, buggy, cart_pole, lift, pendulum
-from grounded_trials.report.bodies import body_of, is_mechanism, reach
+from grounded.models import arm, cart_pole, lift, pendulum
+from grounded_trials.report.bodies import body_of, is_mechanism
 from grounded_trials.report.scene import scene_of
 
 
@@ -51,14 +51,6 @@ def test_links_hang_together(model):
     for (_, end), (start, _) in pairwise(ends):
         np.testing.assert_allclose(end, start, atol=1e-12)
     np.testing.assert_allclose(ends[-1][1], body.path(states), atol=1e-12)
-
-
-def test_a_mark_along_a_path_and_a_state_that_is_unknown():
-    body = _body(buggy.model)
-    assert not is_mechanism(body) and len(body.parts) == 1
-    states = np.zeros((3, 2))
-    states[1] = np.nan
-    assert len(reach(_body(pendulum.model), states)) == 4  # two tips, two joints
 
 
 @pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model, lift.model])
@@ -103,7 +95,6 @@ def test_what_has_no_length_has_no_unit():
     ],
 )
 def test_a_link_is_as_long_as_the_model_says(params, lengths):
-    """A rope of L = 0.6 m was drawn 1 m long, and distances of its tip were given in m."""
     model = replace(pendulum.model, params=params)
     body = _body(model)
     assert body.unit == ("m" if lengths else "")
@@ -152,42 +143,3 @@ def test_a_mujoco_model_looks_as_its_file_says():
     assert seen is not None
     rod = seen.lines(0)[2][0]  # after the cart's two rings
     np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)
-
-
-def test_a_carriage_is_no_wider_than_its_way_and_what_hangs_from_it_is_no_tip():
-    """A crane's trolley was drawn 0.43 m wide beside 1.5 m of travel."""
-
-    def half(size):
-        return body_of(cart_pole.model, scene_of(cart_pole.model), size).parts[-1].size[0]
-
-    assert half(0.05) == pytest.approx(0.05) and half(0.05) < half(10.0) == half(20.0)
-    assert _body(cart_pole.model).watched == "the tip" == _body(pendulum.model).watched
-    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)})
-    assert "load" in _body(crane).watched
-
-
-def test_a_robot_on_wheels_is_watched_at_its_position_not_at_a_tip():
-    """A balancing robot's page showed the "Error of the tip", l above its axle."""
-    roles = {"rail": "x", "upright": ("theta",), "speed": "x_vel"}
-    body = _body(replace(cart_pole.model, roles=roles))
-    states = np.array([[0.3, 0.4, 0.0, 0.0], [0.5, -0.2, 0.0, 0.0]])
-    rail = cart_pole.model.state_names.index("x")
-    assert "tip" not in body.watched
-    np.testing.assert_allclose(body.path(states)[:, 0], states[:, rail])
-    assert not body.path(states)[:, 2].any() and reach(body, states)[:, 2].max() > 0.1
-
-
-def test_a_rope_is_thin_and_its_load_is_at_its_end():
-    """The rope of a crane of 0.55 m was a rod, 6.6 cm thick."""
-    params = {"L": Param(0.55, "m")}
-    crane = replace(cart_pole.model, roles={"rail": "x", "hanging": ("theta",)}, params=params)
-    body, states = _body(crane), np.array([[0.3, 0.4, 0.0, 0.0]])
-    parts = {part.name: k for k, part in enumerate(body.parts)}
-    rope, load = (body.parts[parts[name]] for name in ("link1", "load"))
-    assert rope.size[0] < 0.005 and rope.size[1] == 0.55 and load.shape == "box"
-    poses = body.poses(states)
-    assert len(poses) == len(body.parts)
-    np.testing.assert_allclose(poses[parts["load"]][0], body.path(states))
-    (_, width), *_ = motion(body, states, 0.1).lines(0)
-    assert width == 2 * rope.size[0]
-    assert "load" not in [part.name for part in _body(cart_pole.model).parts]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -42,17 +41,6 @@ def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(GroundedError, match=r"\.\[png\]"):
         png(Figure("utility", "Utility", "", ()))
-
-
-@pytest.mark.slow
-def test_the_demo_does_without_a_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr("grounded_cli.studies.demo.find_spec", lambda name: None)
-    monkeypatch.chdir(tmp_path)
-    done = grounded("demo", "pendulum", "--dir", "made")
-    assert done.code == 0 and "`grounded -C made run best`" in " ".join(done.out.split())
-    assert not any(line.split()[:1] in (["rrd"], ["html"]) for line in done.out.splitlines())
-    assert not [*Path("made").rglob("*.rrd"), *Path("made").rglob("*.html")]
-    assert "extra `view`" in done.err and "extra `report`" in done.err
 
 
 def test_what_is_there_is_imported():

@@ -8,7 +8,7 @@ import numpy as np
 
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
-from grounded_trials.report.forecast import anchored, forecast, forecast_error
+from grounded_trials.report.forecast import anchored, forecast_error
 from grounded_trials.workspace.adopted import planner_of
 from small_tasks import cart, cart_task
 
@@ -37,7 +37,6 @@ def test_a_late_log_is_not_taken_for_what_the_model_lacks():
 
 
 def test_a_forecast_starts_where_a_late_and_filtered_log_says_that_the_robot_was():
-    """With its lags adopted a ball seemed to be missed three times as far as without."""
     task = cart_task()
     effects = [
         {"name": "sensor_delay:x", "d": DELAY * task.dt},
@@ -51,19 +50,3 @@ def test_a_forecast_starts_where_a_late_and_filtered_log_says_that_the_robot_was
     noisy = replace(late, states=late.states + 1e-3 * np.random.default_rng(0).normal(size=(41, 2)))
     knows, plain = (forecast_error(planner_of(task, some), noisy) for some in (effects, []))
     assert (knows < 0.5 * plain).all() and (knows < 0.02).all()
-
-
-def test_without_memory_a_trial_stays_as_it_is():
-    planner, trial = planner_of(cart_task(), []), _logged(cart_task(), 0.2)
-    assert anchored(planner, trial) is trial
-
-
-def test_a_forecast_along_a_trial_ends_where_its_windows_end():
-    planner, trial = planner_of(cart_task(), []), _logged(cart_task(), 0.6)
-    found = forecast(planner, replace(trial, states=trial.states))
-    assert found is not None
-    along = found.along(trial)
-    np.testing.assert_array_equal(along[0], trial.states[0])
-    np.testing.assert_array_equal(along[20], found.states[0, -1])
-    np.testing.assert_array_equal(along[21], found.states[1, 1])
-    assert np.isfinite(along).all()

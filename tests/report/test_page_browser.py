@@ -17,7 +17,7 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
-from reported import car, cart, copied, many_flights
+from reported import car, cart, copied, gathered
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -37,7 +37,7 @@ def window():
 @pytest.fixture(scope="module")
 def car_page(car, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "page.html"
-    path.write_text(page(gather(Folder(car))))
+    path.write_text(page(gathered(car)))
     return path
 
 
@@ -91,15 +91,6 @@ def test_time_panels_zoom_together(opened):
     assert _range(opened, "states-3") == pytest.approx(home)
 
 
-def test_keys_zoom_where_the_focus_is(opened):
-    home = _range(opened, "states-1")
-    opened.key("states-1", "+")
-    low, high = _range(opened, "states-1")
-    assert high - low == pytest.approx((home[1] - home[0]) / 2)
-    opened.key("states-1", "ArrowRight")
-    assert _range(opened, "states-1")[0] > low
-
-
 def test_a_trial_is_switched_off_and_on(opened):
     visible = (
         "return document.getElementById('paths-0')._fullData.filter(t => t.visible === true)"
@@ -114,26 +105,8 @@ def test_a_trial_is_switched_off_and_on(opened):
     assert opened.run(visible) == names
 
 
-def test_one_cursor_in_all_panels(opened, car):
-    opened.point("#states-1", 0.5, 0.5)
-    time.sleep(0.5)
-    t = float(opened.run("return document.documentElement.dataset.time"))
-    assert 0.5 < t < 2.5
-    for plot in ("states-0", "states-4", "error-1", "inputs-0"):
-        at = opened.run(
-            "const p = document.getElementById(arguments[0]), { xaxis } = p._fullLayout;"
-            "const mark = p.querySelector('.over');"
-            "return xaxis.p2l(parseFloat(mark.style.left) - xaxis._offset)",
-            plot,
-        )
-        assert at == pytest.approx(t, abs=0.01), plot
-    assert opened.run("return Number(document.getElementById('time').value)") == pytest.approx(
-        t, abs=0.05
-    )
-
-
 def test_the_slider_moves_the_run_along_its_path(opened, car):
-    findings = gather(Folder(car))
+    findings = gathered(car)
     best = findings.best
     assert best is not None
     opened.run("document.getElementById('paths-0').scrollIntoView({block: 'center'})")
@@ -154,18 +127,6 @@ def test_the_slider_moves_the_run_along_its_path(opened, car):
         ("desired", findings.task.target),
     ):
         np.testing.assert_allclose(at[name], states[k, columns], atol=0.01, err_msg=name)
-
-
-def test_playing_moves_time_on(opened):
-    slider = "const at = document.getElementById('time'); at.value = 0;"
-    opened.run(f"{slider} at.dispatchEvent(new Event('input'))")
-    assert float(opened.run("return document.documentElement.dataset.time")) == 0
-    opened.click("#play")
-    time.sleep(0.6)
-    opened.click("#play")
-    t = float(opened.run("return document.documentElement.dataset.time"))
-    assert t > 0.1
-    assert float(opened.run("return document.documentElement.dataset.time")) == t  # it stands
 
 
 @pytest.fixture(scope="module")
@@ -242,35 +203,6 @@ def test_a_pendulum_swings_as_its_states_say(window, swing):
     assert window.errors() == []
 
 
-def test_the_keyboard_reaches_every_control(window, swing):
-    window.resize(1400, 900)
-    window.open(swing[1])
-    window.draw_all()
-    controls = (
-        "[...document.querySelectorAll('a[href], button, input, select, summary, .plot')]"
-        ".filter(e => !e.disabled && e.getClientRects().length && !e.closest('.modebar'))"
-    )
-    total = window.run(
-        f"{controls}.forEach((e, k) => {{ e.dataset.k = k; }}); return {controls}.length"
-    )
-    window.run("document.activeElement.blur(); window.scrollTo(0, 0)")
-    reached = []
-    for _ in range(2 * total):
-        window.tab()
-        at = window.run(
-            "const e = document.activeElement, look = getComputedStyle(e);"
-            "const seen = look.outlineStyle !== 'none' && parseFloat(look.outlineWidth) > 0;"
-            "return [e === document.body, e.dataset.k, seen]"
-        )
-        if at[0]:
-            break
-        if at[1] is not None:  # else a table that scrolls
-            assert at[2], at  # one sees where the focus is
-            reached.append(int(at[1]))
-    assert reached == sorted(reached) and set(reached) == set(range(total))
-    assert total > 20
-
-
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])
 def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     window.resize(width, 900)
@@ -297,22 +229,6 @@ def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     assert window.errors() == []
 
 
-def test_on_paper_a_short_table_is_whole_and_a_long_one_leaves_no_row_alone(window, car_page):
-    """A table of errors began at the foot of a page with one row."""
-    window.resize(1400, 900)
-    window.open(car_page)
-    window.devtools("Emulation.setEmulatedMedia", {"media": "print"})
-    said = window.run(
-        "const style = (s, of) => getComputedStyle(document.querySelector(s))[of];"
-        "return [style('#errors', 'breakInside'), style('#errors thead', 'breakAfter'),"
-        "style('#errors tbody tr', 'breakAfter'),"
-        "style('#errors tbody tr:last-child', 'breakBefore'),"
-        "style('.figure .key', 'breakInside'), style('.wide', 'overflowX')]"
-    )
-    window.devtools("Emulation.setEmulatedMedia", {"media": ""})
-    assert said == ["avoid"] * 5 + ["visible"]
-
-
 def test_print_shows_every_panel_in_light_colours(window, car_page):
     window.dark(True)
     window.resize(1400, 900)
@@ -333,25 +249,6 @@ def test_print_shows_every_panel_in_light_colours(window, car_page):
     assert window.errors() == []
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-def test_the_text_of_every_bar_is_in_its_panel(cart, tmp_path, window, width):
-    """`40 % of the time` behind a long bar was cut off at the panel's edge."""
-    path = tmp_path / "page.html"
-    path.write_text(page(gather(Folder(cart))))
-    window.resize(1400, 900)
-    window.open(path)
-    window.draw_all()
-    window.resize(width, 900)  # a drawn page whose window changes
-    time.sleep(1.0)
-    over = window.run(
-        "return [...document.querySelectorAll('.plot')].flatMap(p => {"
-        "const box = p.getBoundingClientRect();"
-        "return [...p.querySelectorAll('.barlayer text')].map(t => t.getBoundingClientRect())"
-        ".map(t => Math.max(t.right - box.right, box.left - t.left)); })"
-    )
-    assert len(over) > 5 and max(over) <= 0, (width, over)
-
-
 def test_hostile_names_run_nothing(cart, tmp_path, window):
     path = tmp_path / "page.html"
     path.write_text(page(hostile(cart)))
@@ -361,20 +258,6 @@ def test_hostile_names_run_nothing(cart, tmp_path, window):
     window.run("document.querySelectorAll('.plot').forEach(e => e.focus())")
     assert window.run("return window.hacked") is None
     assert window.errors() == []
-
-
-def test_tables_can_be_copied(opened):
-    opened.run(
-        "let text = ''; const area = () => document.querySelector('textarea').value;"
-        "document.execCommand = () => { text = area(); };"
-        "navigator.clipboard.writeText = () => Promise.reject();"
-        "window.copiedText = () => text;"
-    )
-    opened.click("button[data-copy=errors]")
-    copied_text = opened.run("return window.copiedText()")
-    rows = [line.split("\t") for line in copied_text.split("\n")]
-    assert rows[0][:2] == ["state", "unit"] and rows[1][:2] == ["delta", "rad"]
-    assert len({len(row) for row in rows}) == 1
 
 
 def test_a_watched_page_reloads_itself(cart, tmp_path, window):
@@ -390,30 +273,4 @@ def test_a_watched_page_reloads_itself(cart, tmp_path, window):
         if window.run("return document.documentElement.dataset.watched") != before:
             break
     assert window.run("return document.documentElement.dataset.watched") != before
-    assert window.errors() == []
-
-
-def test_the_first_figure_is_drawn_before_the_others_which_follow_unscrolled(tmp_path, window):
-    path = tmp_path / "page.html"
-    path.write_text(page(many_flights(3)))
-    window.resize(1400, 900)
-    window.open(path)
-    shown = "return [...document.querySelectorAll('.plot')].filter(p => p.offsetParent)"
-    counts = [window.run(f"{shown}.filter(p => p.drawn).length")]
-    for _ in range(100):
-        time.sleep(0.2)
-        counts.append(window.run(f"{shown}.filter(p => p.drawn).length"))
-        if counts[-1] == window.run(f"{shown}.length"):
-            break
-    assert counts[0] < counts[-1] == window.run(f"{shown}.length")
-
-
-def test_fifty_long_trials_open_at_once(tmp_path, window):
-    path = tmp_path / "page.html"
-    path.write_text(page(many_flights(50)))
-    assert path.stat().st_size < 4e6
-    window.resize(390, 900)
-    window.open(path)
-    window.draw_all()
-    assert window.run("return document.documentElement.scrollWidth") <= 390
     assert window.errors() == []

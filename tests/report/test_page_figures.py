@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -12,49 +11,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facts import holding
 from grounded.diagnosis.error_report import Credit, RulerRow
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, worth_figure
 from grounded.diagnosis.report import Diagnosis, Verdict
-from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     COLOURS,
     DASHES,
     STEPS,
-    Band,
-    Bar,
-    Bars,
     Curve,
-    Dot,
     Figure,
     Panel,
-    fitted,
     log_ticks,
     loss_ticks,
     rgb,
     thinned,
-    without_astray,
 )
-from grounded.figures.interactive import LONG, PAPER, coloured, in_lines, packed, plotted
+from grounded.figures.interactive import PAPER, plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
-from grounded.search.pictures import search_figure
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.gap import _binned, forecast_figures, residual_figures
-from grounded_trials.report.figures.paths import _level, path_figure
-from grounded_trials.report.figures.png import _bars, png
+from grounded_trials.report.figures.paths import path_figure
+from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
 from grounded_trials.report.forecast import forecast, forecast_error
-from grounded_trials.report.gathering import gather
 from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
-from grounded_trials.workspace.folder import Folder
-from page_browser import unpacked
-from reported import DIAGNOSIS, car, cart, many_flights
+from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -76,12 +62,6 @@ def test_thinning_keeps_ends_peaks_and_breaks(count, seed, broken):
     assert np.isnan(y).any() == np.isnan(y[kept]).any()
 
 
-def test_thinning_of_a_path_is_even():
-    t = np.linspace(0, 2 * np.pi, 3001)
-    kept = thinned(np.cos(t), np.sin(t), 300)
-    assert len(kept) == 300 and np.ptp(np.diff(kept)) <= 1
-
-
 def test_loss_axes_put_better_higher_and_space_by_ratio():
     curve = Curve(np.arange(3.0), np.array([-100.0, -10.0, -1.0]), "best", "b")
     panel = Panel("p", "x", "y", (curve,), loss=True)
@@ -92,49 +72,8 @@ def test_loss_axes_put_better_higher_and_space_by_ratio():
     assert plotted(panel)["layout"]["yaxis"]["ticktext"] == [f"{t:g}" for t in ticks]
 
 
-def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
-    dots = (
-        Dot(1.0, -50.0, "best", "a", error=60.0),
-        Dot(2.0, -2.0, "best", "b", error=7.0),
-        Dot(3.0, float("nan"), "model", "failed", "cross"),
-    )
-    panel = Panel("p", "x", "y", dots=dots, bands=(Band(-9.0, 5.0, "other", "n"),), loss=True)
-    known, failed = plotted(panel)["data"]
-    assert np.isfinite(known["y"]).all() and np.isfinite(known["error_y"]["array"]).all()
-    low, high = panel.ranges()[1]
-    assert failed["text"] == ["failed"] and low <= failed["y"][0] <= low + 0.1 * (high - low)
-
-
-def test_a_run_that_went_astray_does_not_flatten_the_others():
-    calm = np.sin(np.linspace(0, 6, 50))
-    wild = np.linspace(0, 1e6, 50)
-    low, high = fitted(without_astray([calm], [wild]))
-    assert low > -6 and high < 6
-
-
-@given(
-    st.floats(-1e6, 1e6), st.sampled_from([0.0, 1e-6, 1.0, 1e6]), st.sampled_from([0.0, 1.0, 1e5])
-)
-def test_packed_numbers_are_what_they_were_where_one_can_see_it(offset, span, outlier):
-    values = offset + span * np.linspace(0, 1, 50)
-    values[7] = np.inf
-    values[9] += outlier
-    back = unpacked(packed(values))
-    assert np.isnan(back[7])
-    inner = np.ptp(np.quantile(np.delete(values, 7), [0.02, 0.98]))
-    np.testing.assert_allclose(
-        np.delete(back, 7), np.delete(values, 7), atol=1e-3 * inner + 1e-9, rtol=1e-6
-    )
-
-
-def test_roles_become_colours_light_and_dark():
-    trace = {"line": {"color": "@best"}, "fill": "@best/0.15", "name": "v @ 2 m/s"}
-    assert coloured(trace) == {
-        "line": {"color": "#0072b2"},
-        "fill": "rgba(0,114,178,0.15)",
-        "name": "v @ 2 m/s",
-    }
-    assert coloured(trace, dark=True)["line"] == {"color": "#56b4e9"}
+FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
+FIGURES += ("accuracy", "gap", "forecast", "residual", "autocorrelation")
 
 
 @pytest.mark.slow
@@ -142,35 +81,21 @@ def test_roles_become_colours_light_and_dark():
 def test_pictures_are_drawn_in_their_colours(cart):
     from PIL import Image
 
-    figures = all_figures(gather(Folder(cart)))
-    assert [f.name for f in figures] == [
-        "utility",
-        "paths",
-        "states",
-        "inputs",
-        "error",
-        "bias",
-        "accuracy",
-        "gap",
-        "forecast",
-        "residual",
-        "autocorrelation",
-    ]
-    for figure in figures:
+    figures = all_figures(gathered(cart))
+    assert tuple(f.name for f in figures) == FIGURES
+    for figure in figures[:3]:
         image = Image.open(io.BytesIO(png(figure)))
         assert image.width >= 900 and image.height >= 300
-        counts = image.convert("RGB").getcolors(1 << 24)
-        assert counts is not None
-        colours = {colour for _, colour in counts}
-        assert (0, 114, 178) in colours or figure.name == "error", figure.name
+        colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 24) or ()}
+        assert (0, 114, 178) in colours, figure.name
 
 
 def test_scenes_of_car_aircraft_and_cart(cart, car):
-    plane = scene_of(gather(Folder(car)).task.model)
+    plane = scene_of(gathered(car).task.model)
     assert plane.names == ("x", "y") and plane.heading is not None and plane.spatial
     air = scene_of(many_flights(1).task.model)
     assert air.names == ("east", "north", "altitude") and air.map and len(air.attitude) == 3
-    assert not scene_of(gather(Folder(cart)).task.model).spatial
+    assert not scene_of(gathered(cart).task.model).spatial
 
 
 @pytest.mark.parametrize(
@@ -194,30 +119,6 @@ def test_a_position_along_one_axis_is_drawn_over_its_speed(roles, axes):
     assert "3D!grounded" not in foxglove_layout(model)["configById"]
 
 
-@pytest.mark.extra("png")
-def test_the_text_of_a_negative_bar_stays_clear_of_the_labels():
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Sheet
-
-    sheet = Sheet(figsize=(4.8, 2.0), dpi=100)
-    canvas, axes = FigureCanvasAgg(sheet), sheet.add_subplot()
-    _bars(
-        axes, Bars("evidence", tuple(Bar(f"{v:g}", v, f"{v:.3g}") for v in (444.9, -3.21))), most=2
-    )
-    canvas.draw()
-    edge = axes.get_window_extent().x0
-    assert all(text.get_window_extent().x0 > edge for text in axes.texts)
-
-
-@pytest.mark.slow
-def test_an_enlarged_path_that_leaves_the_frame_is_said(car):
-    figure = path_figure(gather(Folder(car)))
-    large = next(p for p in figure.panels if p.title.startswith("Deviations"))
-    cut = any(np.isnan(curve.x).any() for curve in large.curves)
-    assert cut == ("where they fit" in large.title)
-    assert cut or large.note  # or left out as a whole
-
-
 def test_rotations_are_right_handed_and_point_along_the_heading():
     task = many_flights(1).task
     scene = scene_of(task.model)
@@ -235,87 +136,35 @@ def test_rotations_are_right_handed_and_point_along_the_heading():
     assert scene.rotations(level)[0][2, 0] > 0.2
 
 
-def test_a_forecast_with_the_true_model_stays_on_the_trial():
+@pytest.fixture(scope="module")
+def swung():
+    """A pendulum's task and a run of the model itself."""
     task = pendulum_task(pendulum.model)
     policy, _ = first_policy(task)
     made = simulate(task.problem(exact=True), policy)
     names = (task.model.state_names, task.model.input_names)
-    trial = Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
+    return task, Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
+
+
+def test_a_forecast_with_the_true_model_stays_on_the_trial_and_others_part_from_it(swung):
+    task, trial = swung
     found = forecast(Planner(task, task), trial, 0.5)
-    assert found is not None
     real = trial.states[np.maximum(found.steps, 0)]
     np.testing.assert_allclose(found.states[found.steps >= 0], real[found.steps >= 0], atol=1e-9)
     assert forecast_error(Planner(task, task), trial).max() < 1e-9
     times, values = found.curve(0, task.dt)
     assert len(times) == len(values) and np.isnan(values).sum() >= len(found.steps)
-
-
-def test_a_forecast_of_a_wrong_model_parts_from_the_trial():
-    task = pendulum_task(pendulum.model)
-    policy, _ = first_policy(task)
-    made = simulate(task.problem(exact=True), policy)
-    names = (task.model.state_names, task.model.input_names)
-    trial = Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
     wrong = task.with_model(task.model.with_values({"m": 1.3}))
     short, long = (forecast_error(Planner(wrong, wrong), trial, s)[0] for s in (0.1, 1.0))
     assert 1e-6 < short < long
-
-
-def test_the_error_of_forecasts_is_taken_from_more_of_them_than_are_drawn():
-    """In a trial of 1.5 s one was drawn, whose end lay on the log by chance: an error of 0."""
-    task = pendulum_task(pendulum.model)
-    t = 0.02 * np.arange(76)
-    states = np.column_stack([np.where(np.abs(t - 1.0) < 1e-9, 0.0, 1.0), 0 * t])
-    names = (task.model.state_names, task.model.input_names)
-    trial = Trial(states, np.zeros((75, 1)), 0.02, *names)
-    few = forecast(Planner(task, task), trial)
-    many = forecast(Planner(task, task), trial, every=1)
-    assert [int((f.steps[:, -1] >= 0).sum()) for f in (few, many)] == [1, 26]
-    ends = task.model.difference(many.states[:26, -1], states[50:])
-    expected = np.sqrt(np.mean(ends**2, axis=0))
-    np.testing.assert_allclose(forecast_error(Planner(task, task), trial), expected)
-
-
-def test_forecasts_go_no_farther_than_the_diagnosis_could_judge():
-    """Of a robot that falls without its feedback no model tells where it is after a second."""
-    findings = many_flights(2)
-    titles = [figure.title for figure in forecast_figures(findings)]
-    assert findings.ahead_s == 1.0 and all("every 1 s" in title for title in titles)
-    rows = (RulerRow(0.1), RulerRow(0.5), RulerRow(1.0, drowned=True))
-    fallen = replace(findings, diagnosis=Diagnosis(Verdict("none"), prediction_error=rows))
-    titles = [figure.title for figure in forecast_figures(fallen)]
-    assert fallen.ahead_s == 0.5 and all("every 0.5 s" in title for title in titles)
-    assert titles
-
-
-def test_a_forecast_of_a_trial_without_steps_is_none():
-    task = pendulum_task(pendulum.model)
-    names = (task.model.state_names, task.model.input_names)
-    trial = Trial(np.full((3, 2), np.nan), np.zeros((2, 1)), task.dt, *names)
-    assert forecast(Planner(task, task), trial) is None
-    assert np.isnan(forecast_error(Planner(task, task), trial)).all()
-
-
-def test_what_is_cut_off_is_marked(cart):
-    findings = gather(Folder(cart))
-    first = findings.first
-    assert first is not None
-    whole = error_figure(findings)
-    assert whole is not None and not any("cut off" in panel.note for panel in whole.panels)
-    states = first.trial.states.copy()
-    states[20, 0] = findings.task.target[20, 0] - 490.0
-    wild = replace(first, trial=replace(first.trial, states=states))
-    runs = tuple(wild if run is first else run for run in findings.runs)
-    cut = error_figure(replace(findings, runs=runs))
-    assert cut is not None
-    panel = cut.panels[0]
-    assert panel.note == "model’s policy is cut off: it reaches −490"
-    assert panel.y_range[0] > -490
+    lost = replace(trial, states=np.full((3, 2), np.nan), inputs=np.zeros((2, 1)))
+    assert forecast(Planner(task, task), lost) is None
+    assert np.isnan(forecast_error(Planner(task, task), lost)).all()
 
 
 @pytest.mark.extra("notebook")
 def test_results_plot_what_the_page_shows(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     assert findings.diagnosis is not None and findings.best is not None
     for result, titles in (
         (findings.diagnosis, ("Prediction error 1 s ahead", "Share of the gap by channel")),
@@ -331,148 +180,8 @@ def test_results_plot_what_the_page_shows(cart):
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
 
 
-def test_steps_show_their_damping_where_none_was_shortened(cart):
-    now = gather(Folder(cart)).standing
-    damped = [replace(t, candidate=replace(t.candidate, alpha=1.0)) for t in now.history]
-    for history, name in ((now.history, "log₂ α"), (damped, "log₁₀ damping")):
-        if name == "log₂ α":
-            last = history[-1]
-            history = (*history[:-1], replace(last, candidate=replace(last.candidate, alpha=0.5)))
-        panel = replace(now, history=tuple(history)).figures()[0].panels[-1]
-        assert panel.y_name == name
-        assert all(panel.y_range[0] < dot.y < panel.y_range[1] for dot in panel.dots)
-
-
-def test_a_result_without_a_figure_says_so(cart):
-    nothing = replace(gather(Folder(cart)).standing, history=())
-    with pytest.raises(GroundedError, match=holding(type(nothing).__name__)):
-        nothing.plot()
-
-
-def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
-    channels = {"x": "m", "v": "m/s"}
-    row = RulerRow(
-        horizon_s=1.0,
-        held_out="trials",
-        unit_by_channel=channels,
-        crude={"x": 0.2, "v": 0.5},
-        calibrated={"x": 0.1, "v": 0.4},
-        with_effects={"x": 0.1, "v": 0.05},
-        noise_floor={"x": 0.05, "v": 0.04},
-    )
-    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
-    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
-    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
-    figure = credit_figure(found)
-    assert figure is not None
-    share, worth = figure.panels
-    assert [bar.label for bar in share.bars] == ["delay:u", "dead_zone:u"]
-    assert share.bars[0].value == 0.9
-    assert share.bars[0].text == "2.4 times"
-    assert worth.title == "v: error 1 s ahead"  # what predictions improved most
-    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
-    names = ["model before these causes", "with all causes", "all but delay:u"]
-    names += ["all but dead_zone:u", "noise alone"]
-    assert [bar.label for bar in worth.bars] == names and worth.bars[2].text == "0.40 m/s"
-    assert "except one" in figure.caption and "offset" not in figure.caption
-    assert "shorter" not in figure.caption
-    needless = replace(dry, without_it={"x": 0.09, "v": 0.04})  # better without it than with all
-    assert "shorter" in credit_figure(replace(found, credit=(late, needless))).caption
-    worse = replace(late, without_it={"x": 0.15, "v": 0.6})
-    figure = credit_figure(replace(found, credit=(worse, dry)))  # longer than the model's
-    assert "offset each other" in figure.caption
-    alone = credit_figure(replace(found, credit=(late,)))  # without it, it is the model before
-    assert [bar.label for bar in alone.panels[1].bars] == [*names[:2], "noise alone"]
-    assert not alone.caption
-    later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
-    settled = replace(found, credit=(), prediction_error=(later,))
-    (bars,) = worth_figure(settled, [(["v"], "v")]).panels  # was `1.2 mm` twice, without 142 mm
-    assert [bar.label for bar in bars.bars] == [
-        "model.py, nothing adopted",
-        "model with what was adopted",
-        "noise alone",
-    ]
-    assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]
-    (x, v) = accuracy_figure(found).panels
-    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
-
-
-def test_a_state_that_was_never_measured_and_a_horizon_that_noise_fills_have_no_bars():
-    """An empty chart, `- rad/s`; and bars of equal length where noise alone is all that shows."""
-    lost = math.nan
-    row = RulerRow(
-        1.0,
-        unit_by_channel={"x": "m", "v": "m/s"},
-        crude={"x": 0.3, "v": lost},
-        with_effects={"x": 0.1, "v": lost},
-    )
-    credit = (Credit("delay:u", 0.6, {"x": 0.2, "v": lost}),)
-    found = Diagnosis(Verdict("effect"), prediction_error=(row,), credit=credit)
-    figure = worth_figure(found, [(["v"], "v")])
-    assert figure is not None and [p.title.partition(":")[0] for p in figure.panels] == ["x"]
-    assert [p.title for p in credit_figure(found, 2).panels[1:]] == ["x: error 1 s ahead"]
-    short = replace(row, horizon_s=0.5)
-    drowned = replace(found, prediction_error=(short, replace(row, drowned=True)))
-    assert worth_figure(drowned, [(["x"], "x")]) is None
-    assert len(credit_figure(drowned).panels) == 1
-
-
-def test_a_cause_is_drawn_where_it_shows():
-    """Both bars shown were shorter without a claimed cause, and no word said why it is claimed."""
-    credit = (
-        Credit("delay:u", 0.6, {"x": 0.2, "v": 0.3}),
-        Credit("gain:u", 0.2, {"x": 0.09, "v": 0.4}),
-    )
-    hidden = Credit("drag:v", 0.1, {"x": 0.1, "v": 0.3})
-    now = {"x": 0.1, "v": 0.3}
-    row = RulerRow(
-        1.0, unit_by_channel={"x": "m", "v": "m/s"}, crude={"x": 0.3, "v": 0.5}, with_effects=now
-    )
-    found = Diagnosis(Verdict("several"), prediction_error=(row,), credit=(*credit, hidden))
-    figure = worth_figure(found, [(["x"], "x")])
-    assert figure is not None
-    assert [panel.title.partition(":")[0] for panel in figure.panels] == ["x", "v"]
-    assert "drag:v" in figure.caption and "gain:u" not in figure.caption
-
-
-def test_a_mean_of_two_trials_is_no_trial(cart):
-    """Of a candidate that was run twice the page said that the diagnosis never saw it."""
-    findings = gather(Folder(cart))
-    best = findings.runs_of(findings.best.candidate.id)[-1]
-    again = replace(best, trial=replace(best.trial, id="t0099", states=best.trial.states + 1e-3))
-    seen = {"trials": [*(r.trial.id for r in findings.runs), "t0099"], "adopted": []}
-    diagnosis = Diagnosis.from_json(DIAGNOSIS | {"diagnosed": seen})
-    twice = replace(findings, runs=(*findings.runs, again), diagnosis=diagnosis)
-    figure = forecast_figures(twice)[0]
-    assert "t0099" in figure.title and "used this trial" in figure.caption
-    np.testing.assert_array_equal(figure.panels[0].curves[0].y, again.trial.states[:, 0])
-
-
-def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
-    findings = gather(Folder(cart))
-    over, rest = residual_figures(findings)
-    velocity = next(panel for panel in over.panels if panel.title.startswith("v:"))
-    points, line = velocity.curves
-    assert points.style == "points" and line.name.startswith("added by the model")
-    run = findings.best
-    assert run is not None and run.explained is not None
-    added = (run.residual - run.explained)[:, 1] / findings.task.dt
-    assert added.min() <= line.y.min() <= line.y.max() <= added.max()
-    assert all(len(panel.bands) == 1 for panel in rest.panels)
-    assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
-
-
-def test_a_line_of_means_goes_from_the_least_to_the_largest():
-    x = np.concatenate([np.linspace(0.0, 1.0, 80), [2.0, 6.3]])
-    at, mean = _binned(x, 2 * x)
-    assert at[0] < 0.1 and at[-1] == 6.3 and (np.diff(at) > 0).all()
-    np.testing.assert_allclose(mean, 2 * at)
-    at, mean = _binned(np.ones(9), np.arange(9.0))
-    assert at.tolist() == [1.0] and mean.tolist() == [4.0]
-
-
 def test_held_commands_are_drawn_as_steps(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     (panel,) = input_figure(findings).panels
     for curve in panel.curves:
         assert curve.style == "steps" and len(curve.y) == findings.task.horizon + 1
@@ -480,90 +189,39 @@ def test_held_commands_are_drawn_as_steps(cart):
     assert {t["line"]["shape"] for t in plotted(panel)["data"]} == {"hv"}
 
 
-def test_models_that_predict_alike_are_one_curve():
-    def row(seconds, **more):
-        errors = {"outset": 1.0, "crude": 0.5, "calibrated": 0.5, "with_effects": 0.5} | more
-        columns = {key: {"x": seconds * value} for key, value in errors.items()}
-        return RulerRow(seconds, unit_by_channel={"x": "m"}, **columns)
-
-    def named(*rows):
-        found = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows))
-        return [curve.name for curve in found.panels[0].curves]
-
-    assert named(row(0.5), row(1.0)) == ["model.py", "model = calibrated = as diagnosed"]
-    apart = row(1.0, with_effects=0.4)
-    assert named(row(0.5), apart) == ["model.py", "model = calibrated", "as diagnosed"]
+# of linear RGB: how two kinds of colour blindness see it (Machado et al., 2009), and XYZ
+SEEN = np.array(
+    [
+        [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+        [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    ]
+)
+XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 
 
-def test_candidates_are_named_on_the_axis_and_one_that_waits_is_no_worse():
-    findings = many_flights(20)
-    now = findings.standing
-    last = replace(now.history[-1], trials=(), utilities=(), accepted=None)
-    waiting = replace(now, history=(*now.history[:-1], last), outstanding=last.candidate)
-    figure = search_figure(waiting)
-    steps = figure.panels[-1]
-    at, names = zip(*steps.x_ticks, strict=True)
-    assert len(names) <= 8 and names[0] == "c0001" and at[0] == 1.0
-    assert plotted(steps)["layout"]["xaxis"]["ticktext"] == list(names)
-    assert steps.dots[-1].role == "predicted" and steps.dots[-1].shape == "ring"
-    assert any("waiting" in key.name for key in figure.key)
-    expected = figure.panels[0].dots[-1]  # as the table has it
-    assert (expected.shape, expected.y) == ("dash", last.promised)
-    assert not any("waiting" in key.name for key in search_figure(now).key)
-
-
-def test_the_first_candidate_is_not_said_to_replay_a_trial():
-    """A dash was "predicted by the model, which replays the trial before" before any trial."""
-    now = many_flights(3).standing
-    alone = search_figure(replace(now, history=now.history[:1], incumbent=now.history[0]))
-    assert alone is not None and "replays" not in alone.caption
-    several = search_figure(now)
-    assert several is not None and "for all but the first candidate, it replays" in several.caption
-
-
-def _linear(colour):
+def linear(colour):
     value = np.array(rgb(colour)) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def _lab(linear):
-    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    x, y, z = np.cbrt(xyz @ np.clip(linear, 1e-4, 1) / [0.9505, 1.0, 1.089])
+def lab(colour):
+    x, y, z = np.cbrt(XYZ @ np.clip(colour, 1e-4, 1) / [0.9505, 1.0, 1.089])
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-DEUTAN = [
-    [0.367322, 0.860646, -0.227968],
-    [0.280085, 0.672501, 0.047413],
-    [-0.01182, 0.04294, 0.968881],
-]
-PROTAN = [
-    [0.152286, 1.052583, -0.204868],
-    [0.114503, 0.786281, 0.099216],
-    [-0.003882, -0.048116, 1.051998],
-]
 
 
 @pytest.mark.parametrize("dark", [0, 1])
 def test_colours_stand_out_and_are_told_apart_by_the_colour_blind(dark):
-    paper = _linear(PAPER["paper"][dark]) @ [0.2126, 0.7152, 0.0722]
+    paper = linear(PAPER["paper"][dark]) @ XYZ[1]
     for role, pair in COLOURS.items():
-        light = _linear(pair[dark]) @ [0.2126, 0.7152, 0.0722]
+        light = linear(pair[dark]) @ XYZ[1]
         ratio = (max(light, paper) + 0.05) / (min(light, paper) + 0.05)
         assert ratio >= 3.0, role  # WCAG 2.2, 1.4.11
     for together in (("model", "best", "real", "other", "step2"), ("model", "best", *STEPS)):
         for a, b in combinations(together, 2):
-            for seen in (DEUTAN, PROTAN):  # Machado et al. (2009)
-                far = [_lab(np.array(seen) @ _linear(COLOURS[one][dark])) for one in (a, b)]
-                apart = np.linalg.norm(far[0] - far[1]) > 8.0
+            for seen in SEEN:
+                one, two = (lab(seen @ linear(COLOURS[name][dark])) for name in (a, b))
+                apart = np.linalg.norm(one - two) > 8.0
                 assert apart or DASHES.get(a) != DASHES.get(b), (a, b)
-
-
-def test_bars_leave_room_for_what_stands_behind_them():
-    bars = Bars("b", (Bar("a", 100.0, "100"), Bar("delay:torque", -0.07, "-0.0689")))
-    low, high = bars.ends
-    assert low < -20 and high > 110
-    assert plotted(bars)["layout"]["xaxis"]["range"] == [low, high]
 
 
 def test_logarithmic_panels_show_what_has_a_logarithm():
@@ -583,54 +241,47 @@ def test_a_logarithmic_axis_says_its_magnitude(low, span):
     assert all(low - 0.05 <= np.log10(tick) <= low + span + 0.05 for tick in ticks)
 
 
-def test_a_crash_is_marked_where_it_happened(car):
-    findings = gather(Folder(car))
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_crash_is_marked_where_it_happened(car, ends):
+    findings = gathered(car)
     run = findings.runs[0]
     states = run.trial.states.copy()
     states[20:] = np.nan
-    short = replace(run, trial=replace(run.trial, states=states), utility=-np.inf)
-    figure = path_figure(replace(findings, runs=(short, *findings.runs[1:])))
-    assert figure is not None and "cross" in figure.caption
-    (cross,) = figure.panels[0].dots
+    trial = replace(run.trial, states=states)
+    short = replace(run, trial=trial.until(19) if ends else trial, utility=-np.inf)
+    crashed = replace(findings, runs=(short, *findings.runs[1:]))
+    (cross,) = path_figure(crashed).panels[0].dots
     x = findings.task.model.state_names.index("x")
     assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note
-    cut = replace(short, trial=replace(run.trial, states=states[:20], inputs=run.trial.inputs[:19]))
-    (same,) = path_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels[0].dots
-    assert same.note == cross.note  # its log ends there: it ended "after 0.95 s of 0.95 s"
-    for panel in error_figure(replace(findings, runs=(cut, *findings.runs[1:]))).panels:
-        (mark,) = panel.dots  # as in the figures of states
+    for panel in error_figure(crashed).panels:
+        (mark,) = panel.dots
         (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
         assert mark.shape == "cross" and mark.y == off[19]
 
 
-def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):
-    """Means of runs have no id of their own: the best one took the other's place."""
-    findings = gather(Folder(car))
-    own = {findings.first.candidate.id, findings.best.candidate.id}
-    again = [run for run in findings.runs if run.candidate.id in own]
-    runs = [
-        *findings.runs,
-        *(replace(r, trial=replace(r.trial, id=f"{r.trial.id}b")) for r in again),
-    ]
-    figure = path_figure(replace(findings, runs=tuple(runs)))
-    roles = [curve.role for curve in figure.panels[0].curves if curve.style == "line"]
-    assert len(own) == 2 and roles.count("model") == roles.count("best") == 1
-    assert roles.count("other") == len(runs)
-
-
-def test_a_level_flight_looks_level_in_the_view_from_the_side():
-    """Scaled to the sensor's noise of millimetres, a level flight looked like a storm."""
-    x, noise = np.linspace(-2, 2, 50), 0.01 * np.sin(np.arange(50))
-    low, high = _level([Curve(x, 2 + noise, "best", "", 1.0)])
-    assert high - low == pytest.approx(0.4, rel=0.05) and low < 2 < high
-    assert _level([Curve(x, x, "best", "", 1.0)]) is None
-
-
-def test_long_names_are_broken_where_they_are_joined():
-    """In a small panel they were cut, and so were the values behind the bars."""
-    whole = "without delay:roll_command+pitch_command+thrust"
-    lines = in_lines(whole).split("<br>")
-    assert max(map(len, lines)) <= LONG and "".join(lines).replace(" ", "") == whole.replace(
-        " ", ""
+def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
+    row = RulerRow(
+        horizon_s=1.0,
+        held_out="trials",
+        unit_by_channel={"x": "m", "v": "m/s"},
+        crude={"x": 0.2, "v": 0.5},
+        calibrated={"x": 0.1, "v": 0.4},
+        with_effects={"x": 0.1, "v": 0.05},
+        noise_floor={"x": 0.05, "v": 0.04},
     )
-    assert in_lines("without calibration") == "without calibration"
+    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
+    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
+    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
+    share, worth = credit_figure(found).panels
+    assert [(bar.label, bar.value) for bar in share.bars] == [
+        ("delay:u", 0.9),
+        ("dead_zone:u", 0.1),
+    ]
+    assert worth.title.startswith("v")  # what predictions improved most
+    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
+    later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
+    settled = replace(found, credit=(), prediction_error=(later,))
+    (bars,) = worth_figure(settled, [(["v"], "v")]).panels
+    assert [bar.value for bar in bars.bars] == [1.4, 0.05, 0.04]
+    (x, v) = accuracy_figure(found).panels
+    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title

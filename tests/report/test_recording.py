@@ -14,25 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import holding
-from grounded.diagnosis.error_report import Credit
-from grounded_trials.report.bodies import body_in
 from grounded_trials.report.figures.paths import ended
-from grounded_trials.report.findings import Log
-from grounded_trials.report.gathering import gather
-from grounded_trials.report.recording.layout import Space, blueprint
-from grounded_trials.report.recording.recording import rate, write_recording
-from grounded_trials.report.recording.texts import credit, summary, verdict
-from grounded_trials.report.scene import scene_of
-from grounded_trials.workspace.folder import Folder
+from grounded_trials.report.recording.recording import write_recording
 from pace import slowness
-from reported import car, cart, many_flights
-from workspaces import make
+from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-rrb = pytest.importorskip("rerun.blueprint")
 RERUN = Path(sys.executable).with_name("rerun")
 needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")
 
@@ -46,31 +35,22 @@ def _entities(path: Path) -> str:
     return _rerun("rrd", "print", path).stdout
 
 
+ENTITIES = """
+/paths/model_policy /paths/best/body /paths/predicted /state/x/desired /state/x/best
+/input/force/low /bias/v/c0001 /bias/v/left_as_diagnosed /ahead/real/body /ahead/off/body
+/ahead/on/body /ahead/v/off /ahead/v/on /utilities /summary
+"""
+
+
 @needs_tool
 def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     path = tmp_path / "cart.rrd"
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     write_recording(findings, path)
     done = _rerun("rrd", "verify", path)
     assert done.returncode == 0, done.stderr
     found = _entities(path)
-    for entity in (
-        "/paths/model_policy",
-        "/paths/best/body",
-        "/paths/predicted",
-        "/state/x/desired",
-        "/state/x/best",
-        "/input/force/low",
-        "/bias/v/c0001",
-        "/bias/v/left_as_diagnosed",
-        "/ahead/real/body",
-        "/ahead/off/body",
-        "/ahead/on/body",
-        "/ahead/v/off",
-        "/ahead/v/on",
-        "/utilities",
-        "/summary",
-    ):
+    for entity in ENTITIES.split():
         assert f"{entity} " in found, entity
     for run in findings.runs:
         for part in ("path", "predicted", "body", "state", "input", "bias", "explained"):
@@ -79,7 +59,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
 
 @needs_tool
 def test_crashes_are_marked_where_and_when(car, tmp_path):
-    findings = gather(Folder(car))
+    findings = gathered(car)
     (first, *rest), names = findings.runs, findings.task.model.state_names
     states, inputs = first.trial.states[:20], first.trial.inputs[:19]
     cut = replace(first.trial, states=states, inputs=inputs)
@@ -99,80 +79,6 @@ def test_crashes_are_marked_where_and_when(car, tmp_path):
     assert f"/state/{names[0]}/ended_best " not in found
     write_recording(findings, path)
     assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
-
-
-def _origins(container):
-    """The origins of a blueprint's views, in order."""
-    parts = getattr(container, "contents", None)
-    if hasattr(container, "class_identifier"):
-        return [container.origin]
-    return [origin for part in parts or () for origin in _origins(part)]
-
-
-@pytest.mark.parametrize("logs", [False, True])
-def test_the_verdict_and_its_credit_are_seen_when_a_recording_opens(cart, logs):
-    """The credit was below the fold of the verdict; with logs alone, both were in a hidden tab."""
-    findings = gather(Folder(cart))
-    causes = (Credit("calibration", 1.0),)
-    findings = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
-    if logs:
-        run = findings.runs[0]
-        findings = replace(findings, runs=(), logs=(Log(run.trial, run.residual),))
-    scene, body = scene_of(findings.task.model), body_in(findings)
-    root = blueprint(findings, Space(findings, scene, body)).root_container
-    shown = root
-    while shown.active_tab is not None or isinstance(shown, rrb.Tabs):
-        shown = shown.contents[shown.active_tab or 0]
-    assert _origins(shown)[:2] == ["/verdict", "/credit"]
-
-
-@needs_tool
-def test_car_and_aircraft(car, tmp_path):
-    for name, findings in (("car", gather(Folder(car))), ("aircraft", many_flights(2))):
-        path = tmp_path / f"{name}.rrd"
-        write_recording(findings, path)
-        assert _rerun("rrd", "verify", path).returncode == 0
-        assert "/paths/desired " in _entities(path)
-
-
-@needs_tool
-def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
-    make(tmp_path / "p", "pendulum")
-    assert grounded("-C", tmp_path / "p", "learn", "--trials", 1).code == 0
-    path = tmp_path / "pendulum.rrd"
-    write_recording(gather(Folder(tmp_path / "p")), path)
-    assert _rerun("rrd", "verify", path).returncode == 0
-    found = _entities(path)
-    assert (
-        "/paths/model_policy/body/link1 " in found and "/trials/t0001/predicted/body/link1" in found
-    )
-
-
-@needs_tool
-def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
-    findings = gather(Folder(cart))
-    parts = []
-    for run in findings.runs[:2]:
-        parts.append(tmp_path / f"{run.trial.id}.rrd")
-        write_recording(replace(findings, runs=(run,)), parts[-1])
-    whole = tmp_path / "whole.rrd"
-    done = _rerun("rrd", "merge", *parts, "-o", whole)
-    assert done.returncode == 0, done.stderr
-    assert _rerun("rrd", "verify", whole).returncode == 0
-    found = _entities(whole)
-    assert all(f"/trials/{run.trial.id}/state" in found for run in findings.runs[:2])
-    ids = {line for line in found.split() if line.startswith("recording_id")}
-    assert len(ids) <= 1
-
-
-@needs_tool
-def test_a_damaged_recording_is_noticed(cart, tmp_path):
-    path = tmp_path / "cart.rrd"
-    write_recording(gather(Folder(cart)), path)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    path.write_bytes(bytes(data[: len(data) // 2]))
-    assert _rerun("rrd", "verify", path).returncode != 0
 
 
 @pytest.mark.slow
@@ -201,16 +107,7 @@ def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
     from grounded.errors import GroundedError
 
     with pytest.raises(GroundedError, match=holding(tmp_path / "missing")):
-        write_recording(gather(Folder(cart)), tmp_path / "missing" / "cart.rrd")
-
-
-def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
-    residual = np.random.default_rng(0).normal(size=(3000, 2))
-    rates, dt = rate(residual, 0.02, 1)
-    assert len(rates) <= 600 and dt == pytest.approx(0.1)
-    np.testing.assert_allclose(rates.mean(axis=0), residual.mean(axis=0) / 0.02)
-    same, dt = rate(residual[:100], 0.02)
-    np.testing.assert_array_equal(same, residual[:100] / 0.02)
+        write_recording(gathered(cart), tmp_path / "missing" / "cart.rrd")
 
 
 def _ended(command: list[str], log: Path, seconds: float) -> str:
@@ -228,9 +125,8 @@ def _ended(command: list[str], log: Path, seconds: float) -> str:
 @needs_tool
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed")
 def test_the_viewer_shows_the_paths(car, tmp_path):
-    """Half a minute: the viewer draws in software."""
     path, shot = tmp_path / "car.rrd", tmp_path / "shot.png"
-    write_recording(gather(Folder(car)), path)
+    write_recording(gathered(car), path)
     screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
     flags = ["--new", "--bind", "127.0.0.1", "--window-size", "1400x900", "--renderer", "vulkan"]
     command = [*screen, str(RERUN), *flags, "--screenshot-to", str(shot), str(path)]
@@ -245,24 +141,3 @@ def test_the_viewer_shows_the_paths(car, tmp_path):
     for colour in ((213, 94, 0), (86, 180, 233), (170, 170, 170)):  # model's policy, best, desired
         near = (np.abs(left - colour).max(axis=2) < 25).sum()
         assert near > 300, colour
-
-
-def test_the_texts_begin_with_the_next_command_and_name_a_crash(cart):
-    """`next:` was below the fold, and the utility of a crashed first run was -inf."""
-    findings = gather(Folder(cart))
-    lines = verdict(findings).splitlines()
-    assert lines[0] == f"next: `{findings.next_command}`" and len(lines) > 2
-    assert credit(findings) == ""  # this diagnosis has none
-    causes = (Credit("calibration", 0.75), Credit("delay:force", 0.25))
-    known = replace(findings, diagnosis=replace(findings.diagnosis, credit=causes))
-    rows = credit(known).splitlines()[2:]
-    assert [row.count("█") for row in rows] == [15, 5]
-    assert "█" not in verdict(known)
-    assert credit(replace(known, diagnosis=None)) == ""
-    assert findings.first is not None
-    crashed = tuple(
-        replace(run, utility=-np.inf) if run is findings.first else run for run in findings.runs
-    )
-    text = summary(replace(findings, runs=crashed))
-    assert "inf" not in text and "failed by the model's policy" in text
-    assert "0 logs" not in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,21 +11,10 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
-from facts import holds
-from grounded.diagnosis.report import Diagnosis
-from grounded_trials.report.diagnosis_words import calibrated_sentence
-from grounded_trials.report.findings import (
-    improvements_in,
-    off_target,
-    prediction_error,
-    rms,
-)
-from grounded_trials.report.gathering import gather
-from grounded_trials.report.reporting import save_optimum
-from grounded_trials.store.documents import write_document
+from grounded_trials.report.findings import prediction_error, rms
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error
-from reported import DIAGNOSIS, car, cart, copied, damage
+from reported import DIAGNOSIS, car, cart, copied, damage, gathered, stored
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -40,64 +28,6 @@ def test_text_fits_a_terminal_and_ends_with_the_next_command(cart, car):
         assert max(map(len, lines)) <= 80
         assert plain(done.out).split("\n")[-2] == f"next: grounded {command}"
         assert "\x1b" not in done.out
-        for heading in ("utility", "trajectories", "bias", "gap to the model"):
-            assert any(line.startswith(heading) for line in lines)
-
-
-def test_text_without_a_diagnosis_says_how_to_get_one(car):
-    out = plain(grounded("-C", car, "report").out)
-    assert re.search("^gap to the model\n.*: grounded diagnose$", out, re.M)
-
-
-def test_text_shows_the_diagnosis(cart):
-    out = grounded("-C", cart, "report").out
-    assert "90 %" in out
-    assert "k = 0.300 +- 0.010 1/s" in out
-
-
-def test_text_and_status_explain_their_columns(cart):
-    for command, words in (("report", "alpha: "), ("status", "damp: ")):
-        lines = grounded("-C", cart, command).out.splitlines()
-        (legend,) = [line for line in lines if line.startswith(f"  {words}")]
-        assert "+-: standard error" in legend and len(legend) <= 80
-
-
-def test_text_shows_the_ruler(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    row = {
-        "horizon_s": 1.0,
-        "unit_by_channel": {"v": "m/s"},
-        "crude": {"v": 0.31},
-        "calibrated": {"v": 0.12},
-        "with_effects": {"v": 0.08},
-        "noise_floor": {"v": None},
-    }
-    credit = [{"of": "viscous_friction:v", "share": 0.62, "times": 1.83}]
-    document = DIAGNOSIS | {"prediction_error": [row], "credit": credit}
-    write_document(folder / "reports" / "diagnosis.json", document)
-    lines = grounded("-C", folder, "report").out.splitlines()
-    (line,) = [x for x in lines if x.startswith("v, 1 s ahead")]
-    assert line.split()[4:] == ["0.310", "0.120", "0.0800", "-", "m/s"]
-    assert any("viscous_friction:v" in x and "+83 %" in x for x in lines)
-
-
-def test_text_says_how_utilities_are_predicted_and_what_acts_alike(cart):
-    out = " ".join(grounded("-C", cart, "report").out.split())
-    assert re.search(r"\b5 whole trials\b.*\b3\.21\b.*\b0\.0456\b", out)
-    assert re.search(r"\bquadratic_drag:v\b[^;]* 96\.0 %.*\bcoulomb_friction:v 80 %", out)
-
-
-def test_half_a_number_is_never_shown(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
-    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "claimed": True}
-    document = DIAGNOSIS | {"ranking": [entry]}
-    write_document(folder / "reports" / "diagnosis.json", document)
-    (shown,) = re.findall(
-        r"patch:v +9\.0 +(k0 .*?)\n\S", grounded("-C", folder, "report").out, re.S
-    )
-    values = [re.sub(r"\s+", " ", one).strip() for one in shown.split(",")]
-    assert values == [f"k{i} = 0.123 +- 0.010 m/s" for i in range(4)]
 
 
 def test_json_holds_what_the_contract_says(cart):
@@ -130,7 +60,7 @@ def test_a_workspace_without_trials_has_a_report(tmp_path):
 
 
 def test_findings_measure_what_they_say(cart):
-    findings = gather(Folder(cart))
+    findings = gathered(cart)
     task, best = findings.task, findings.best
     assert best is not None
     off = best.trial.states[:, 0] - task.target[:, 0]
@@ -143,34 +73,18 @@ def test_findings_measure_what_they_say(cart):
     np.testing.assert_allclose(best.residual, best.trial.states[1:] - step, atol=1e-12)
 
 
-def test_the_diagnosed_effect_leaves_less_of_the_bias(cart):
-    best = gather(Folder(cart)).best
-    assert best is not None and best.explained is not None
-    assert rms(best.explained)[1] < rms(best.residual)[1]
-
-
 @pytest.mark.extra("view", "png")
 def test_a_damaged_trial_is_left_out_and_named(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     path = damage(folder, "trials/t0002-*")
     done = grounded("-C", folder, "report")
     assert done.code == 3
-    assert path.name in done.out and "is damaged" in " ".join(plain(done.out).split())
+    assert path.name in done.out
     assert plain(done.out).rstrip().split("\n")[-1].startswith("next: grounded ")
     document = grounded("-C", folder, "report", "--json", "--html", "--rrd")
     assert document.code == 3
     assert document.json["lost"][0]["file"] == path.name
-    page = Path(document.json["paths"]["html"]).read_text()
-    assert path.name in page and document.json["lost"][0]["reason"].split(";")[0] in page
-
-
-def test_a_removed_trial_is_named(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    (path,) = folder.glob("trials/t0002-*")
-    path.unlink()
-    done = grounded("-C", folder, "report")
-    assert done.code == 3
-    assert re.search("^.*t0002: trials/ .*t0002", done.out, re.M)
+    assert path.name in Path(document.json["paths"]["html"]).read_text()
 
 
 @pytest.mark.extra("view", "png")
@@ -202,59 +116,26 @@ def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     assert lost["file"] == "diagnosis.json" and lost["reason"]
 
 
-@pytest.mark.slow
-@pytest.mark.extra("view", "png")
+@pytest.mark.extra("view")
 def test_the_first_trial_may_be_lost_and_a_short_one_is_shown_as_failed(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    workspace = Folder(folder)
-    from dataclasses import replace
-
-    from grounded_trials.store.trial_file import trial_bytes
-
-    stored = workspace.trials()[-1]
-    states = np.array(stored.trial.states[:11])
+    w = Folder(copied(cart, tmp_path / "w"))
+    trial = w.trials()[-1].trial
+    states = np.array(trial.states[:11])
     states[7:] = np.nan
-    short = replace(stored.trial, states=states, inputs=stored.trial.inputs[:10], id="")
-    model = workspace.base_model
-    workspace.store.add(
-        trial_bytes(
-            short,
-            {"kind": "trial", "task": workspace.task.hash},
-            workspace.candidate_bytes(short.candidate),
-            state_units=dict(model.states),
-            input_units=dict(model.inputs),
-            start_ns=0,
-        )
-    )
-    done = grounded("-C", folder, "report", "--html", "--rrd", "--json")
-    assert done.code == 0, done.err
-    assert "failed" in grounded("-C", folder, "report").out
-    damage(folder, "trials/t0001-*")
-    done = grounded("-C", folder, "report", "--html", "--png", "--rrd")
-    assert done.code == 3, done.err
+    short = replace(trial, states=states, inputs=trial.inputs[:10])
+    about = {"kind": "trial", "task": w.task.hash}
+    stored(w, short, about, w.candidate_bytes(short.candidate))
+    assert "failed" in grounded("-C", w.folder, "report").out
+    damage(w.folder, "trials/t0001-*")
+    assert grounded("-C", w.folder, "report", "--html", "--rrd").code == 3
 
 
 def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path):
-    from dataclasses import replace
-
-    from grounded_trials.store.trial_file import trial_bytes
-
-    folder = copied(cart, tmp_path / "w")
-    workspace = Folder(folder)
-    (tmp_path / "outside.mcap").write_bytes(workspace.candidate_bytes("c0001"))
-    model = workspace.base_model
-    evil = replace(workspace.trials()[0].trial, candidate="../../outside", id="")
-    units = {"state_units": dict(model.states), "input_units": dict(model.inputs)}
-    workspace.store.add(trial_bytes(evil, {"kind": "trial"}, None, start_ns=0, **units))
-    before = grounded("-C", cart, "report", "--json").json
-    after = grounded("-C", folder, "report", "--json").json
+    w = Folder(copied(cart, tmp_path / "w"))
+    (tmp_path / "outside.mcap").write_bytes(w.candidate_bytes("c0001"))
+    stored(w, replace(w.trials()[0].trial, candidate="../../outside"), {"kind": "trial"})
+    before, after = (grounded("-C", f, "report", "--json").json for f in (cart, w.folder))
     assert after["utilities"] == before["utilities"]
-
-
-def test_the_optimum_is_shown_where_a_study_left_it(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    save_optimum(Folder(folder), -0.0123)
-    assert "optimum -0.01230" in grounded("-C", folder, "report").out
 
 
 def test_nothing_heavy_is_imported_for_text(cart):
@@ -282,8 +163,6 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
     names = ["paths", "data-t0001", "data-t0002", "residual", "autocorrelation"]
     assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
-    out = grounded("-C", folder, "report").out
-    assert holds(out, "2 logs") and "1 s after each restart" in out
 
 
 @pytest.mark.extra("view", "png")
@@ -292,44 +171,5 @@ def test_a_candidate_that_was_not_run_yet_is_shown_as_predicted(tmp_path):
     assert grounded("-C", tmp_path / "w", "propose").code == 0
     done = grounded("-C", tmp_path / "w", "report", "--html", "--rrd", "--png", "--json")
     assert done.code == 0, done.err
-    assert "predicted for c0001" in Path(done.json["paths"]["html"]).read_text()
+    assert "c0001" in Path(done.json["paths"]["html"]).read_text()
     assert plain(grounded("-C", tmp_path / "w", "report").out).endswith("next: grounded run\n")
-
-
-def test_text_says_what_was_calibrated(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    out = " ".join(grounded("-C", folder, "report").out.split())
-    assert "mass 1.00 -> 1.40 kg" in out
-    assert re.search(r"\brms error of the predicted utility\b.*\butilities\b.* 1\.50\b", out)
-    assert "scatter of repeats" not in out
-    one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
-    document = DIAGNOSIS | {"utility_prediction": one}
-    write_document(folder / "reports" / "diagnosis.json", document)
-    out = " ".join(grounded("-C", folder, "report").out.split())
-    assert "rms error of the predicted utility" in out and "utilities vary" not in out
-
-
-def test_all_calibrated_parameters_are_named_the_most_changed_first():
-    table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
-    found = Diagnosis.from_json(DIAGNOSIS | {"parameters": table})
-    text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
-    assert text == (
-        "calibrated with the effects: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m, "
-        "p2 1.00 -> 1.20 m, p1 1.00 -> 1.10 m"
-    )
-
-
-def test_two_trials_of_a_candidate_miss_by_more_than_their_mean(cart):
-    """One ended 31 cm too far, one 31 cm short: their mean was said to be there."""
-    findings = gather(Folder(cart))
-    best = findings.runs_of(findings.best.candidate.id)[-1]
-    target = np.nan_to_num(findings.task.target)
-    two = [
-        replace(best, trial=replace(best.trial, id=f"t009{k}", states=target + sign * 0.31))
-        for k, sign in enumerate((1, -1))
-    ]
-    runs = (*(r for r in findings.runs if r.candidate.id != best.candidate.id), *two)
-    found = replace(findings, runs=runs)
-    assert rms(off_target(found, found.best))[0] == pytest.approx(0.31)
-    told = next(one for one in improvements_in(found) if "x" in one.what)
-    assert told.after == pytest.approx(0.31)

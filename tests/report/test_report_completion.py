@@ -31,11 +31,6 @@ def test_commands_and_their_options():
     assert {"--html", "--png", "--rrd"} <= set(_asked("grounded report --"))
 
 
-@pytest.mark.parametrize("words", ["grounded -C {} export ", "grounded export -C {} "])
-def test_names_of_the_workspace_that_is_named(cart, words):
-    assert {"best", "c0001"} <= set(_asked(words.format(cart)))
-
-
 def _context(folder) -> click.Context:
     """As the shell's TAB key makes it, with -C before the command."""
     return cli.make_context("grounded", ["-C", str(folder), "export"], resilient_parsing=True)

@@ -10,7 +10,6 @@ from cli import grounded
 from facts import holds
 from grounded.search import pictures
 from grounded.search.pictures import few, search_figure
-from grounded.search.scatter import with_errors
 from grounded_trials import Workspace
 from grounded_trials.report import gathering
 from grounded_trials.report.page import tables
@@ -61,24 +60,6 @@ def test_a_report_reads_few_of_many_trials_and_its_numbers_are_the_same(learnt, 
     assert holds(text, f"{part.left_runs} of {len(whole.runs)} trials", "3 of 5 logs")
     head = grounded("-C", learnt.folder, "report").out.splitlines()[0:2]
     assert f"{len(whole.runs)} trials" in " ".join(head)
-
-
-def test_the_band_and_the_table_have_one_standard_error():
-    """The band pooled the wild first candidates: 0.54 where the table said 3e-4."""
-    now = many_flights(4).standing
-    worth = [(-4200.0, -300.0), (-60.0, -20.0), (-5.0,), (-2.47, -2.49)]
-    history = with_errors(
-        [
-            replace(tried, utilities=u, trials=tried.trials * len(u), accepted=True)
-            for tried, u in zip(now.history, worth, strict=True)
-        ]
-    )
-    best = history[-1]
-    figure = search_figure(replace(now, history=history, incumbent=best))
-    (band,) = figure.panels[0].bands
-    assert (band.high - band.low) / 4 == pytest.approx(best.standard_error)
-    once = replace(now, history=history[:3], incumbent=history[2])
-    assert not search_figure(once).panels[0].bands  # run once: its error is not known
 
 
 def test_the_page_and_its_figure_of_many_candidates_say_how_many_are_left_out(monkeypatch):

@@ -1,22 +1,12 @@
 """Numbers and units as people read them."""
 
-import math
-from types import SimpleNamespace
-
-import numpy as np
 import pytest
 
-from grounded.diagnosis.cause_words import give_or_take
-from grounded.diagnosis.report import Estimate
-from grounded.result import begun, measured_alike
-from grounded_trials.report.findings import by_state
+from grounded.result import measured, measured_alike
 from grounded_trials.wording import (
     count,
-    extent,
     glued,
     labelled,
-    moved,
-    or_zero,
     per_second,
     percent,
     ranges,
@@ -50,35 +40,6 @@ def test_the_unit_one_is_not_printed():
 )
 def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
     assert per_second(unit) == rate
-
-
-def test_what_rounding_left_of_zero_reads_zero():
-    assert extent(-1e-18, 0.3) == (0.0, 0.3) and extent(-0.3, 7e-17) == (-0.3, 0.0)
-    assert extent(-1e-18, 2e-18) == (-1e-18, 2e-18)  # small in itself, not beside anything
-    assert or_zero(1e-12, math.inf) == 1e-12 and math.isnan(or_zero(math.nan, 1.0))
-    assert moved(1.0, -7e-17, "m").startswith("1.00 -> 0 ")
-
-
-@pytest.mark.parametrize(
-    ("value", "std", "text"),
-    [
-        (7e-17, 0.01, "0 +- 0.010 N"),
-        (-2e-5, 0.01, "0 +- 0.010 N"),
-        (2e-4, 0.01, "0.000200 +- 0.010 N"),
-        (0.3, 1e-18, "0.3 N"),
-        (1234.0, 300.0, "1,234 +- 300 N"),
-        (0.018089, 0.00088, "0.01809 +- 0.00088 N"),
-    ],
-)
-def test_a_value_is_zero_where_its_deviation_shows_no_digit_of_it(value, std, text):
-    assert give_or_take(Estimate(value, std, unit="N")) == text
-
-
-def test_an_error_that_is_rounding_noise_beside_its_row_is_zero():
-    errors = [np.array([0.3, 2e-17]), np.array([-1e-18, 3e-17])]
-    model = SimpleNamespace(states={"x": "m", "v": "m/s"}, n=2)
-    x, v = by_state(model, errors)
-    assert x[-1] == "0" != v[-1] and measured_alike([0.1, 2e-16], "m") == ["100 mm", "0 mm"]
 
 
 @pytest.mark.parametrize(
@@ -116,8 +77,35 @@ def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
 
 
-def test_a_sentence_that_begins_with_an_effect_keeps_its_name():
-    """The page said "Coriolis:v and rate_gain:v are equivalent", a name that `adopt` refuses."""
-    assert begun("coriolis:v and rate_gain:v are") == "coriolis:v and rate_gain:v are"
-    assert begun("t_end is") == "t_end is"
-    assert begun("the state v: 3 m") == "The state v: 3 m"
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.17, "m", "170 mm"),
+        (2.0, "m", "2.0 m"),
+        (4e-4, "m", "0.40 mm"),
+        (3e-6, "rad", "3.0 µrad"),
+        (0.3, "rad/s", "0.30 rad/s"),
+        (3e-4, "V", "3.0e-04 V"),
+        (0.0, "m", "0 m"),
+    ],
+)
+def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
+    assert measured(value, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "texts"),
+    [
+        ((1.6e-4, 1.6e-3), "m", ["0.16 mm", "1.6 mm"]),  # it was 0.16 mm -> 0.16 cm
+        ((1.6e-3, 9.1e-4), "m", ["1.6 mm", "0.91 mm"]),
+        ((8.2e-4, 0.045), "m", ["0.82 mm", "45 mm"]),
+        ((1.75, 0.012), "m", ["1,750 mm", "12 mm"]),
+        ((0.31, 1.6e-3), "m", ["310 mm", "1.6 mm"]),
+        ((1.2e-3, 7.3e-4), "rad", ["1.2 mrad", "0.73 mrad"]),
+        ((0.12, 5.8e-4), "rad", ["0.12 rad", "0.00058 rad"]),
+        ((0.2, 0.0), "m", ["200 mm", "0 mm"]),
+        ((0.17,), "m", ["170 mm"]),
+    ],
+)
+def test_errors_that_are_compared_have_one_unit(values, unit, texts):
+    assert measured_alike(values, unit) == texts

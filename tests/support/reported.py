@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,10 @@ from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
+from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
+from grounded_trials.store.trial_file import trial_bytes
+from grounded_trials.workspace.folder import Folder
 from workspaces import make
 
 DIAGNOSIS: dict[str, Any] = {
@@ -121,6 +125,13 @@ def damage(folder: Path, pattern: str) -> Path:
     return path
 
 
+@cache
+def gathered(workspace: Path) -> Findings:
+    """Return the findings of a workspace that no test changes."""
+    return gather(Folder(workspace))
+
+
+@cache
 def many_flights(trials: int = 50) -> Findings:
     """Return findings of the aircraft's noisy figure-8, 3000 steps a trial, without files."""
     task = flight_task(aircraft.model)
@@ -165,3 +176,14 @@ def many_flights(trials: int = 50) -> Findings:
         optimum=None,
         then=NextCommand("propose"),
     )
+
+
+def diagnosed(folder: Path, **changes: Any) -> None:
+    """Write the diagnosis of a workspace, with some of its parts changed."""
+    write_document(folder / "reports" / "diagnosis.json", {**DIAGNOSIS, **changes})
+
+
+def stored(w: Folder, trial: Trial, about: dict[str, Any], policy: bytes | None = None) -> None:
+    """Store a trial in a workspace."""
+    units = {"state_units": dict(w.base_model.states), "input_units": dict(w.base_model.inputs)}
+    w.store.add(trial_bytes(replace(trial, id=""), about, policy, start_ns=0, **units))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+from grounded_trials import Workspace
 from grounded_trials.starting.examples import EXAMPLES, write_example
 from grounded_trials.workspace.folder import Folder
 
@@ -75,6 +77,31 @@ def make(folder: Path, example: str = "cart", **files: str) -> Folder:
     for key, text in files.items():
         (folder / names[key]).write_text(text)
     return Folder(folder)
+
+
+def blank(folder: Path, model: str, dt: float | None = None, **keys: str) -> Workspace:
+    """Make a workspace from the text of a model alone; `keys` as in `edit`."""
+    source = folder.parent / "given.py"
+    source.write_text(model)
+    edit(Workspace.create(folder, model=source, dt=dt).folder, **keys)
+    return Workspace(folder)
+
+
+def edit(folder: Path, **keys: str) -> None:
+    """Write values into grounded.toml: of keys that it has, of `effects`, or of whole tables."""
+    file = folder / "grounded.toml"
+    text = file.read_text()
+    for key, value in keys.items():
+        if key == "effects":
+            text = re.sub(r"(?m)^effects = .*\n", "", text)
+            text = text.replace("[task]", f"effects = [{value}]\n[task]", 1)
+        elif key in ("limits", "safety", "system"):
+            text = re.sub(rf"(?ms)^\[{key}\].*?(?=^\[|\Z)", "", text)
+            text += f"\n[{key}]\n{value}\n" * bool(value)
+        else:
+            assert re.search(rf"(?m)^{key} = ", text)
+            text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+    file.write_text(text)
 
 
 def _rest_to_rest(t: float) -> float:

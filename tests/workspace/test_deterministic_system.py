@@ -45,7 +45,6 @@ def workspace(tmp_path):
 
 @pytest.mark.parametrize("repeats", [1, 2])
 def test_learn_ends(workspace, repeats):
-    """FACTS 7, reason 1: with two repeats 0.1 ran the first candidate again and again."""
     config = workspace.folder / "grounded.toml"
     more = f"max_trials = 12\nrepeats = {repeats}\n{EARLY}"
     config.write_text(config.read_text().replace("max_trials = 12", more))
@@ -102,7 +101,6 @@ def test_the_same_bytes_beside_repeats_that_differ_are_called_a_copy(workspace):
 
 
 def test_learn_stops_at_a_trial_in_other_units_and_goes_on_where_it_is_asked_again(workspace):
-    """It warned that the program writes millimetres, and ran three more plans made of them."""
     drive = workspace.folder / "drive.py"
     drive.write_text(
         DRIVE.replace("candidate=meta", "states=ran.states * [1000, 1], candidate=meta")

@@ -6,19 +6,13 @@ import sys
 
 import numpy as np
 import pytest
-from test_next_step import diagnosed
 
 from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, plain
-from grounded.rollout import simulate
-from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.adopted import planner_of
 from reported import cart, copied
-from workspaces import CONFIG, make
 
 __all__ = ["cart"]
 
@@ -75,7 +69,6 @@ def test_a_session_from_an_example_to_a_report(tmp_path):
     ],
 )
 def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, options):
-    """Two copies of one folder, each the current one when it is asked."""
     for side in ("a", "b"):
         copied(cart, tmp_path / side)
         (first, *_) = (tmp_path / side / "trials").glob("t0001-*")
@@ -91,20 +84,6 @@ def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, option
     assert plain(found.to_json()) == printed.json
     assert repr(found).startswith(f"<{type(found).__name__} ") and len(repr(found)) < 200
     assert "<table>" in found._repr_html_()
-
-
-def test_what_was_changed_on_the_disk_is_seen_by_the_next_call(cart, tmp_path):
-    w = Workspace(copied(cart, tmp_path / "w"))
-    before = w.planner.plan.model.state_names
-    assert w.status().then == NextCommand("adopt", ("viscous_friction:v",))
-    done = w.adopt("viscous_friction:v")
-    assert [effect["name"] for effect in done.effects] == ["viscous_friction:v"]
-    assert w.config.model.effects and w.planner.plan.model.state_names == before
-    assert w.status().then.verb in ("propose", "diagnose")  # the diagnosis is of another model
-    diagnosed(w.folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
-    (w.folder / "grounded.toml").write_text("[model]\nfile = 3\n")
-    with pytest.raises(GroundedError, match=holding("[model]", "file")):
-        w.status()
 
 
 def test_one_reader_strict_or_telling_what_it_lost(cart, tmp_path):
@@ -127,59 +106,6 @@ def test_one_reader_strict_or_telling_what_it_lost(cart, tmp_path):
     assert np.array_equal(
         found.candidates[0].predicted_states, whole.candidates[0].predicted_states
     )
-
-
-def test_fit_says_how_its_values_are_written(tmp_path):
-    folder = make(tmp_path / "w").folder
-    w = Workspace(folder)
-    w.learn(2)
-    found = w.fit(["mass"])
-    assert found.then == NextCommand("fit", ("--params", "mass", "--apply")) and not found.applied
-    again = w.fit(["mass"], apply=True)
-    assert again.then == NextCommand("propose")
-    assert w.base_model.params["mass"].value == pytest.approx(again.fit.params["mass"].value)
-
-
-@pytest.mark.slow
-def test_fit_knows_the_effects_that_were_adopted(tmp_path):
-    """The robot has a delay, a lag and a dead zone, the model too: only mass and drag are off."""
-    listed = """file = "model.py"
-effects = [
-    {name = "delay:force", d = 0.02},
-    {name = "first_order_lag:force", tau = 0.2},
-    {name = "dead_zone:force", c = 0.6},
-]"""
-    folder = make(tmp_path / "w", config=CONFIG.replace('file = "model.py"', listed)).folder
-    w, rng = Workspace(folder), np.random.default_rng(0)
-    true = w.task.with_model(w.base_model.with_values({"mass": 1.4, "drag": 0.5}))
-    robot = planner_of(true, w.config.model.effects).plan
-    names = (w.base_model.state_names, w.base_model.input_names)
-    for k in range(8):
-        force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)
-        run = simulate(robot.problem(exact=True), robot.policy(force, None, None))
-        seen = run.states[:, :2] + rng.normal(0, 0.002, (41, 2))
-        write_trial(tmp_path / f"{k}.mcap", Trial(seen, force, 0.05, *names), {"kind": "data"})
-        w.ingest(tmp_path / f"{k}.mcap", data=True)
-    found = w.fit().fit
-    for name, value in {"mass": 1.4, "drag": 0.5}.items():
-        assert found.params[name].low < value < found.params[name].high
-        assert found.params[name].std < 0.1 * value
-    assert found.params["first_order_lag_force_tau"].value == pytest.approx(0.2, abs=0.05)
-    assert found.after.ahead[0] < 0.01 < found.before.ahead[0]
-
-    w.fit(apply=True)
-    assert w.base_model.params["mass"].value == pytest.approx(1.4, abs=0.1)
-    before = w.planner.plan.latency
-    kept = {effect["name"]: effect for effect in w.config.model.effects}
-    assert kept["delay:force"]["d"] == 0.02
-    assert kept["dead_zone:force"]["c"] == pytest.approx(0.6, abs=0.1)
-    assert kept["first_order_lag:force"]["tau"] == pytest.approx(
-        found.params["first_order_lag_force_tau"].value
-    )
-
-    w.fit(["mass"], latency=True, apply=True)  # the whole delay: it is not counted twice
-    assert "delay:force" not in {effect["name"] for effect in w.config.model.effects}
-    assert w.planner.plan.latency == pytest.approx(before, abs=0.02)
 
 
 @pytest.mark.parametrize(

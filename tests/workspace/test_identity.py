@@ -6,23 +6,17 @@ averaged two policies called c0002, one bit in diagnosis.json was adopted as 9.5
 """
 
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_next_step import diagnosed
 
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import StudyStore, proven
-from grounded_trials.workspace import identity
-from grounded_trials.workspace.candidates.search_state import standing_in
-from grounded_trials.workspace.identity import _decoded, candidate_of, other_task
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from reported import cart, copied
-from small_tasks import cart_task, rover_task
 from workspaces import CONFIG, make
 
 __all__ = ["cart"]
@@ -45,7 +39,6 @@ def w(made, tmp_path):
 
 
 def test_every_flipped_bit_of_a_diagnosis_is_found(cart, tmp_path):
-    """All of them: on 0.1, 1,539 of 6,000 were read as another diagnosis."""
     folder = copied(cart, tmp_path / "w")
     w = Workspace(folder)
     path = folder / "reports" / "diagnosis.json"
@@ -100,7 +93,6 @@ def test_every_flipped_byte_of_a_note_is_found(w):
 
 @pytest.mark.parametrize("which", [0, -1])
 def test_a_deleted_trial_is_found_the_last_one_too(w, which):
-    """On 0.1 `verify` counted what was left."""
     w.propose()  # this hand-out has seen the last trial
     trials = sorted(w.store.folder.glob("t*.mcap"))
     assert w.verify().damaged == ()
@@ -120,7 +112,6 @@ def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(w):
 
 
 def test_a_rewritten_candidate_with_a_checksum_of_its_own_is_found(w, tmp_path):
-    """Another workspace's c0003 is whole and predicts itself; it is not what was handed out."""
     waiting = w.propose().candidate.id
     other = learnt(tmp_path / "other", config=CONFIG.replace("x = 10.0", "x = 20.0"))
     other.propose()
@@ -132,7 +123,6 @@ def test_a_rewritten_candidate_with_a_checksum_of_its_own_is_found(w, tmp_path):
 
 
 def test_joined_workspaces_never_mix_two_policies_of_one_name(w, tmp_path):
-    """On 0.1 the two trials of c0002 were averaged, though two policies had run."""
     config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
     other = learnt(tmp_path / "other", config=config)
     assert other.task.hash == w.task.hash
@@ -153,7 +143,6 @@ def test_joined_workspaces_never_mix_two_policies_of_one_name(w, tmp_path):
 
 
 def test_a_slow_propose_does_not_replace_what_was_handed_out(w, monkeypatch):
-    """On 0.1 the second wrote over the file that a robot was about to run."""
     from grounded.search import improve
 
     plan, quick = improve.propose, []
@@ -174,7 +163,6 @@ def test_a_slow_propose_does_not_replace_what_was_handed_out(w, monkeypatch):
 
 
 def test_another_policy_never_gets_the_name_of_one_that_was_handed_out(w):
-    """Its file is gone, the robot may still run it: the next policy has another name."""
     first = w.propose().candidate
     w.candidate_path(first.id).unlink()
     w.forget()
@@ -187,53 +175,12 @@ def test_another_policy_never_gets_the_name_of_one_that_was_handed_out(w):
     assert not np.array_equal(other.policy.feedforward, first.policy.feedforward)
 
 
-def test_what_propose_knows_of_its_candidate_is_what_its_file_says(w):
-    """The process that wrote a file does not decode it: see `encoded`."""
-    made = w.propose().candidate
-    data = w.candidate_bytes(made.id)
-    (known, meta), (read, stated) = candidate_of(data, made.id), _decoded(data, made.id)
-    assert known is made and meta == stated
-    for name, own in vars(read).items():
-        mine = getattr(known, name)
-        if name == "policy":
-            for part, value in vars(own).items():
-                assert np.array_equal(value, vars(mine)[part])
-        elif isinstance(own, np.ndarray):
-            assert np.array_equal(own, mine)
-        else:
-            assert repr(own) == repr(mine) or float(own) == float(mine)  # caution: 0 and 0.0
-
-
-def test_files_that_were_read_are_not_decoded_again_but_for_few_large_ones(w, monkeypatch):
-    """Of 16 candidates each `standing` decoded 12 again, which took 2 s of a search."""
-    made = w.propose().candidate
-    data, decoded = w.candidate_path(made.id).read_bytes(), []
-    for kept in (identity.MOST_KNOWN, 0):
-        monkeypatch.setattr(identity, "MOST_KNOWN", kept)
-        monkeypatch.setattr(identity, "_DECODED", identity._Recent())
-        monkeypatch.setattr(identity, "_decoded", lambda *read: decoded.append(read) or (made, {}))
-        for _ in range(3):
-            for k in range(10):
-                candidate_of(data + bytes([k]), made.id)
-    assert len(decoded) == 10 + 30
-
-
 def test_a_hand_out_is_recorded_once(w):
     identity = w.propose().candidate.id
     count = len(w.notes.store.list())
     w.propose()
     assert len(w.notes.store.list()) == count
     assert set(w.noted.handed) == {"c0001", "c0002", identity}
-
-
-def test_a_workspace_of_an_older_version_is_read_as_it_is(w):
-    """It has no notes, and trials that name a candidate without carrying it."""
-    before = standing_in(w).utilities
-    for note in w.store.folder.glob("n*.json"):
-        note.unlink()
-    w.forget()
-    assert standing_in(w).utilities == before and w.verify().damaged == ()
-    assert w.propose().candidate is not None
 
 
 def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):
@@ -244,42 +191,3 @@ def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):
     write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial", "task": meta["task"]})
     found = w.ingest(tmp_path / "bare.mcap")
     assert w.noted.ran.keys() == {found.sha256[:16]}
-
-
-def test_a_diagnosis_is_told_apart_from_no_diagnosis(tmp_path):
-    w = make(tmp_path / "w")
-    assert read_diagnosis(w.reports) is None
-    w.reports.mkdir()
-    diagnosed(w.folder)
-    assert read_diagnosis(w.reports) is not None
-
-
-def test_a_candidate_of_another_model_is_told_as_that():
-    """Its limits and its start have other lengths than those of the task."""
-    rover, cart = rover_task(), cart_task()
-    made = SimpleNamespace(
-        policy=SimpleNamespace(
-            state_names=rover.model.state_names, input_names=rover.model.input_names
-        ),
-        predicted_states=[rover.start],
-    )
-    assert other_task(cart, made) == "a model with other states or inputs"
-
-
-def test_a_candidate_of_another_start_is_told_with_it():
-    """`another start` was read as wrong: the first row of a table had v = 0.00054 m/s."""
-    cart = cart_task()
-    then = np.array(cart.start)
-    then[0] += 0.25
-    made = SimpleNamespace(
-        policy=SimpleNamespace(
-            state_names=cart.model.state_names,
-            input_names=cart.model.input_names,
-            low=cart.low,
-            high=cart.high,
-            horizon=cart.horizon,
-        ),
-        predicted_states=[then],
-    )
-    name, unit = next(iter(cart.model.states.items()))
-    assert other_task(cart, made) == f"a start at {name} = {then[0]:.3g} {unit} then"

@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from facts import holding
-from grounded.accounts.lag import alike
-from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError
 from grounded.fit import fit
-from grounded.model import Model, Param
 from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.formats.mcap_writer import encode_doubles, rows_of_lists
-from grounded_trials.formats.protobuf import double_tag, doubles_tag, uniform_doubles
 
 RING = """
 import numpy as np
@@ -84,71 +79,11 @@ def test_a_diagnosis_says_how_many_names_it_takes():
         diagnose(model, [logged(model)])
 
 
-def test_steps_are_compiled_where_derivatives_are_too_many():
-    model = ring(100, 20)
-    assert model.system.how == "compiled steps" and "100 states" in model.system.note
-    trial = logged(model)
-    at = (trial.states[:-1], trial.inputs, model.values, 0.05)
-    slow = super(type(model.system).__mro__[1], model.system)
-    assert np.allclose(model.system.step(*at), slow.step(*at), rtol=0, atol=1e-12)
-    f_x, f_u = model.system.linearise(*at)
-    moved = np.array(trial.states[:-1])
-    moved[:, 7] += 1e-6
-    change = (model.system.step(moved, *at[1:]) - model.system.step(*at)) / 1e-6
-    assert np.allclose(change, f_x[:, :, 7], atol=1e-6) and f_u.shape == (60, 100, 20)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("n, m, how", [(20, 100, "step=step"), (100, 20, "derivative=rate")])
+@pytest.mark.parametrize("n, m, how", [(10, 60, "step=step"), (100, 20, "derivative=rate")])
 def test_a_wide_model_gets_a_candidate(n, m, how, tmp_path):
     (tmp_path / "ring.py").write_text(RING.format(n=n, m=m, how=how))
     workspace = Workspace.create(tmp_path / "w", model=tmp_path / "ring.py")
     candidate = workspace.propose().candidate
     assert candidate.policy.gain.shape == (100, m, n + m)
     assert np.abs(candidate.predicted_states).max() < 1e-3  # the target is rest
-
-
-def test_messages_of_many_numbers_are_read_in_one_piece():
-    values = np.random.default_rng(0).standard_normal((5, 300))
-    messages = encode_doubles(values)
-    buffer, lengths = b"".join(messages), [len(message) for message in messages]
-    end = np.cumsum(lengths)
-    fields = [(double_tag(number), 1) for number in range(1, 301)]
-    found = uniform_doubles(buffer, end - lengths, end, fields)
-    assert np.array_equal(np.column_stack(found), values)
-    assert uniform_doubles(buffer, end - lengths, end, [*fields[1:], fields[0]]) is None
-    assert uniform_doubles(buffer, end - lengths, end, fields[:-1]) is None
-
-
-def test_lists_of_numbers_are_read_in_one_piece():
-    rng = np.random.default_rng(0)
-    lists = [rng.standard_normal((5, count)) for count in (2, 40)]
-    messages = [row.tobytes() for row in rows_of_lists(lists)]
-    buffer, lengths = b"".join(messages), [len(message) for message in messages]
-    end = np.cumsum(lengths)
-    fields = [(doubles_tag(1, 2), 2), (doubles_tag(2, 40), 40)]
-    found = uniform_doubles(buffer, end - lengths, end, fields)
-    assert all(np.array_equal(a, b) for a, b in zip(found, lists, strict=True))
-    assert uniform_doubles(buffer, end - lengths, end, fields[::-1]) is None
-    assert uniform_doubles(buffer, end - lengths, end, [(doubles_tag(1, 42), 42)]) is None
-
-
-def test_of_many_commands_a_late_noisy_copy_is_found():
-    model = Model(
-        states={"x": "m"},
-        inputs={f"u{j}": "1" for j in range(40)},
-        params={"k": Param(1.0, "1/s", 0.1, 3.0)},
-        derivative=lambda s, a, p: {"x": -p.k * s.x + a.u0},
-    )
-    rng = np.random.default_rng(2)
-    u = np.cumsum(rng.standard_normal((603, 40)), axis=0)
-    u[3:, 31] = u[:-3, 4]
-    u = u[3:]
-    u[:, 31] += 0.02 * u[:, 31].std() * rng.standard_normal(600)
-    pairs = alike(u, 6)
-    assert (4, 31) in pairs and len(pairs) < 780
-    names = {"state_names": ("x",), "input_names": model.input_names}
-    trial = Trial(dt=0.05, states=rng.standard_normal((601, 1)), inputs=u, **names)
-    (copy,) = [f for f in preflight(model, [trial], ()).findings if f.kind == "copy"]
-    assert copy.signal == "u31" and "u4," in copy.finding
-    assert copy.delay_s == pytest.approx(0.15, abs=0.02)

@@ -1,7 +1,6 @@
 """Workspace: all state is derived from its files: configuration, model, target and trials."""
 
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -13,13 +12,11 @@ from grounded_trials.starting.examples import EXAMPLES, write_example
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import read_config
 from grounded_trials.workspace.user_files.task_file import read_target, target_arrays, write_target
-from pace import slowness
 from workspaces import CONFIG, MODEL, make
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_examples_files_say_what_its_task_is(name, tmp_path):
-    """The files that `init` writes give the very task that the studies use."""
     write_example(tmp_path, name)
     found, own = Folder(tmp_path).task, EXAMPLES[name].task()
     assert (found.dt, found.horizon, found.feedback) == (own.dt, own.horizon, own.feedback)
@@ -32,11 +29,6 @@ def test_an_examples_files_say_what_its_task_is(name, tmp_path):
     np.testing.assert_array_equal(found.model.values, own.model.values)
     text = (tmp_path / "grounded.toml").read_text()
     assert "[system]" in text and "{candidate} {trial}" in text
-
-
-def test_nothing_is_read_before_it_is_asked_for(tmp_path):
-    w = Folder(tmp_path / "nowhere")
-    assert w.store.list() == () and w.candidate_ids() == [] and w.next_id() == "c0001"
 
 
 def test_states_start_at_the_targets_first_row_else_at_0(tmp_path):
@@ -57,32 +49,6 @@ def test_input_columns_of_the_target_are_what_inputs_are_compared_with(tmp_path)
     config = CONFIG.replace("horizon = 40", "horizon = 2")
     w = make(tmp_path / "a", config=config, target="t,force,x\n0,1,0\n0.05,2,0\n0.1,9,0\n")
     assert w.task.input_target.tolist() == [[1.0], [2.0]] and w.task.past.tolist() == [1.0]
-
-
-def test_a_longer_target_is_cut_and_may_start_at_any_time(tmp_path):
-    config = CONFIG.replace("horizon = 40", "horizon = 2")
-    rows = "".join(f"{7 + 0.05 * i:.2f},{i}\n" for i in range(9))
-    assert make(tmp_path / "a", config=config, target="t,x\n" + rows).task.target[
-        :, 0
-    ].tolist() == [
-        0,
-        1,
-        2,
-    ]
-
-
-def test_parameters_of_grounded_toml_override_the_models(tmp_path):
-    changed = CONFIG.replace("[task]", "params = { mass = 3.0 }\n[task]")
-    w = make(tmp_path / "w", config=changed)
-    assert w.task.model.params["mass"].value == 3.0 and w.task.model.params["drag"].value == 0.2
-
-
-def test_a_model_by_its_import_name(tmp_path):
-    config = CONFIG.replace('file = "model.py"', 'module = "grounded.models.pendulum"')
-    config = config.replace("x = 10.0", "theta = 1").replace("force", "torque")
-    rows = "".join(f"{0.05 * i:.2f},0\n" for i in range(41))
-    w = make(tmp_path / "w", config=config, target="t,theta\n" + rows)
-    assert w.task.model.name == "pendulum"
 
 
 def test_two_workspaces_in_one_process_have_their_own_models(tmp_path):
@@ -138,18 +104,3 @@ def test_comments_and_layout_of_grounded_toml_survive_fit_apply(tmp_path):
     assert text.startswith("# mine\n") and "dt = 0.05  # 20 Hz" in text
     assert read_config(w.folder).model.params == {"mass": 2.0}
     assert read_config(w.folder).task.latency == {"force": 0.07}
-
-
-def test_a_hundred_trials_are_listed_quickly(tmp_path):
-    w = make(tmp_path / "w", config=CONFIG.replace("max_trials = 12", "max_trials = 500"))
-    grounded("-C", w.folder, "propose")
-    path = grounded("-C", w.folder, "run", "--json").json["trial_file"]
-    from grounded_trials.store.trial_file import read_trial, trial_bytes
-
-    trial, meta, policy = read_trial(path)
-    keep = {k: meta[k] for k in ("kind", "iteration", "alpha", "task")}
-    for k in range(100):
-        w.store.add(trial_bytes(trial, keep | {"number": str(k)}, policy))
-    start = time.process_time()
-    assert len(Folder(w.folder).trials()) == 100
-    assert time.process_time() - start < 3.0 * slowness()

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import holds
 from grounded.errors import GroundedError
-from grounded.search.planner import predicted
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.remarks import initial_state
 from workspaces import make
 
 
@@ -47,15 +44,7 @@ def doubtful(tmp_path):
     return w
 
 
-def test_a_doubt_that_is_settled_without_the_run_asked_for_says_so(doubtful):
-    found = ingest_log(doubtful, doubtful.worse(0.81), "c0002")
-    assert standing_in(doubtful).outstanding is None
-    (told,) = [one for one in found.notes if "once more" in one]
-    assert holds(told, "c0001 need not", "c0002", "still counts")
-
-
 def test_a_run_that_costs_the_best_its_place_is_told_as_one_more_run_of_it(doubtful):
-    """It was "no better than the best so far", without a word that the best was another now."""
     states = doubtful.best.states.copy()
     states[1:, 0] += 5.0
     write_trial(doubtful.unnamed, replace(doubtful.best, states=states), {"kind": "trial"})
@@ -65,7 +54,6 @@ def test_a_run_that_costs_the_best_its_place_is_told_as_one_more_run_of_it(doubt
 
 
 def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
-    """An arm's search asked for it, a run of the loser came first: `none is waiting`."""
     ingest_log(doubtful, doubtful.worse(0.81), "c0002")
     moved = doubtful.best.states + 1e-6
     write_trial(doubtful.unnamed, replace(doubtful.best, states=moved, candidate=""), {})
@@ -74,34 +62,3 @@ def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
     write_trial(doubtful.unnamed, replace(doubtful.best, states=moved + 1e-6, candidate=""), {})
     with pytest.raises(GroundedError, match="none is waiting"):  # one run was asked for
         ingest_log(doubtful, doubtful.unnamed)
-
-
-def test_a_run_that_lost_by_its_start_is_asked_for_again(tmp_path, monkeypatch):
-    """ "The run counts, no need to repeat it" stood above a loss that its start explained."""
-    w = make(tmp_path / "w")
-    run_candidate(w, propose_in(w).candidate.id)
-    ingest_log(w, w.folder / "runs" / "c0001-1.mcap")
-    second = propose_in(w).candidate.id
-    ran, *_ = read_trial(run_candidate(w, second).trial_file)
-    planner = w.planner
-    policy = w.candidate(second)[0].policy
-    start = planner.plan.problem(exact=True).start + np.array([0.1, 0.0])
-    there = predicted(replace(planner.plan.problem(exact=True), start=start), policy).states
-    here = predicted(planner.plan.problem(exact=True), policy).states
-    write_trial(w.folder / "off.mcap", replace(ran, states=ran.states + there - here), {})
-    # no state alone spoils the run, or the scatter of runs is as large
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.0)
-    found = ingest_log(w, w.folder / "off.mcap", second)
-    assert (found.verdict, found.to_settle) == ("in doubt", second)
-    (told,) = [one for one in found.warnings if "the run started with" in one]
-    assert holds(told, f"what {second} lost", "run once more", "by the model")
-    assert "no need" not in told
-    monkeypatch.setattr(initial_state, "_lost_by", lambda *_: -0.01)  # another of its runs did
-    told = initial_state.begun_elsewhere(w, w.task_trials()[-1]).told
-    assert holds(told, "The run counts", f"where its runs began explains much of what {second}")
-    again = propose_in(w)
-    assert again.candidate.id == second and not again.proposal.is_new
-    write_trial(w.folder / "on.mcap", ran, {})
-    found = ingest_log(w, w.folder / "on.mcap", second)
-    # its mean is still lower, and it has its two runs: now the best one may have been lucky
-    assert found.verdict == "in doubt" and found.to_settle not in ("", second)

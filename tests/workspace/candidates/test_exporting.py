@@ -6,16 +6,14 @@ import math
 import re
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cli import grounded
-from facts import holding, holds
+from cli import grounded, plain
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
-from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.candidates.proposing import propose_in
@@ -95,18 +93,6 @@ def test_a_csv_is_read_by_any_reader_that_skips_hashes(tmp_path):
         ]
     )
     np.testing.assert_array_equal(gain, policy.gain)
-    assert any("psi" in line and "wrap" in line for line in head)
-    assert any(re.search(r"steering: limits .*\bheld .*\d", line) for line in head)
-
-
-def test_the_same_candidate_is_the_same_file(tmp_path):
-    w = make(tmp_path / "w")
-    for form in ("json", "csv", "npz"):
-        path = exported(w, tmp_path, form)
-        first = path.read_bytes()
-        export_candidate(w, "c0001", form, path)
-        if form != "npz":  # a zip holds the time
-            assert path.read_bytes() == first
 
 
 def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
@@ -131,16 +117,12 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
 
 
 def test_after_the_search_an_export_asks_for_no_further_run(tmp_path):
-    """`next: export best`, then "run it, record a log, next: next LOG" of a search that ended."""
     w = make(tmp_path / "w").folder
     export = ("-C", w, "export", "best", "--runner", "-o", tmp_path / "c.npz")
     assert grounded("-C", w, "learn", "--trials", "1").code == 0
-    assert "record a log" in grounded(*export).out
     assert not grounded(*export, "--json").json["search_ended"]
     assert grounded("-C", w, "learn").code == 0
-    said = " ".join(grounded(*export).out.replace("\\", "").split())
-    assert holds(said, "the search has ended", "says how sure")
-    assert said.endswith(f"next: grounded -C {w} report --html")
+    assert plain(grounded(*export).out).endswith("next: grounded report --html\n")
     assert grounded(*export, "--json").json["search_ended"]
 
 
@@ -158,26 +140,7 @@ def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):
         export_candidate(Folder(w.folder), "best", "json", tmp_path / "b.json")
 
 
-def test_what_became_of_a_candidate_is_said_with_its_export(tmp_path):
-    """A lost candidate, and one whose run was set aside, were written without a word."""
-    w = make(tmp_path / "w")
-    ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
-    second = propose_in(w).candidate.id
-    trial = read_trial(run_candidate(w, second).trial_file)[0]
-    far = replace(trial, states=trial.states + np.array([9.0, 0.0]))
-    write_trial(tmp_path / "far.mcap", far, {"kind": "trial"})
-    lost = ingest_log(w, tmp_path / "far.mcap", second)
-    assert lost.verdict == "no better"
-    (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "a.json").notes
-    assert all(part in note for part in (second, "lost", "c0001"))
-    assert not export_candidate(Folder(w.folder), "c0001", path=tmp_path / "b.json").notes
-    assert grounded("-C", w.folder, "discard", lost.trial, "--why", "wheel off").code == 0
-    (note,) = export_candidate(Folder(w.folder), second, path=tmp_path / "c.json").notes
-    assert all(part in note for part in (lost.trial, "wheel off"))
-
-
 def test_only_the_candidates_own_export_counts_as_made(tmp_path, monkeypatch):
-    """`next:` was `next LOG` where another workspace's c0001.npz lay in the current folder."""
     mine, other = (
         make(tmp_path / name, config=CONFIG.partition("[system]")[0].replace("10.0", weight))
         for name, weight in (("w", "10.0"), ("other", "11.0"))
@@ -218,17 +181,3 @@ def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tm
     assert plain_name.code == 0 and json.loads((tmp_path / "plain").read_text())["dt"] == 0.05
     folder = grounded("-C", w.folder, "export", "c0001", "-o", ".")
     assert folder.code == 1 and "is a folder" in folder.err
-
-
-@pytest.mark.parametrize("feedback", [True, False])
-def test_the_law_that_an_export_states_is_of_what_it_holds(tmp_path, feedback):
-    """A quarter turn's JSON, open loop, had `gain_t (z - reference_t)` in its law, and neither."""
-    w = make(
-        tmp_path / "w", config=CONFIG.replace("[task]", f"[task]\nfeedback = {feedback}".lower())
-    )
-    document = json.loads(exported(w, tmp_path, "json").read_text())
-    assert ("gain_t" in document["law"]) == ("gain" in document) == feedback
-    arrays = np.load(exported(w, tmp_path, "npz"))
-    assert ("gain_t" in str(arrays["law"])) == ("gain" in arrays.files) == feedback
-    head, _, rest = exported(w, tmp_path, "csv").read_text().partition("\nt,")
-    assert ("gain_t" in head) == ("gain." in rest.splitlines()[0]) == feedback

@@ -112,178 +112,96 @@ def test_the_contracts_own_example_is_valid(with_config):
     assert task.safety_high.tolist()[0] == 1.5
 
 
-WRONG = [
-    # (what is replaced, by what, what the message must hold)
-    ("[task]", "[tasks]", ["task", "did you mean 'task'"]),
-    ("[task]", "surprise = 1\n[task]", ["[model] surprise", "is not known here"]),
-    ('file = "model.py"', 'fil = "model.py"', ["[model] fil", "did you mean 'file'"]),
-    ('file = "model.py"', "file = 3", ["[model] file", "must be a text, found 3"]),
-    ('file = "model.py"', "", ["[model] file", "exactly one of"]),
-    ('file = "model.py"', 'file = "model.py"\nmodule = "a.b"', ["[model]", "exactly one of"]),
-    (
-        'file = "model.py"',
-        'module = "no_such_thing"',
-        ["[model] module", "no_such_thing", "install"],
-    ),
-    ('file = "model.py"', 'file = "modle.py"', ["modle.py", "does not exist"]),
-    ('file = "model.py"', 'file = "../other.py"', ["../other.py", "outside the workspace"]),
-    (
-        "[task]",
-        "params = { mas = 1.0 }\n[task]",
-        ["[model] params", "'mas'", "did you mean 'mass'"],
-    ),
-    ("[task]", 'params = { mass = "1" }\n[task]', ["[model.params] mass", "must be a number"]),
-    ("[task]", "params = { mass = nan }\n[task]", ["[model.params] mass", "finite"]),
-    ("[task]", "params = 3\n[task]", ["[model] params", "must be a table"]),
-    ("[task]", "effects = [3]\n[task]", ["[model] effects", "must hold tables"]),
-    ("[task]", "effects = { }\n[task]", ["[model] effects"]),
-    ("[task]", "smoothing = -1\n[task]", ["[model] smoothing", "must not be negative"]),
-    ("dt = 0.05", "", ["[task] dt", "is missing"]),
-    ("dt = 0.05", "dt = 0", ["[task] dt", "positive"]),
-    ("dt = 0.05", "dt = -0.05", ["[task] dt", "positive"]),
-    ("dt = 0.05", "dt = inf", ["[task] dt", "finite"]),
-    ("dt = 0.05", "dt = true", ["[task] dt", "must be a number, found True"]),
-    ("dt = 0.05", "dt = 1" + "0" * 400, ["[task] dt"]),
-    (
-        "dt = 0.05",
-        "dt = 0.06",
-        ["[task] dt = 0.06", "are 0.05 s apart", "set dt = 0.05"],
-    ),
-    ("dt = 0.05", "DT = 0.05", ["[task] DT", "did you mean 'dt'"]),
-    ("horizon = 40", "horizon = 0", ["[task] horizon", "at least 1"]),
-    ("horizon = 40", "horizon = 4.5", ["[task] horizon", "whole number"]),
-    ("horizon = 40", "horizon = 50", ["target.csv has 41 rows", "needs 51", "horizon = 40"]),
-    ("horizon = 40", "horizon = 1" + "0" * 30, ["horizon"]),
-    ('target = "target.csv"', 'target = "t.csv"', ["t.csv does not exist", "[task] target"]),
-    ('target = "target.csv"', 'target = "/etc/passwd"', ["outside the workspace"]),
-    ("horizon = 40", "horizon = 40\nfeedback = 1", ["[task] feedback", "true or false"]),
-    (
-        "horizon = 40",
-        "horizon = 40\nstart = { vv = 0 }",
-        ["[task] start", "'vv'", "did you mean 'v'"],
-    ),
-    ("horizon = 40", "horizon = 40\nstart = 3", ["[task] start", "must be a table"]),
-    (
-        "horizon = 40",
-        "horizon = 40\nlatency = { forc = 0.1 }",
-        ["[task] latency", "did you mean 'force'"],
-    ),
-    ("horizon = 40", "horizon = 40\nlatency = { force = 9 }", ["[task] latency of force", "2.5 s"]),
-    ("horizon = 40", "horizon = 40\nlatency = { force = -1 }", ["[task] latency of force"]),
-    (
-        "state = { x = 10.0 }",
-        "state = { y = 10.0 }",
-        ["[reward.state] y", "valid names: v, x|x, v"],
-    ),
-    (
-        "state = { x = 10.0 }",
-        "state = { v = 1 }",
-        ["weighs state 'v'", "target", "add the column 'v'"],
-    ),
-    ("state = { x = 10.0 }", "state = { x = -1 }", ["[reward] state", "not negative"]),
-    ("state = { x = 10.0 }", "state = { x = 0 }", ["[reward]", "weighs no state"]),
-    ("state = { x = 10.0 }", "states = { x = 1 }", ["[reward] states", "did you mean 'state'"]),
-    ("state = { x = 10.0 }", "state = 3", ["[reward] state", "must be a table"]),
-    ("force = [-5.0, 5.0]", "forc = [-5, 5]", ["[limits] forc", "did you mean 'force'"]),
-    ("force = [-5.0, 5.0]", "force = 5", ["[limits] force"]),
-    ("force = [-5.0, 5.0]", "force = [5]", ["[limits] force", "must be [low, high]"]),
-    ("force = [-5.0, 5.0]", 'force = ["a", 5]', ["[limits] force", "must be a number"]),
-    ("force = [-5.0, 5.0]", "force = [5, -5]", ["[limits] force", "below the upper limit"]),
-    ("force = [-5.0, 5.0]", "force = [nan, 5]", ["[limits] force"]),
-    ("[search]", "[safety]\nz = [0, 1]\n[search]", ["[safety] z", "valid names"]),
-    ("[search]", "[safety]\nx = [1, 0]\n[search]", ["[safety] x", "must be below"]),
-    ("max_trials = 12", "max_trial = 12", ["[search] max_trial", "did you mean 'max_trials'"]),
-    ("max_trials = 12", "max_trials = 0", ["[search] max_trials", "1 to"]),
-    ("max_trials = 12", 'method = "dpp"', ["[search] method", "did you mean 'ddp'"]),
-    ("max_trials = 12", 'step = "fulll"', ["[search] step", "did you mean 'full'"]),
-    ("max_trials = 12", "step = 3", ["[search] step", "must be a text"]),
-    ("max_trials = 12", "refit = 0", ["[search] refit", "true or false"]),
-    ("max_trials = 12", "repeats = 0", ["[search] repeats"]),
-    ("max_trials = 12", "max_halvings = 99", ["[search] max_halvings", "0 to 30"]),
-    ("max_trials = 12", "tolerance = 2", ["[search] tolerance"]),
-    ('model = "real.py"', 'modell = "real.py"', ["[system] modell", "did you mean 'model'"]),
-    ('model = "real.py"', 'model = "reel.py"', ["reel.py", "does not exist", "[system]"]),
-    ('model = "real.py"', 'model = "real.py"\ncommand = "x"', ["[system] command", "not both"]),
-    ('model = "real.py"', 'model = "real.py"\nseed = -1', ["[system] seed"]),
-    ('model = "real.py"', 'model = "real.py"\nseed = 0.5', ["[system] seed", "whole number"]),
-    (
-        'model = "real.py"',
-        'model = "real.py"\nnoise = { strat = { x = 1 } }',
-        ["[system.noise] strat", "did you mean 'start'"],
-    ),
-    (
-        'model = "real.py"',
-        'model = "real.py"\nnoise = { start = { xx = 1 } }',
-        ["[system.noise.start] xx", "did you mean 'x'"],
-    ),
-    (
-        'model = "real.py"',
-        'model = "real.py"\nnoise = { start = { x = -1 } }',
-        ["[system.noise.start] x", "must not be negative"],
-    ),
-    ('clock = "header"', 'clock = "haeder"', ["[log] clock", "did you mean 'header'"]),
-    ('clock = "header"', 'clok = "header"', ["[log] clok", "did you mean 'clock'"]),
-    ("[log.state.x]", "[log.state.xx]", ["[log.state] xx", "did you mean 'x'"]),
-    ("[log.state.x]", "[log.stat.x]", ["[log] stat", "did you mean 'state'"]),
-    ('path = "/odom.x"', "", ["[log.state.x] path", "is missing"]),
-    ('path = "/odom.x"', "path = 3", ["[log.state.x] path", "must be a text"]),
-    ('path = "/odom.x"', 'path = "/odom.x["', ["[log.state.x] path", "expected"]),
-    ("unwrap = true", 'unwrap = "yes"', ["[log.state.x] unwrap", "true or false"]),
-    ("scale = 1.0", "scael = 1.0", ["[log.state.x] scael", "did you mean 'scale'"]),
-    ("scale = 1.0", "scale = 0.0", ["[log.state.x] scale"]),
-    ("delay_s = 0.01", "delay_s = inf", ["[log.state.x] delay_s", "finite"]),
-    ("max_age_s = 0.2", "max_age_s = 0", ["[log.state.x] max_age_s", "positive"]),
-    ("max_age_s = 0.2", "max_age_s = -1.0", ["[log.state.x] max_age_s", "positive"]),
-    ('resample = "linear"', 'resample = "cubic"', ["[log.state.x] resample", "linear"]),
-    ("[log.input.force]", "[log.input.farce]", ["[log.input] farce", "did you mean 'force'"]),
-    ("end = 5.0", 'end = "first-input"', ["[log.span] end", "time in seconds"]),
-    ("end = 5.0", "end = [1]", ["[log.span] end"]),
-    ("end = 5.0", "ende = 5.0", ["[log.span] ende", "did you mean 'end'"]),
-    ("above = 0 }", "abov = 0 }", ["[log.span.start] abov", "did you mean 'above'"]),
-    ("above = 0 }", "above = 0, below = 1 }", ["[log.span] start", "exactly one of"]),
-    (", above = 0 }", " }", ["[log.span] start", "exactly one of"]),
-    (
-        "measured = { x = 0.002 }",
-        "measured = { xx = 1 }",
-        ["[estimate.measured] xx", "did you mean 'x'"],
-    ),
-    ("measured = { x = 0.002 }", "measured = { x = 0 }", ["[estimate] measured.x", "positive"]),
-    ("measured = { x = 0.002 }", "mesured = { x = 1 }", ["[estimate]", "meas"]),
-    ("process = { v = 0.1 }", "process = { v = -1 }", ["[estimate] process.v", "positive"]),
-]
+# what is replaced | by what | what the message names
+WRONG = r"""
+[task] | [tasks] | 'task'
+[task] | surprise = 1\n[task] | [model] surprise
+file = "model.py" | fil = "model.py" | [model] fil, 'file'
+file = "model.py" | file = 3 | [model] file
+file = "model.py" |  | [model] file
+file = "model.py" | file = "model.py"\nmodule = "a.b" | [model]
+file = "model.py" | module = "no_such_thing" | [model] module
+file = "model.py" | file = "modle.py" | modle.py
+file = "model.py" | file = "../other.py" | ../other.py
+[task] | params = { mas = 1.0 }\n[task] | [model] params, 'mass'
+[task] | params = { mass = "1" }\n[task] | [model.params] mass
+[task] | effects = [3]\n[task] | [model] effects
+[task] | smoothing = -1\n[task] | [model] smoothing
+dt = 0.05 |  | [task] dt
+dt = 0.05 | dt = 0 | [task] dt
+dt = 0.05 | dt = 0.06 | [task] dt = 0.06
+dt = 0.05 | DT = 0.05 | [task] DT, 'dt'
+horizon = 40 | horizon = 0 | [task] horizon
+horizon = 40 | horizon = 50 | target.csv
+target = "target.csv" | target = "t.csv" | t.csv, [task] target
+target = "target.csv" | target = "/etc/passwd" | outside the workspace
+horizon = 40 | horizon = 40\nfeedback = 1 | [task] feedback
+horizon = 40 | horizon = 40\nstart = { vv = 0 } | [task] start, 'v'
+horizon = 40 | horizon = 40\nlatency = { forc = 0.1 } | [task] latency, 'force'
+horizon = 40 | horizon = 40\nlatency = { force = 9 } | [task] latency of force
+state = { x = 10.0 } | state = { y = 10.0 } | [reward.state] y
+state = { x = 10.0 } | state = { v = 1 } | weighs state 'v'
+state = { x = 10.0 } | state = { x = -1 } | [reward] state
+state = { x = 10.0 } | state = { x = 0 } | [reward]
+force = [-5.0, 5.0] | forc = [-5, 5] | [limits] forc, 'force'
+force = [-5.0, 5.0] | force = [5, -5] | [limits] force
+[search] | [safety]\nz = [0, 1]\n[search] | [safety] z
+max_trials = 12 | max_trial = 12 | [search] max_trial, 'max_trials'
+max_trials = 12 | method = "dpp" | [search] method, 'ddp'
+max_trials = 12 | max_halvings = 99 | [search] max_halvings
+model = "real.py" | model = "reel.py" | reel.py, [system]
+model = "real.py" | model = "real.py"\ncommand = "x" | [system] command
+model = "real.py" | model = "real.py"\nseed = -1 | [system] seed
+model = "real.py" | model = "real.py"\nnoise = { start = { xx = 1 } } | [system.noise.start] xx, 'x'
+model = "real.py" | model = "real.py"\nnoise = { start = { x = -1 } } | [system.noise.start] x
+clock = "header" | clock = "haeder" | [log] clock, 'header'
+[log.state.x] | [log.state.xx] | [log.state] xx, 'x'
+path = "/odom.x" |  | [log.state.x] path
+path = "/odom.x" | path = "/odom.x[" | [log.state.x] path
+scale = 1.0 | scael = 1.0 | [log.state.x] scael, 'scale'
+scale = 1.0 | scale = 0.0 | [log.state.x] scale
+delay_s = 0.01 | delay_s = inf | [log.state.x] delay_s
+max_age_s = 0.2 | max_age_s = 0 | [log.state.x] max_age_s
+resample = "linear" | resample = "cubic" | [log.state.x] resample
+[log.input.force] | [log.input.farce] | [log.input] farce, 'force'
+end = 5.0 | end = "first-input" | [log.span] end
+end = 5.0 | ende = 5.0 | [log.span] ende, 'end'
+above = 0 } | abov = 0 } | [log.span.start] abov, 'above'
+, above = 0 } |  } | [log.span] start
+measured = { x = 0.002 } | measured = { xx = 1 } | [estimate.measured] xx, 'x'
+measured = { x = 0.002 } | mesured = { x = 1 } | [estimate]
+process = { v = 0.1 } | process = { v = -1 } | [estimate] process.v
+"""
 
 
-@pytest.mark.parametrize(("old", "new", "parts"), WRONG, ids=[w[1][:40] or w[0] for w in WRONG])
-def test_what_is_wrong_is_one_sentence(with_config, old, new, parts):
-    text = CONFIG + LOG
-    assert old in text
-    workspace = with_config(text.replace(old, new, 1))
+@pytest.mark.parametrize("row", WRONG.split("\n")[1:-1])
+def test_what_is_wrong_is_one_sentence_that_names_it(with_config, row):
+    old, new, parts = (part.strip().replace("\\n", "\n") for part in row.split("|"))
+    assert old in CONFIG + LOG
+    workspace = with_config((CONFIG + LOG).replace(old, new, 1))
     with pytest.raises(GroundedError) as caught:
         everything(workspace)
     message = str(caught.value)
-    for part in parts:
-        assert any(p in message for p in part.split("|")), message
+    assert all(part in message for part in parts.split(", ")), message
     assert "\n" not in message.strip() and len(message) < 400
     assert any(name in message for name in ("grounded.toml", "target", ".py")), message
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
+    ("text", "named"),
     [
-        ("[model\n", ["grounded.toml is not valid TOML", "line 2|end of document|line 1"]),
-        ("[task]\ndt = 0.05\ndt = 0.1\n", ["not valid TOML", "line 3|end of document"]),
-        ("", ["[model] file"]),
-        ("model = 3", ["grounded.toml", "model", "must be a table"]),
-        ("[modle]\nfile = 'model.py'", ["modle", "did you mean 'model'"]),
-        ("\ufeff[model]", ["grounded.toml"]),
+        ("[model\n", "grounded.toml"),
+        ("[task]\ndt = 0.05\ndt = 0.1\n", "grounded.toml"),
+        ("", "[model] file"),
+        ("model = 3", "model"),
+        ("[modle]\nfile = 'model.py'", "'model'"),
+        ("\ufeff[model]", "grounded.toml"),
     ],
     ids=["cut", "twice", "empty", "no table", "typo", "bom"],
 )
-def test_a_file_that_is_not_toml_or_not_ours(with_config, text, parts):
-    with pytest.raises(GroundedError) as caught:
+def test_a_file_that_is_not_toml_or_not_ours(with_config, text, named):
+    with pytest.raises(GroundedError, match=holding(named)):
         everything(with_config(text))
-    for part in parts:
-        assert any(p in str(caught.value) for p in part.split("|")), str(caught.value)
 
 
 def test_a_folder_that_is_no_workspace(tmp_path):
@@ -340,9 +258,8 @@ GOOD = tomllib.loads(CONFIG + LOG)
 
 @pytest.mark.slow
 @given(st.sampled_from(sorted(keys_of(GOOD))), VALUES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, value):
-    """Whatever stands at a key: a task, or a GroundedError; never another exception."""
     from grounded_trials.workspace.user_files import config as module
 
     folder = tmp_path_factory.getbasetemp() / "garbage"
@@ -360,7 +277,7 @@ def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, val
 
 
 @given(st.text(max_size=200))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
     folder = tmp_path_factory.getbasetemp() / "text"
     folder.mkdir(exist_ok=True)
@@ -370,25 +287,22 @@ def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
 
 
 @pytest.mark.parametrize(
-    ("effect", "holds"),
+    ("effect", "facts"),
     [
-        ('name = "delay:force"', "needs a value for 'd'"),
-        ('name = "delay:force", d = 0.02, dd = 3.0', "has no quantity 'dd': did you mean 'd'"),
-        ('name = "delay:force", d = -0.02', "d = -0.02 is out of bounds: expected at least 0"),
-        ('name = "delay:force", d = nan', "d must be a number"),
-        ('name = "dead_zone:force", c = -5.0', "c = -5 is out of bounds: expected at least 0"),
-        ('name = "input_gain:force", g = 9.0', "expected at least -3 and at most 5"),
-        ('name = "viscous_friction:v"', "needs a value for 'k'"),
+        ('"delay:force"', ("'d'",)),
+        ('"delay:force", d = 0.02, dd = 3.0', ("'dd'", "'d'")),
+        ('"delay:force", d = -0.02', ("-0.02", "0")),
+        ('"delay:force", d = nan', ("d", "number")),
+        ('"input_gain:force", g = 9.0', ("9", "-3", "5")),
     ],
 )
-def test_an_adopted_effect_is_whole_and_possible(tmp_path, effect, holds):
-    text = CONFIG.replace("[task]", f"effects = [{{ {effect} }}]\n[task]")
-    with pytest.raises(GroundedError, match=r"grounded.toml: \[model\] effects: ") as raised:
-        _ = make(tmp_path / "w", config=text).planner
-    assert holds in str(raised.value)
+def test_an_adopted_effect_is_whole_and_possible(with_config, effect, facts):
+    text = CONFIG.replace("[task]", f"effects = [{{ name = {effect} }}]\n[task]")
+    with pytest.raises(GroundedError, match=holding("grounded.toml", "effects", *facts)):
+        _ = with_config(text).planner
 
 
-def test_bounds_that_the_data_chose_are_none(tmp_path):
+def test_bounds_that_the_data_chose_are_none(with_config):
     big = "[{ name = 'dead_zone:force', c = 3.0 }, { name = 'delay:force', d = 1.5 }]"
     text = CONFIG.replace("[task]", f"effects = {big}\n[task]")
-    assert make(tmp_path / "w", config=text).planner.plan.latency[0] == 1.5
+    assert with_config(text).planner.plan.latency[0] == 1.5

@@ -1,0 +1,112 @@
+"""What the page's panels, tables and lists hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.report import Diagnosis
+from grounded_trials.report.calmed import WINDOWS
+from grounded_trials.report.figures.gap import forecast_figures
+from grounded_trials.report.figures.runs import bias_figure, error_figure, state_figure
+from grounded_trials.report.findings import ESTIMATED, Log
+from grounded_trials.report.page.causes import adopted, causes
+from grounded_trials.report.page.page import page
+from grounded_trials.report.page.tables import forecast_table
+from grounded_trials.report.settled import Settled
+from reported import DIAGNOSIS, car, cart, gathered, many_flights
+
+__all__ = ["car", "cart"]
+
+
+def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
+    findings = many_flights(1)
+    (run,), dt = findings.runs, findings.task.dt
+    steps, n = run.residual.shape
+    noise = np.random.default_rng(0).normal(0, 0.005, (steps + 1, n))
+    course = 0.1 * dt * np.sin(np.linspace(0, 7, steps))[:, None]
+    noisy = replace(run, residual=course + np.diff(noise, axis=0))
+    figure, window = bias_figure(replace(findings, runs=(noisy,))), -(-steps // WINDOWS)
+    for panel in figure.panels:
+        (curve,) = panel.curves
+        np.testing.assert_allclose(np.diff(curve.x), window * dt)
+        assert curve.x[0] == pytest.approx(0.5 * (window - 1) * dt) and panel.note
+        drawn = np.interp(curve.x, dt * np.arange(steps), course[:, 0] / dt)
+        assert np.abs(curve.y - drawn).max() < 0.05 < np.ptp(noise) / dt
+
+
+@pytest.mark.parametrize(("logs", "states_first"), [(1, True), (24, False)])
+def test_many_logs_are_rows_of_the_table_of_forecasts(cart, logs, states_first):
+    findings = gathered(cart)
+    trial = findings.runs[0].trial
+    data = tuple(
+        Log(replace(trial, id=f"d{k:02d}"), findings.runs[0].residual) for k in range(logs)
+    )
+    few = replace(findings, runs=(), logs=data, better=None)
+    _, made, *_ = forecast_table(few)
+    states = findings.task.model.states
+    assert len(made.header) == (2 + logs if states_first else 1 + len(states))
+    assert len(made.rows) == (len(states) if states_first else logs)
+    assert all(len(row) == len(made.header) for row in made.rows)
+    _, single, *_ = forecast_table(replace(few, logs=data[:1]))
+    of_first = [row[2] for row in single.rows]
+    assert of_first == ([row[2] for row in made.rows] if states_first else list(made.rows[0][1:]))
+
+
+def weighed(findings, **weights):
+    """The findings with other weights on the states along the way, none at the end."""
+    names = findings.task.model.state_names
+    state = np.array([weights.get(name, 0.0) for name in names])
+    reward = replace(findings.task.reward, state=state, terminal=0 * state)
+    target = np.nan_to_num(findings.task.target)
+    return replace(findings, task=replace(findings.task, reward=reward, target=target))
+
+
+def test_no_path_is_desired_of_a_state_without_a_weight(car):
+    findings = weighed(gathered(car), x=10.0, y=10.0)
+    states, errors = state_figure(findings), error_figure(findings)
+    assert states is not None and errors is not None
+    desired = {p.title for p in states.panels if any(c.role == "desired" for c in p.curves)}
+    assert desired == {"x [m]", "y [m]"} and "v [m/s]" in {p.title for p in states.panels}
+    assert not any(p.title.startswith(("v ", "psi ")) for p in errors.panels)
+    assert not any(dot.role == "desired" for p in states.panels for dot in p.dots)
+
+
+def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):
+    findings = gathered(cart)
+    assert findings.estimated == () and ESTIMATED not in page(findings)
+    findings = replace(findings, estimated=("v",))
+    states = state_figure(findings)
+    assert states is not None
+    for figure in (states, forecast_figures(findings)[0]):
+        notes = {p.title: p.note for p in figure.panels}
+        assert ESTIMATED in notes["v [m/s]"] and ESTIMATED not in notes["x [m]"]
+
+
+def test_each_cause_is_an_item_with_its_worth_values_and_ties():
+    tied = {"k": {"value": 0.25, "std": 0.02, "unit": "1/m"}}
+    ranking = [one | {"claimed": k == 0} for k, one in enumerate(DIAGNOSIS["ranking"])]
+    ranking.append({"effect": "quadratic_drag:v", "params": tied, "evidence": 39.0})
+    said = {"kind": "several", "effects": ["viscous_friction:v"], "parameters": ["mass"]}
+    said["causes"] = ["mass is off", "friction slows v"]
+    credit = [
+        {"of": "calibration", "share": 0.7, "times": 8.0},
+        {"of": "viscous_friction:v", "share": 0.3, "times": 1.46},
+    ]
+    more = {"verdict": said, "credit": credit, "ranking": ranking}
+    own, friction = causes(Diagnosis.from_json(DIAGNOSIS | more))
+    assert "8.0 times" in own.text and "mass = 1.400 +- 0.020 kg" in own.values
+    assert "46 %" in friction.text
+    assert (friction.name, friction.values) == ("viscous_friction:v", "k = 0.300 +- 0.010 1/s")
+    assert friction.ties == (("quadratic_drag:v", "k = 0.250 +- 0.020 1/m"),)
+
+
+def test_what_was_adopted_is_a_list_if_it_is_more_than_one():
+    rows = (("viscous_friction:v", "k = 0.30 +- 0.01 1/s"), ("mass", "1.40 +- 0.02 kg, was 1"))
+    both = Settled(("friction slows v", "mass 1.00 -> 1.40 kg"), rows=rows)
+    friction, mass = adopted(both)
+    assert friction.text and friction.values == rows[0][1]
+    assert (mass.text, mass.name, mass.values) == ("", *rows[1])
+    assert adopted(Settled(("friction slows v",), rows=rows[:1])) == adopted(None) == []
