@@ -179,8 +179,6 @@ def test_a_branch_not_taken_never_leaks_nan():
 
 @pytest.mark.parametrize("eps", [0.0, 0.05])
 def test_what_is_infinitely_steep_at_rest_has_a_slope_there(eps):
-    """A drag by np.hypot(vx, vy) from rest: its slope was 0/0, and the plan a free fall."""
-
     def drag(s, a, p):
         speed = np.hypot(s.x, s.v)
         return {
@@ -212,8 +210,6 @@ def test_smoothing_narrows_to_the_exact_branch():
 
 
 def test_what_depends_on_parameters_alone_is_never_smoothed():
-    """A guard of a time constant is no corner of the run: 40 ms had been planned as 52 ms."""
-
     def lag(s, a, p, dt):
         tau = np.maximum(p.tau, 1e-6)
         sign = np.where(p.tau > 0.03, 1.0, -1.0)

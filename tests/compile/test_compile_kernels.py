@@ -329,7 +329,6 @@ def test_a_run_by_itself_is_the_run_beside_others(delays):
 
 @pytest.mark.slow
 def test_an_arm_with_six_adopted_effects_is_compiled_with_its_derivatives():
-    """Those were 18,749 operations, more than 14,000: a proposal took 70 s instead of 12 s."""
     effects = [
         ("delay:tau1+tau2", {"d": 0.0149}),
         ("joint_friction:tau1<-w1", {"c": 0.754, "b": 0.314}),

@@ -78,7 +78,6 @@ def test_volts_are_said_to_be_counted_before_or_after_a_gain_of_their_input():
 
 
 def test_a_gain_beside_a_curve_of_its_input_says_at_which_command():
-    """Both change the gain: `48 % stronger` was so at 2.4 A and at no other current."""
     gain, other = (Library().effect(name, arm) for name in (GAIN, "input_gain:t2"))
     curve = Library().effect("input_curve:t1", arm)
     peak = next(q.start for q in curve.quantities if q.name == "U")
@@ -97,7 +96,6 @@ def test_a_gain_beside_a_curve_of_its_input_says_at_which_command():
 
 
 def test_the_smallest_of_many_are_told_in_words_with_their_values():
-    """A crane's dead zone was `also viscous_friction:w and dead_zone:u`, without a value."""
     late = "delay:t1+t2"
     names = [INERTIA, ONE, "calibration", GAIN, BIAS, late, "dead_zone:t2"]
     VALUES["dead_zone:t2"] = {"c": Estimate(0.255, 0.02, unit="N m")}
@@ -188,7 +186,6 @@ def test_a_cause_on_which_trials_disagree_stands_alone():
     ],
 )
 def test_a_gain_of_a_power_of_ten_asks_for_the_unit_of_the_log(g, said):
-    """A thrust in percent was 90.8 % weaker than modelled, to be adopted."""
     told = other_unit("input_gain:thrust", {"g": Estimate(g, 0.01)})
     assert (said in told and "unit" in told) if said else told == ""
     assert other_unit("delay:thrust", {"d": Estimate(g, 0.01)}) == ""

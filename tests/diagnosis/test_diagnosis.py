@@ -179,7 +179,6 @@ def test_parameters_that_are_off_are_named_most_important_first():
 
 
 def test_a_parameter_that_did_not_move_is_not_blamed_for_those_that_did():
-    """A motor's gain was right to 0.2 %, and blamed: mass and inertia were 12 % and 14 % off."""
     ratios = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])  # K, m, I: K / m and K / I are known
     H, b = 3000 * ratios.T @ ratios + np.eye(3), np.array([-0.02, 1.8, 2.1])
     free, _ = fewest(H, b, range(3))

@@ -106,7 +106,6 @@ def test_an_interval_is_as_wide_as_what_is_wrong_along_the_manoeuvre():
 
 
 def test_predictions_start_from_filtered_states_wherever_the_track_lies():
-    """Behind a kink a track may stay where it was measured, nearly as noisy as the sensors."""
     trials, quiet = runs(1.5, noise=20.0), runs(1.5, noise=0.0)
     data = prepare(axis(1.5), trials)
     predictor = Predictor(data)

@@ -103,7 +103,6 @@ def test_an_older_document_is_read_with_what_it_has():
 
 
 def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
-    """They were {}, which a script takes for an effect without quantities."""
     found = Diagnosis.from_json(DIAGNOSIS)
     with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
         found.values("drag:v")

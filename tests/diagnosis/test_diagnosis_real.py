@@ -1,7 +1,4 @@
-"""Real systems whose authors published what the model lacks (../shared/data, each SOURCE.md).
-
-Their logs become MCAP trials, which are ingested and diagnosed by the commands that a user types.
-"""
+"""Real systems whose authors published what the model lacks (../shared/data, each SOURCE.md)."""
 
 import numpy as np
 import pytest
@@ -56,10 +53,7 @@ def values(document, effect):
 @pytest.mark.slow
 @needs_data
 def test_the_servo_has_a_speed_limit_and_a_delay():
-    """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up.
-
-    These runs, 11 of 32, do not tell what of the delay is in the log.
-    """
+    """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up."""
     found = diagnose(SERVO.model, SERVO.read()[:22:2])
     named = {row.effect: row.params for row in found.ranking if row.claimed}
     assert 1.0 < named["slew_limit:position"]["r"].value < 1.7

@@ -69,7 +69,6 @@ def late(findings):
 
 
 def test_one_message_is_late_as_a_whole(trials):
-    """Only the heading was corrected, which its rate tells; side slip took the rest."""
     assert set(late(preflight(ROVER, trials).findings)) == {"psi"}
     found = preflight(ROVER, trials, one_message=POSE)
     assert late(found.findings) == pytest.approx(dict.fromkeys(POSE, LATE), abs=0.004)

@@ -61,7 +61,6 @@ def row(crude, after, floor=None, **more):
 
 
 def test_what_the_task_follows_is_named_before_what_improves_by_hardly_more():
-    """The README's verdict named the steering angle and the speed, not where the car went."""
     some = row({"x": 1.0, "v": 1.0}, {"x": 0.15, "v": 0.01})
     units = {**UNITS, "w": "1/s"}
     three = replace(
@@ -90,7 +89,6 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
 
 
 def test_every_state_that_gets_worse_is_told_at_the_horizon_where_it_loses_most():
-    """Of a docking robot only `y 0.5 s ahead` was told, but x was 12 % worse 1 s ahead."""
     near = row({"x": 1.8e-3, "y": 1.3e-3}, {"x": 1.7e-3, "y": 1.5e-3}, horizon_s=0.5)
     far = row({"x": 2.97e-3, "y": 2.55e-3}, {"x": 3.33e-3, "y": 2.75e-3})
     named = {"unit_by_channel": {"x": "m", "y": "m"}, "noise_floor": {"x": 1e-3, "y": 1e-3}}
@@ -158,7 +156,6 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
 
 
 def test_what_ties_and_gains_little_beside_a_gap_is_not_to_be_adopted():
-    """An aircraft's sideslip: "the log of the heading is 0.187 s old", which it was not."""
     little, much = (row({"x": 2.0, "v": 1.0}, {"x": x, "v": 1.0}) for x in (1.7, 0.5))
     pair, own = ("sensor_delay:psi", "coupling:p<-phi"), ("sensor_delay:psi",)
     left, wide = ([Remainder("x", error=e, floor=1.0)] for e in (1.5, 3.0))
@@ -242,7 +239,6 @@ def test_a_slow_plant_is_spoken_of_by_whole_trials():
 
 
 def test_the_same_figures_are_not_shown_twice():
-    """A boat's `now` and `as diagnosed` were the same to all digits shown: nothing was claimed."""
     alike = row({"x": 0.02518153, "v": 0.5}, {"x": 0.02518557, "v": 0.5})
     better = row({"x": 0.02518153, "v": 0.5}, {"x": 0.024, "v": 0.5})
     for one, causes, columns in ((alike, (), 1), (better, (), 2), (alike, ("b",), 2)):
@@ -284,8 +280,6 @@ def test_down_to_the_noise_is_said_at_the_floor_alone():
 
 
 def test_what_noise_of_few_repeats_does_not_tell_is_no_explanation_down_to_the_noise():
-    """x was off by 1.8 times a noise known to a factor of 3.4: "down to the noise", the page said,
-    and 53 % unexplained."""
     rows = (row({"x": 0.31, "v": 0.1}, {"x": 1.6e-3, "v": 0.1}, {"x": 9.1e-4, "v": 0.1}),)
     few = (replace(rows[0], floor_unsure=0.41),)
     assert "1.8 times" in rest(rows) and not in_doubt(rows) and not rest(few)
@@ -307,7 +301,6 @@ def test_a_leftover_within_the_noise_is_stated_by_what_tells_it_from_noise():
 
 
 def test_what_a_cause_is_worth_is_the_same_in_the_sentence_and_in_the_table():
-    """It was a share of logarithms, which nobody could know."""
     effect = Library().effect("viscous_friction:v", cart_task().model)
     k = {"k": Estimate(0.3, unit="1/s")}
     best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
@@ -336,7 +329,6 @@ def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():
 
 
 def test_what_two_logs_by_hand_show_needs_no_third():
-    """Another log was asked for, recorded and asked for again: a delay showed in both."""
     seen = Unconfirmed("delay:v", trial="t1", seen=(2, 8), trials=("t1", "t9"))
     by_hand = next_trial(_claims(), "", (), (seen,), (), {"t1": LOG, "t9": LOG})
     assert holds(by_hand, "No trial is needed", "t1 and t9", "delay:v") and "record" not in by_hand
@@ -347,7 +339,6 @@ def test_what_two_logs_by_hand_show_needs_no_third():
 
 
 def test_a_sensor_that_may_be_late_or_filtered_is_told_as_both():
-    """One that was 0.12 s late was told as a filter of 0.124 s, as if that was sure."""
     alike = (
         Likeness("sensor_lag:v", "sensor_delay:v", 0.995),
         Likeness("sensor_delay:u", "sensor_lag:u", 0.991),
@@ -362,7 +353,6 @@ def test_a_sensor_that_may_be_late_or_filtered_is_told_as_both():
 
 
 def test_a_delay_acts_at_every_place():
-    """It showed "where y < -3.95 m", where only the drive by hand went."""
     late, patch = (Library().effect(name, car.model) for name in ("delay:throttle", "patch:v"))
     assert _anywhere(late) == ("x", "y") and _anywhere(patch) == ()
 
@@ -439,8 +429,6 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
 
 
 def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
-    """The same inputs can't be sent by a candidate with feedback, and a best of two runs has a
-    repeat."""
     task = cart_task()
     names = task.model.state_names, task.model.input_names
     H, n, m = task.horizon, task.model.n, task.model.m
@@ -476,7 +464,6 @@ def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
 
 
 def test_an_adopted_effect_that_may_be_none_is_told():
-    """A boat's drift of the speed, adopted at 0.181 +- 0.027, was 0.050 +- 0.079 later."""
     adopted = ("offset:u", "joint_friction:t1<-q1")
     known = {
         "offset_u_c": Estimate(0.05, 0.079, None, "m/s^2"),

@@ -7,8 +7,6 @@ from grounded.figures.interactive import plotted
 
 
 def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
-    """It was drawn on the line, at the trial's length, as if it were the error 2 s ahead."""
-
     def row(seconds, error, whole=False):
         return RulerRow(seconds, whole, {"x": "m"}, crude={"x": error}, with_effects={"x": error})
 
@@ -28,8 +26,6 @@ def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
 
 
 def test_noise_of_zero_is_in_the_caption_and_not_in_the_legend():
-    """A logarithmic axis cannot show it: the legend named a curve that was nowhere."""
-
     def figure(noise):
         rows = [
             RulerRow(

@@ -65,7 +65,6 @@ def _row(**more):
 
 @pytest.mark.parametrize("claimed", [3, EFFECTS + 1])
 def test_a_claimed_or_tied_effect_always_has_a_row_in_the_table(claimed):
-    """The ninth claimed effect was missing, because the ranking was cut first."""
     names = [f"viscous_friction:v{k}" for k in range(EFFECTS + 4)]
     ranking = tuple(
         Ranked(name, {}, {}, 100.0 - k, claimed=k < claimed) for k, name in enumerate(names)
@@ -129,7 +128,6 @@ def test_noise_from_trials_that_are_merely_alike_is_a_bound_everywhere():
 
 
 def test_the_noise_of_the_sentence_is_the_noise_of_the_table():
-    """0.5 of 0.37 was "at most that", beside 0.37 in the table."""
     row = replace(_row(floor_at_most=True), noise_floor={"v": 0.37})
     assert "at most 0.37 m/s" in improvement((row,))
     left = Remainder("v", error=0.5, floor=0.37, horizon_s=1.0, error_unit="m/s")
@@ -137,7 +135,6 @@ def test_the_noise_of_the_sentence_is_the_noise_of_the_table():
 
 
 def test_an_error_no_larger_than_a_bound_of_the_noise_does_not_read_as_if_nothing_was_left():
-    """Of a flexible arm, 0.0029 rad were left; "noise: at most 0.0026 rad", really 0.00045."""
     row = replace(_row(floor_at_most=True), noise_floor={"v": 0.45})
     said = improvement((row,))
     assert "0.45" not in said and said.endswith("is not known: repeat one run to see.")

@@ -55,7 +55,6 @@ rover = Model(
 
 
 def test_a_wheel_turns_with_the_speed_and_the_yaw_rate():
-    """The right wheel was the yaw rate's drive, and the left one the speed's."""
     speeds = combined_speeds(rover)
     assert pairs_of(rover) == ["left<-v+r", "right<-v+r"] and springs_of(rover) == []
     for name, side in (("left", -1), ("right", 1)):
@@ -96,7 +95,6 @@ def test_adopted_effects_change_no_drives_speed():
 
 
 def test_the_loss_of_a_wheel_turns_the_robot():
-    """0.6 V of dry friction on the left wheel alone: as if its voltage were less by that."""
     stiff = wrap(Library().effect(LEFT, rover), {"c": 0.6, "b": 0.0}, DT)
     x = np.array([[0.0, 0.0, 0.0, 0.5, 0.4]])
     u = np.array([[4.0, 4.0]])
@@ -196,7 +194,6 @@ def test_a_friction_moves_with_the_track_in_the_slopes_of_a_fit():
 
 
 def test_a_track_is_fitted_beside_the_friction_of_both_wheels():
-    """Values stayed where they began: the step went beyond the bounds of gains and frictions."""
     data = prepare(cart, [carted()])
     search = HypothesisSearch(data, ())
     search.nulls()
@@ -213,7 +210,6 @@ def test_a_track_is_fitted_beside_the_friction_of_both_wheels():
 
 @pytest.mark.slow
 def test_friction_of_two_wheels_is_named_and_the_parameters_are_right():
-    """It was a gain of -20.5 % of both inputs and two curves, and left psi 89 mrad off."""
     found = gr.diagnose(rover, [driven(k, np.array([0.6, 0.9])) for k in range(3)])
     assert {*found.verdict.effects} == {LEFT, RIGHT}
     values = {one.effect: one.params for one in found.ranking}

@@ -232,7 +232,6 @@ def test_several_effects_wrap_one_another():
 
 
 def test_a_delay_passes_its_oldest_input_on_in_steps_shorter_than_its_own():
-    """Its queue holds inputs of control steps; in a shorter one nothing of the input was left."""
     late = wrap(Library().effect(f"delay:{pendulum.input_names[0]}", pendulum), {"d": 0.03}, 0.02)
     x, short = np.zeros((1, late.n)), 1e-5
     x[0, -1] = 2.0
@@ -318,7 +317,6 @@ def test_the_docs_show_every_family():
 
 @pytest.mark.parametrize("duration", [0.1, 6.0, 30.0])
 def test_a_wave_turns_in_the_longest_trial_an_adopted_one_turned_in_another(duration):
-    """Half a cosine, of a period of 54 s, was claimed in logs of 6 to 30 s."""
     known = {"v": 1.0}
     seen, any_of = (
         Library().effect("periodic:v", car, Scales(known, known, {}, 0.05, duration)),
@@ -359,7 +357,6 @@ def test_lags_are_sought_within_their_bound(dt, steps):
 
 @pytest.mark.parametrize("name", ["dead_zone:force", "viscous_friction:v"])
 def test_a_model_that_lacks_a_state_says_so_with_an_adopted_effect_too(name):
-    """It was a KeyError in grounded's own file once an effect was adopted."""
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"force": "N"},

@@ -124,7 +124,6 @@ boat = Model(
 
 @pytest.mark.slow
 def test_thrusters_that_are_weaker_astern_are_named_together():
-    """One curve alone explains too little: a drift of the speed was claimed in its place."""
     rng, astern, trials = np.random.default_rng(5), 0.6, []
     for _ in range(3):
         sent = np.repeat(rng.uniform(-0.9, 0.9, (20, 2)), 8, axis=0)

@@ -99,7 +99,6 @@ def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
 
 
 def test_gains_of_several_joints_of_an_arm_are_like_a_load():
-    """A payload was told as an elbow 20 % weaker and both joints slower, "adopt them"."""
     (tau, w), (other, _) = (pair.split("<-") for pair in PAIRS)
     known = replace(arm, params={"m2": Param(1.0, "kg")})
     assert like_a_load(known, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
@@ -179,7 +178,6 @@ def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
 
 @pytest.mark.parametrize(("w", "push"), [(0.8, 3.0), (-0.8, 3.0), (0.1, -2.0), (2.0, 0.0)])
 def test_a_position_moves_by_the_loss_as_it_grows_within_the_step(w, push):
-    """Held at its mean over the step it left a cart behind: a delay of 20 ms was found as 19.4."""
     cart = Model(
         states={"x": "m", "v": "m/s", "y": "m", "r": "m/s"},
         inputs={"u": "N"},
@@ -263,7 +261,6 @@ def test_a_step_with_a_spring_is_that_of_many_small_ones():
 
 @pytest.mark.slow
 def test_a_cable_at_a_joint_is_found():
-    """Seen on a rotary pendulum: two couplings stood in, and errors were a hundred times larger."""
     found = gr.diagnose(arm, real_trials(k=(2.0, 0.0)))
     assert found.effects == ("joint_spring:t1<-q1",)
     assert found.ranking[0].params["k"].value == pytest.approx(2.0, rel=0.03)
@@ -284,7 +281,6 @@ def crane(unit):
 
 @pytest.mark.parametrize("unit", ["1", "%", "m/s", "N", "V"])
 def test_what_a_motor_loses_is_offered_whatever_its_commands_unit(unit):
-    """Seen on a crane: with the unit 1 its dry friction was told as a coupling of the load."""
     assert pairs_of(crane(unit)) == ["motor<-v"]
     effect = Library().effect("joint_friction:motor<-v", crane(unit))
     lost = effect.free[0]

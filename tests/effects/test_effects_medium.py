@@ -32,10 +32,7 @@ DRAG = ("quadratic_drag:u", {"k": 0.3})
 def rates(
     s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0), added=(0.0, 0.0, 0.0)
 ) -> dict[str, Any]:
-    """A boat over ground; of its drag only the velocity through the water makes one.
-
-    added: what added masses make of the products v r, u r and u v, in the rates of u, v and r.
-    """
+    """A boat over ground; of its drag only the velocity through the water makes one. added."""
     cos, sin = np.cos(s["psi"]), np.sin(s["psi"])
     ahead = s["u"] - water[0] * cos - water[1] * sin
     aside = s["v"] + water[0] * sin - water[1] * cos
@@ -240,7 +237,6 @@ def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
 
 
 def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
-    """However they join: a hull's drag that was found later was taken for an offset over ground."""
     model = adopted(CURRENT)
     data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
     found = Predictor(data).next(h, data.y[:-1])

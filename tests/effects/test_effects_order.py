@@ -64,10 +64,7 @@ def hypothesis(parts, model=car):
 
 
 def predicted(parts, model=car, leads=False):
-    """The diagnosis' own prediction from the start, (STEPS + 1, n).
-
-    leads: with what arrives within a step, of which plans take the mean.
-    """
+    """The diagnosis' own prediction from the start, (STEPS + 1, n). leads."""
     names = (car.state_names, car.input_names)
     empty = np.full((STEPS + 1, car.n), 0.1)
     predictor = Predictor(prepare(model, [Trial(empty, commands(), DT, *names, start_inputs=HELD)]))
@@ -128,7 +125,6 @@ def test_one_order_everywhere(parts):
 
 @pytest.mark.parametrize("parts", [(LIMIT, PART), (PART, ZONE, LAG), (BIAS, ZONE, PART)])
 def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(parts):
-    """As a mean of two commands, what is bent was off by 0.06 rad/s."""
     off = np.abs(adopted(parts) - predicted(parts, leads=True)).max(axis=0)
     assert off[car.state_names.index("delta")] < 6e-4 and off.max() < 0.015
     near = np.abs(probed(parts) - predicted(parts, leads=True)).max(axis=0)
@@ -136,7 +132,6 @@ def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(pa
 
 
 def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
-    """A robot's rate limit and delay, adopted: 3.5 times the error that was diagnosed."""
     plan = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)]).plan
     j = car.input_names.index(PART[0].partition(":")[2])
     assert plan.latency[j] == pytest.approx(2 * DT)
@@ -150,7 +145,6 @@ def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
 
 
 def test_the_memory_of_a_trial_follows_what_arrives():
-    """A limit's memory behind a delay began pieces of a log as if nothing were late."""
     planner = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)])
     trial = Trial(
         predicted((LIMIT, PART)),
@@ -172,7 +166,6 @@ def test_the_memory_of_a_trial_follows_what_arrives():
 
 @pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])
 def test_what_was_held_before_went_through_all_effects(parts):
-    """An input that stays as it was held moves no memory."""
     names = (car.state_names, car.input_names)
     still = Trial(
         np.full((STEPS + 1, car.n), 0.1),
@@ -198,7 +191,6 @@ def test_a_delay_acts_last_whenever_it_was_claimed():
 
 @pytest.mark.parametrize("new", [WEAKER, BIAS, LIMIT, LAG])
 def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
-    """What adopting writes is what was diagnosed: a gain was written behind the dead zone."""
     old = [{"name": ZONE[0], **ZONE[1]}]
     model = planner_of(task(), old).plan.model
     want = predicted((new,), model)
@@ -208,7 +200,6 @@ def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
 
 
 def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
-    """Found on the whole rate, it was written beside it: predictions were five times worse."""
     old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
     model = planner_of(task(), old).plan.model
     want = predicted((("rate_gain:delta", {"g": 0.3}),), model)

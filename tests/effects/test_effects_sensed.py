@@ -66,7 +66,6 @@ def offered(name, data):
 @pytest.mark.parametrize(("name", "values"), MOVES, ids=lambda v: v if isinstance(v, str) else "")
 @pytest.mark.parametrize("late", LATE.values(), ids=[*LATE])
 def test_what_moves_a_model_with_late_logs_steps_as_the_model_that_adopts_it(late, name, values):
-    """A friction was looked for in the log of the speed, which moves nothing, and never found."""
     model = built(late)
     data = late_data(model)
     effect, predictor = offered(name, data), Predictor(data)
@@ -126,7 +125,6 @@ cart = Model(
 
 @pytest.mark.slow
 def test_a_friction_is_found_behind_a_late_log():
-    """A ball in a tube whose sensor is 45 ms late: its height was off by 7.8 cm, now by 0.8."""
     rng, dt, delay, real = np.random.default_rng(3), 0.025, 0.045, []
     for _ in range(3):
         t = dt * np.arange(241)
@@ -166,7 +164,6 @@ def test_a_friction_is_found_behind_a_late_log():
     [("psi", "sensor_delay:psi", {"d": 0.12}), ("v", "sensor_lag:v", {"tau": 0.1})],
 )
 def test_true_values_behind_a_late_log_do_not_drift_away_from_it(state, name, values):
-    """An aircraft's roll was estimated 0.12 rad beside its log after 12 s, and every step lost."""
     model = Model(
         states={state: "rad" if state == "psi" else "m/s"},
         inputs={"u": "1"},

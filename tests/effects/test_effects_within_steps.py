@@ -88,7 +88,6 @@ def test_a_lead_is_the_first_moment_of_what_arrives_in_a_step(name, value):
 
 @pytest.mark.parametrize(("name", "value"), CASES)
 def test_a_delay_of_a_part_of_a_step_is_estimated_from_encoders(name, value):
-    """Seen: 8.3 ms of a MuJoCo arm were called 10.9 ms, and a lag was likelier than the delay."""
     data = prepare(joint, [trial(name, value, seed) for seed in (1, 2)], np.zeros(1))
     effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
     (q,) = effect.free
@@ -109,7 +108,6 @@ engine = Model(
 
 @pytest.mark.parametrize(("dt", "tau", "late"), [(0.1, 0.28, 0.14), (0.1, 0.03, 0.16)])
 def test_a_lag_and_a_delay_that_ends_within_a_step_are_told_apart(dt, tau, late):
-    """A walker's log: 0.274 +- 0.001 s after 0.145 +- 0.0006 s were found for 0.28 s after 0.14."""
     rng, h, count = np.random.default_rng(1), dt / FINE, 240
     u = np.repeat(rng.uniform(-1, 1, count // 4), 4) + 0.2 * rng.standard_normal(count)
     sent = np.concatenate([np.full(round(late / h), u[0]), np.repeat(u, FINE)])

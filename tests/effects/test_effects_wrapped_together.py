@@ -116,7 +116,6 @@ def test_pairs_wrapped_in_any_order_are_one_model():
     ],
 )
 def test_the_side_of_an_input_that_was_never_seen_stays_unknown(name, values, uncertain):
-    """The fan of a tube acted `0.4 % more to its positive side`: a fit had moved what was 0."""
     model = wrap(Library().effect(name, car), values, DT)
     stem = name.replace(":", "_") + "_"
     free = {n.removeprefix(stem) for n, p in model.params.items() if p.uncertain}

@@ -82,7 +82,6 @@ def results():
 
 
 def test_the_bounds_of_theorem1_are_drawn_in_both_panels():
-    """Only the second panel had one, with a K of its own for each point."""
     result = results()["theorem1"]
     for panel, bound in zip(
         PICTURES["theorem1"](result).panels,

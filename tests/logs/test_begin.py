@@ -66,7 +66,6 @@ def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
 
 @pytest.mark.parametrize("seen", ["/car/pose", "/goal_pose"])
 def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
-    """Motion capture was passed over for the sum of the wheels' own speed."""
     found = begin(tmp_path / "w", car_bag(tmp_path / "bag", seen=seen))
     guesses = {one.name: one for one in found.states}
     assert guesses["v"].path == "/odom.twist.twist.linear.x"
@@ -81,7 +80,6 @@ def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
 
 @pytest.mark.parametrize("names", ["speed turn", "linear angular"])
 def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path, names):
-    """It was an arm of two wheels, and nothing was mapped to what it is commanded."""
     log, w, model = rover_bag(tmp_path / "bag"), tmp_path / "w", None
     if names != "speed turn":
         begin(tmp_path / "first", log)
@@ -234,7 +232,6 @@ def steered(tmp_path, scale=1.0, turned=1.0, name="steer"):
 def test_a_steering_in_degrees_where_the_model_has_radians_is_unsure(
     tmp_path, scale, turned, name, doubted
 ):
-    """[limits] were written as +-22.9 rad without a doubt."""
     guess = steered(tmp_path, scale, turned, name)
     said = any("0.017453293" in why and "22.9" in why for why in guess.reasons)
     assert said == doubted and (not guess.sure or not doubted)
@@ -298,7 +295,6 @@ model = Model(
 def test_a_rate_that_a_name_gives_and_the_numbers_refute_is_sought_among_the_others(
     tmp_path, named
 ):
-    """A quaternion and a twist have a w, too: `w` was read from a number that is always 0."""
     (tmp_path / "turning.py").write_text(TURNING)
     rng, t = np.random.default_rng(0), 0.02 * np.arange(1500)
     psi, gyro = 0.6 * np.sin(1.3 * t) + 0.3 * np.sin(3 * t), 0.78 * np.cos(1.3 * t)
@@ -327,7 +323,6 @@ def test_the_real_car_of_a_laboratory(tmp_path):
 
 
 def test_an_input_that_is_held_at_its_largest_value_is_not_rounded_beyond_it():
-    """DART's throttle of 0.359677 was held at 0.3597, so that no command opened the workspace."""
     held, (low, high) = _inline({"u": 0.3596774}), json.loads(_span((0.0, 0.3596774)))
     assert low <= float(held.partition("= ")[2].removesuffix(" }")) <= high
 
@@ -428,7 +423,6 @@ def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names
 
 @pytest.mark.parametrize("names", ["left,right", "motor_right,motor_left"])
 def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp_path, names):
-    """It was "generic": six numbers that follow left and right with a lag."""
     found = begin(tmp_path / "w", wheels(names))
     assert found.kind == "differential" and not found.unsure
     model = Workspace(tmp_path / "w").base_model
@@ -453,7 +447,6 @@ model = Model(states={"angle": "rad", "angle_rate": "rad/s", "wheel_speed": "rad
 
 
 def test_a_speed_in_rpm_is_the_state_its_name_begins_with(tmp_path):
-    """wheel_rpm was not found for wheel_speed, and offered for angle_rate instead."""
     t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
     rows = np.column_stack([t, 10 * np.sin(t), 300 * np.cos(2 * t), np.sin(3 * t)])
     np.savetxt(log, rows, "%.5f", ",", header="t,angle_deg,wheel_rpm,pwm", comments="")
@@ -491,7 +484,6 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_path, swapped):
-    """The kind was unknown, and neither thruster was found: exchanged, both push ahead alike."""
     found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag", swapped))
     assert found.kind == "boat" and not found.unsure
     order = [f"/thrusters/cmd.data[{k}]" for k in ((1, 0) if swapped else (0, 1))]
@@ -500,7 +492,6 @@ def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_p
 
 
 def test_a_number_offered_in_a_comment_comes_with_its_clock(tmp_path):
-    """A Float64MultiArray has no stamp: ingest refused the table after its # were removed."""
     found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="car")
     assert not any(guess.path for guess in found.inputs)
     path = tmp_path / "w/grounded.toml"
@@ -518,7 +509,6 @@ def test_a_number_offered_in_a_comment_comes_with_its_clock(tmp_path):
 
 
 def test_a_generic_model_has_each_of_its_numbers_once(tmp_path):
-    """Its states were w and z, parts of the quaternion, read from a speed that is constant."""
     found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="generic")
     paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
     assert len(set(paths.values())) == len(paths) and "" not in paths.values()
@@ -528,7 +518,6 @@ def test_a_generic_model_has_each_of_its_numbers_once(tmp_path):
 
 
 def test_a_measured_rate_is_no_input(tmp_path):
-    """A boat's log taken for a drone's gave its odometry's turn rate as the command of the yaw."""
     log = boat_bag(tmp_path / "bag", "/thruster/left", "/thruster/right")
     found = begin(tmp_path / "w", log, kind="drone")
     (rate,) = [guess for guess in found.inputs if guess.name == "yaw_rate"]
@@ -551,7 +540,6 @@ def test_speeds_measured_on_both_sides_are_no_commands(tmp_path):
     ],
 )
 def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
-    """It was "generic": numbers that follow the voltage with a lag."""
     t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
     pitch, x = 0.1 * np.sin(2 * t), 0.5 * np.sin(0.7 * t)
     rows = np.column_stack([t, x, np.gradient(x, t), pitch, np.gradient(pitch, t), np.cos(3 * t)])
@@ -572,7 +560,6 @@ def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
 
 
 def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
-    """Its position was a turn rate that is always 0, though the wheels' angles were in the log."""
     found = begin(tmp_path / "w", balancer_bag(tmp_path / "bag"))
     guesses = {g.name: g for g in (*found.states, *found.inputs)}
     assert found.kind == "balance" and guesses["motor_voltage"].path == "/motor_voltage.data"
@@ -686,7 +673,6 @@ def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung,
 
 
 def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
-    """A balancer's pitch was the constant 0 of an Odometry, its measured tilt not even a rival."""
     t = 0.02 * np.arange(500)
     tilt, still = 0.1 * np.sin(2 * t), np.zeros_like(t)
     drive = 0.3 * np.sin(0.7 * t)
@@ -768,7 +754,6 @@ def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_pa
 
 
 def test_a_column_that_stays_has_the_range_of_its_unit():
-    """Seen: 100 each for a sway, a speed and a rate that were to stay zero."""
     t = np.linspace(0, 1, 21)
     units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s"}
     columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
@@ -807,7 +792,6 @@ def test_of_a_target_that_stays_at_a_sensors_offset_the_weight_is_to_be_chosen(t
 
 @pytest.mark.parametrize("more", [(), ("--to", "psi=0")])
 def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
-    """It was held at 0 all along, against the position that moved."""
     w = tmp_path / "w"
     grounded("init", w, "--example", "car-circle")
     done = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=0", *more, "--json")
@@ -875,7 +859,6 @@ def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
     ],
 )
 def test_a_line_takes_the_seconds_that_are_given(tmp_path, paces, most):
-    """They were left aside without a word: 4 s had become 2.8 s."""
     made = workspaces.make(tmp_path / "w")
     words = ("target", "line", "--to", "x=2", "--seconds", "4", *paces)
     done = grounded("-C", made.folder, *words, "--json").json
@@ -905,7 +888,6 @@ def test_seconds_that_a_target_can_t_take_are_refused(tmp_path, words, said):
 
 
 def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
-    """A boom was told to have a role 'position' of two states; a step began at 0."""
     cart = workspaces.MODEL.replace(', "speed": "v"', "").replace('"position": ("x",)', "")
     config = workspaces.CONFIG.replace('"target.csv"\n', '"target.csv"\nstart = { x = 0.5 }\n', 1)
     made = workspaces.make(tmp_path / "w", model=cart, config=config)
@@ -957,7 +939,6 @@ def furuta(s, a, p):
 
 
 def test_a_swing_up_is_of_the_angle_that_hangs(tmp_path):
-    """The arm of a Furuta pendulum came first and was sent to pi, where the run also began."""
     model = Model(
         states={"arm": "rad", "hung": "rad", "w": "rad/s", "v": "rad/s"},
         inputs={"volts": "V"},
@@ -1046,7 +1027,6 @@ def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path
 
 
 def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error_names(tmp_path):
-    """`[task] dt` was changed below a target.csv that `init` had written."""
     made = workspaces.make(tmp_path / "w")
     file = made.folder / "grounded.toml"
     before = read_target(made.folder / "target.csv")[1]
@@ -1061,7 +1041,6 @@ def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error
 
 
 def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path):
-    """A user's own remark was overwritten, too."""
     made = begin(tmp_path / "w", car_bag(tmp_path / "bag"))
     file, mine = Path(made.workspace) / "grounded.toml", "# terminal = { psi = 7 }"
     file.write_text(file.read_text().replace("[reward]", f"{mine}\n[reward]"))
@@ -1074,7 +1053,6 @@ def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path)
 
 
 def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):
-    """It had all four numbers follow an input `u`, which the log did not have, with lags."""
     rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
     servo = 10 * np.sign(np.sin(2 * t)) + rng.normal(0, 1, len(t))
     ball, speed = 80 * np.sin(1.3 * t), 104 * np.cos(1.3 * t) + rng.normal(0, 2, len(t))
@@ -1092,7 +1070,6 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
 
 
 def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
-    """A car's roll rate was one, and a weight of 100 was put on it."""
     rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
     columns = [t, np.sin(t), rng.normal(0, 0.005, len(t)), np.sign(np.sin(2 * t))]
     header = "t,pose,roll_rate,servo"
@@ -1106,7 +1083,6 @@ def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
 
 @pytest.mark.parametrize("name", ["force", "grip [N]"])
 def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
-    """A cart's force became a state, beside an input `u` that the log did not have."""
     t = 0.02 * np.arange(500)
     table = np.column_stack([t, np.sin(t), np.cos(t), 3 * np.sin(2.2 * t)])
     header = f"t,x,v,{name}"
@@ -1118,7 +1094,6 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
 
 
 def test_an_input_that_never_changes_is_reported_as_constant(tmp_path):
-    """It was "no number of the log", though the log has that column."""
     t = 0.02 * np.arange(500)
     table = np.column_stack([t, np.sin(t), np.cos(t), 0.1 + 0 * t])
     np.savetxt(tmp_path / "c.csv", table, "%.5f", ",", header="t,x,v,steering", comments="")
@@ -1128,7 +1103,6 @@ def test_an_input_that_never_changes_is_reported_as_constant(tmp_path):
 
 
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
-    """A step to 60 m, of 60 cm, was drawn without a word."""
     made = workspaces.make(tmp_path / "w")
     file = made.folder / "grounded.toml"
     file.write_text(re.sub(r"(?m)^\[safety\]\n(?:\w.*\n)*", "", file.read_text()))
@@ -1141,7 +1115,6 @@ def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
-    """Two of four hovers gave no start: commands scattered by a twentieth of their range."""
     rng, t = np.random.default_rng(seed), 0.02 * np.arange(500)
     moves = np.clip(t - 1, 0, None)
     columns = {
@@ -1181,7 +1154,6 @@ model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
 
 
 def test_a_log_whose_first_row_is_off_the_grid_is_known_again_in_its_target(tmp_path):
-    """After `ingest --data`, which starts at a step of the commands, no `target` was asked for."""
     (tmp_path / "model.py").write_text(SLED)
     t = np.r_[0.0083, 0.04 * np.arange(1, 200)]
     force = np.sin(2 * t) + np.sin(5.3 * t)

@@ -47,7 +47,6 @@ def log(tmp_path_factory):
 
 @pytest.mark.parametrize("xml", ["arm.xml", "model.py"])
 def test_an_mjcf_file_is_a_model_and_comes_along(tmp_path, monkeypatch, log, xml):
-    """It was read as Python, or left behind, or sought in whatever folder a command came from."""
     robot, w = tmp_path / "robot", tmp_path / "w"
     robot.mkdir()
     (robot / "arm.xml").write_text(MJCF)

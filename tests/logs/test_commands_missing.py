@@ -83,7 +83,6 @@ def test_a_renamed_topic_names_all_that_is_read_from_it(tmp_path, model):
 
 
 def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
-    """`target line --to` began at 0, 0, where the arm never was."""
     begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
     assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}
     moving = tmp_path / "moving"
@@ -92,7 +91,6 @@ def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
 
 
 def test_a_recovered_log_that_log_can_read_is_to_be_ingested(tmp_path, model):
-    """After `recover` of a manual log, `next:` was `inspect`."""
     log = excavator(tmp_path / "bag", still=100, storage=StoragePlugin.MCAP)
     begin(tmp_path / "w", log, model=model)
     cut = tmp_path / "cut.mcap"

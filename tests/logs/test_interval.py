@@ -132,7 +132,6 @@ def test_commands_with_stamps_of_their_own_are_late_by_nothing():
 
 
 def test_a_command_that_stays_at_its_limits_is_not_held_between_rows():
-    """Each command of a robot that fell was said to be up to a row late."""
     rng = np.random.default_rng(3)
     sent = np.clip(np.cumsum(rng.normal(0, 4, 1000)), -7.4, 7.4)
     sent[400:] = 7.4
@@ -145,7 +144,6 @@ def test_a_command_that_stays_at_its_limits_is_not_held_between_rows():
 
 @pytest.mark.parametrize("hz", [2, 7.5, 12, 15, 24, 25, 30, 45, 50, 60, 75, 90, 100, 120, 125, 144])
 def test_the_interval_of_a_loop_is_that_of_its_rows(hz):
-    """0.04 s was written for 30 Hz, beside 25 Hz the nearest that was known."""
     assert round_interval(1 / hz) == pytest.approx(1 / hz, rel=3e-3)
 
 

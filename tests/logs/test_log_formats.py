@@ -245,7 +245,6 @@ def test_a_last_column_that_is_never_filled_may_be_a_name_too_many(tmp_path):
 
 
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
-    """A logger that was stopped; `Time [ms]` was read as seconds."""
     path = tmp_path / "log.csv"
     path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
     found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
@@ -374,7 +373,6 @@ def test_constants_of_an_array_are_one_line(tmp_path):
 
 
 def test_a_missing_column_is_not_said_to_be_one_that_another_signal_is(tmp_path):
-    """`has no field 'Gierrate_dps': did you mean 'Nickrate_dps'?`, which was the pitch rate."""
     path = tmp_path / "log.csv"
     path.write_text("t,Nickrate_dps,U_Nick\n0,1,2\n0.1,1,2\n")
     specs = {"q": SignalSpec("/csv.Nickrate_dps"), "r": SignalSpec("/csv.Gierrate_dps")}
@@ -399,7 +397,6 @@ def test_a_column_that_is_missing_names_the_columns_that_there_are(tmp_path):
 
 
 def test_an_exported_candidate_is_no_log(cart_candidate):
-    """It was "no column of times", and was named among the newest logs."""
     folder, file = cart_candidate
     with pytest.raises(GroundedError, match=r"best\.npz is an exported candidate, c0001"):
         list(npz_records(file))

@@ -198,7 +198,6 @@ def refused(path: Any, spec: SignalSpec, says: str) -> None:
 def test_the_same_word_with_another_unit_is_what_was_meant(
     tmp_path: Path, asked: str, header: str, meant: str
 ) -> None:
-    """`x` beside `x_mm` was asked for as 'vx', `theta_deg` as 'header'."""
     path = tmp_path / "a.csv"
     row = ",".join(["0.1"] * (header.count(",") + 1))
     path.write_text(f"{header}\n{row}\n{row.replace('0.1', '0.2')}\n")

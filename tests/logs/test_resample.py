@@ -78,8 +78,6 @@ def noisy(f: Callable[[np.ndarray], np.ndarray], seed: int, **spec: object) -> S
 
 
 def test_where_a_run_began_is_told_by_the_samples_before_it() -> None:
-    """A boat that was held read -0.088 m, its start was -0.029 m: 'more than the noise'."""
-
     def left(t: np.ndarray) -> np.ndarray:
         return 0.3 + 0.8 * np.maximum(t, 0.0) ** 2
 
@@ -289,7 +287,6 @@ def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
 
 
 def test_a_driver_s_commands_are_neither_early_nor_late() -> None:
-    """A boat's delay of 0.12 s was 0.152: rows of half a step, commands at any of them."""
     x = pose(np.sin)
     x = series(np.arange(-0.5, 21.0, 0.025), np.zeros(860), x.spec)
     u = driven(np.array([7, 8, 9]), 0.025)
@@ -324,7 +321,6 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
 
 @pytest.mark.parametrize("topic, late", [("/x", 0.02), ("/u", 0.0)])
 def test_only_rows_of_states_show_a_command_late(topic: str, late: float) -> None:
-    """`its rows come every 0.1 s` was said of messages that are stamped when they are sent."""
     t = np.arange(0, 2, 0.02)
     sent = series(t, np.floor(t / 0.1 + 1e-6), SignalSpec(f"{topic}.force", "log"))
     assert grid(pose(np.sin), sent).row_s == pytest.approx(late)
@@ -340,7 +336,6 @@ def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
 
 
 def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -> None:
-    """A camera of 25 Hz in rows at 62.5 Hz, 2 or 3 a sample, was said to have 31.2 Hz, twice."""
     t = np.arange(-0.5, 3.0, 0.016)
     seen = np.floor(t / 0.04 + 1e-9) * 0.04
     x, y = series(t, np.sin(3 * seen)), series(t, np.cos(2 * seen))
@@ -352,8 +347,6 @@ def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -
 
 
 def test_what_holds_of_a_whole_message_is_said_once_and_one_sorted_stamp_not_at_all() -> None:
-    """A car's pose: 'x', 'y' and 'psi' each had "1 stamp out of order", in every log."""
-
     def of_pose(order: np.ndarray):  # type: ignore[no-untyped-def]
         x = pose(np.sin)
         one = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])

@@ -147,7 +147,6 @@ def test_a_car_s_commands_are_found_whatever_unit_or_role_their_names_end_with(
 
 @pytest.mark.parametrize("unit, size", [("%", 100.0), ("1", 1.0)])
 def test_the_weight_of_changes_is_that_of_their_range(tmp_path, unit, size):
-    """At 0.01 a change by 1 % cost as much as 0.1 m: a car was planned to stop before its line."""
     t = np.arange(0, 8, 0.02)
     table = np.column_stack([t, np.sin(t), np.cos(t), size * np.sin(np.floor(3 * t))])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
@@ -265,7 +264,6 @@ def helicopter(folder, names, linked=True):
     ],
 )
 def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
-    """All six were UNSURE, though `Zeit` is read as the time."""
     names = names.split()
     out, text = helicopter(tmp_path, names)
     assert "UNSURE" not in out
@@ -276,7 +274,6 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
 
 
 def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
-    """With the # removed as it said, degrees were stored as radians."""
     names = ["a_deg", "b_deg", "c_deg", "d_dps", "e_dps", "f_dps"]
     out, text = helicopter(tmp_path, names, linked=False)
     assert "UNSURE" in out
@@ -290,7 +287,6 @@ def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
 
 
 def test_states_of_one_s_own_model_are_found_by_their_derivatives_if_no_name_fits(tmp_path):
-    """With --model nothing was mapped, though a skeleton's states were."""
     names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
     out, text = helicopter(tmp_path, names)
     log = tomllib.loads(text)["log"]
@@ -341,7 +337,6 @@ def furuta(folder, names):
     ],
 )
 def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, names, sure, volt):
-    """A voltage was taken for the rate that it drives, and two angles were not taken at all."""
     found, notes, text = furuta(tmp_path, names)
     for name, column in zip(("arm", "pend"), names, strict=False):
         assert found[name]["path"] == f"/csv.{column}" and found[name]["sure"] == sure

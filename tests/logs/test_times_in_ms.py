@@ -38,7 +38,6 @@ def test_times_in_ms_are_asked_about_and_next_is_to_begin_again(tmp_path):
     [("millis", 1e-3), ("time_millis", 1e-3), ("micros", 1e-6), ("t_us", 1e-6), ("Time_s", 1.0)],
 )
 def test_an_arduino_s_times_are_known_by_their_name(tmp_path, column, unit):
-    """A column `millis` was refused: no column of times."""
     log = table(tmp_path / "a.csv", column, unit)
     found = begin(tmp_path / "w", log, kind="generic", inputs=["force"])
     assert found.then.verb == "ingest" and found.dt < 2

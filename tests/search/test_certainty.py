@@ -123,7 +123,6 @@ def test_a_scatter_says_on_how_many_repeats_it_rests():
 
 
 def test_a_share_of_cost_has_its_error_if_repeats_tell_it():
-    """A page's headline said "cost reduced by 16 %" of 8 %: the first policy's run was unlucky."""
     first, best = tried(-1.05, base=""), tried(-0.85, -0.9)
     assert share_of_cost(first, tried(-0.875), (first, tried(-0.875))) == "17 %"
     told = share_of_cost(first, best, (first, best))
@@ -132,7 +131,6 @@ def test_a_share_of_cost_has_its_error_if_repeats_tell_it():
 
 
 def test_a_gain_that_a_trial_cannot_show_is_called_so_with_the_runs_it_takes():
-    """A belt drive was promised 0.0019 where runs scatter by 0.0012."""
     found = beyond_one_trial(*promising(0.05))
     assert holds(found, "c2", "0.05", "0.1", "0.2", "22 runs", "stop with c")
     assert runs_to_show(0.05, promising(0.05)[1]) == 22
@@ -167,7 +165,6 @@ def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
 
 
 def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
-    """Two identical runs of the first policy: the noise of its successors was called unknown."""
     first, a, b = tried(-9000.1, -9000.1, -9000.1, base=""), tried(-5.0), tried(-4.0)
     assert holds(last_improvement([first, a, b]), "exactly")
     assert chance(a, b, [first, a, b]) == 1.0
@@ -230,7 +227,6 @@ def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repea
     ],
 )
 def test_a_lead_is_told_only_if_nothing_may_explain_it(runs, clause):
-    """Single runs were "8.2 % better"; ten of each differed by 4.0 %."""
     history = with_chances([tried(*runs[0], base=""), tried(*runs[1])])
     assert explained(*history, history) == clause
 
@@ -303,8 +299,6 @@ def test_starts_that_scatter_as_much_are_not_different_ones():
 
 
 def test_a_lead_that_lucky_starts_explain_is_told_so():
-    """A rover's c0009 led by 0.009 +- 0.026; by the model 0.023 of that was its start."""
-
     def ran(name, utilities, owed=0.0):
         candidate = SimpleNamespace(id=name, base="", model="m", seen=())
         candidate.predicted_states = np.zeros((30, 1))
@@ -333,7 +327,6 @@ def test_a_lead_that_lucky_starts_explain_is_told_so():
 
 
 def test_what_starts_cost_is_not_that_of_the_first_runs_alone():
-    """A rover's start was worth 0.0087 by one run; a second, which lost 0.022, changed nothing."""
     trials = tuple(replace(from_to_zero(0.07), id=name) for name in ("t1", "t2"))
     made = SimpleNamespace(expected_of_base=-4.0, base_as_run=-5.9, seen=("t1", "t2", "t0"))
     best = Tried(SimpleNamespace(id="c0001"), trials, (-6.0, -6.1), True)

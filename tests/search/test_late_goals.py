@@ -41,7 +41,6 @@ def cart(terminal: float, lag: float = 0.04, change: float = 1e-4, rests: int = 
 
 @pytest.mark.parametrize("terminal", [1.0, 10.0])
 def test_the_end_is_asked_of_the_true_speed(terminal):
-    """A cart was pushed in its last steps: its filter read 0.02 m/s at a speed of 0.3."""
     planner = cart(terminal)
     policy, _ = planner.first_policy()
     run = predicted(planner.plan.problem(exact=True), policy)
@@ -61,7 +60,6 @@ def test_what_is_judged_stays_what_is_logged():
 
 
 def test_cheaper_inputs_make_no_plan_worse_by_its_late_log():
-    """A crane braked in its last 30 ms, which its log had not seen: -0.6, then -2.9, then -6.1."""
     found = []
     for change in (3e-3, 1e-3, 1e-4, 1e-5):
         planner = cart(20.0, change=change, rests=0)

@@ -1,10 +1,4 @@
-"""Regression tests for nine failures of the search of version 0.1 on third-party simulators.
-
-Three of the nine are tested elsewhere: 1 (`learn` never ended on a
-deterministic system) in tests/workspace/test_deterministic_system.py, 6 (a joint's friction is a
-torque) in tests/effects/test_effects_joint.py, 8 (float32) in
-tests/compile/test_substeps_and_jacobians.py. The crude models are those of benchmarks/foreign.
-"""
+"""Regression tests for nine failures of the search of version 0.1 on third-party simulators."""
 
 import importlib
 from dataclasses import replace
@@ -89,7 +83,6 @@ def test_only_columns_that_are_weighed_shape_the_guess(mechanisms):
 
 @pytest.mark.parametrize("trials", [1, 3])
 def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
-    """Reason 4: 0.1 went on from the old policy after `adopt`, into the optimum next to it."""
     task, search = late_arm.task, Search(late_arm.task)
     for _ in range(trials):
         search.tell(late_arm.run(search.ask()))
@@ -123,7 +116,6 @@ def test_what_no_model_predicts_is_in_no_other_unit(late_arm, seed):
 
 
 def test_an_unstable_loop_gets_gentler_gains(late_arm):
-    """Issue 12: from -24,000 no step along a direction leads out, nor did refitting and ILC."""
     search = Search(late_arm.task)
     search.tell(late_arm.run(search.ask()))
     wild = search.best.utility
@@ -175,7 +167,6 @@ def test_smaller_steps_hold_a_stiff_friction():
 
 @pytest.mark.slow
 def test_exact_repeats_end_all_reruns(mechanisms):
-    """Reason 9: 0.1 went on running incumbents again after repeats had agreed to the last bit."""
     task = mechanisms.cart_task("gentle")
     real = task.model.with_values({"b": 2.0})  # 0.1: 30 runs of 26 candidates
     found = learn(task, lambda candidate: drive(task, Plant(real, substeps=4), candidate))

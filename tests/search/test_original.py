@@ -56,7 +56,6 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_losses_by_noise_do_not_give_up_an_effect_that_the_runs_confirm(seed):
-    """A rover's true effects "broke their promises" once its runs were as good as noise allows."""
     task, _ = CASES["cart"]
     noise = Noise(process=dict.fromkeys("xv", 0.03), measurement=dict.fromkeys("xv", 0.01))
     plant = Plant(other(task.model, 1.15), latency={"force": 0.1}, noise=noise)
@@ -113,7 +112,6 @@ def test_promises_are_counted_for_each_model():
 
 
 def test_a_loss_that_scatter_may_explain_breaks_no_promise():
-    """Right effects of a helicopter were given up after one loss that was called bad luck."""
     best = step("c1", "", "better", float("nan"), 0.0, runs=(-0.86, -0.72))
     lost = step("c2", "c1", "better", 0.21, -0.87, accepted=False)
     adopted, _ = promises((best, lost), "better")
@@ -133,7 +131,6 @@ def test_a_step_made_from_a_discarded_trial_broke_no_promise():
 
 
 def test_a_run_that_was_stopped_on_its_path_broke_no_promise():
-    """It was stopped by hand after 59 of 90 steps: the adopted effects were given up for it."""
     task, target = CASES["cart"]
     plant, options = Plant(other(task.model, 1.3)), SearchOptions()
     candidates = [propose(task, [], [], options).candidate]

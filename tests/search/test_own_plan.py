@@ -1,9 +1,4 @@
-"""After `adopt` the changed model's own plan is run with its own gains, when it is due.
-
-A hydraulic boom's first policy swung in a limit cycle: its valve is late and slow. The plan of the
-model that knew both kept the swinging gains: ten more trials ended at -1.3, where the same model
-reached -0.01 in two from an empty folder.
-"""
+"""After `adopt` the changed model's own plan is run with its own gains, when it is due."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -87,7 +82,6 @@ def step(run, planner):
 
 
 def test_the_changed_models_plan_is_run_with_its_own_gains(late_boom):
-    """The incumbent's gains were designed for a valve without delay and lag, and are not kept."""
     best = max(map(late_boom.task.utility, late_boom.trials))
     made, utility = step(late_boom, late_boom.better)
     afresh = SimpleNamespace(**vars(late_boom) | {"candidates": [], "trials": []})

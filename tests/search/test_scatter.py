@@ -37,7 +37,6 @@ def runs(pieces, cost=10.0):
 
 
 def test_intervals_from_two_repeats_hold_as_often_as_they_say():
-    """Two pairs that agree by chance gave +- 0.038; seven repeats give 0.09 for a single run."""
     rng = np.random.default_rng(0)
     inside, least, width = [], [], []
     for _ in range(2000):
@@ -95,7 +94,6 @@ def test_pieces_sum_to_the_utility():
 
 
 def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
-    """A run predicted at -0.14 gave -12.5 in the log, mostly from noise of weighted states."""
     task = cart_task()
     proposal = propose(task, [], [], SearchOptions())
     policy, noise = proposal.candidate.policy, np.array([0.1, 0.1])
@@ -121,10 +119,6 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
 
 
 def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
-    """A ball's later plans were told without the 0.038 of noise of every log: a miss of the model.
-
-    The mean of four runs has a quarter of what each costs by noise; a single one has all of it.
-    """
     task, size = cart_task(), {"x": 0.02, "v": 0.02}
     noisy = Plant(other(task.model), noise=Noise(measurement=size))
     for repeats, shares in ((1, (0.0, 0.1)), (4, (0.6, 0.9))):
@@ -148,7 +142,6 @@ def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
 
 
 def test_no_plan_promises_to_remove_the_noise_of_a_log():
-    """-0.047 was promised of logs whose noise costs 0.064: a gain of 0.033 where 0.016 was left."""
     task, noise = cart_task(), np.array([0.02, 0.02])
     made = propose(task, [], [], SearchOptions()).candidate
     whole = noise_cost(task, made.policy, noise)
@@ -206,7 +199,6 @@ def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
 def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
-    """A boat's position had 16 mm on the grid, its promises counted 11 mm."""
     rng = np.random.default_rng(3)
     t = 0.05 * np.arange(401)
     seen = 0.02 * rng.standard_normal((401, 8))
@@ -221,7 +213,6 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
 
 
 def test_a_fast_motion_is_no_noise_of_an_interpolated_log():
-    """An aircraft's roll rate: 0.0065 rad/s at rest, 0.027 counted, which cost a promise 0.19."""
     rng, dt, roll = np.random.default_rng(4), 0.01, 0.0
     holds = [np.full(rng.integers(3, 12), rng.uniform(-0.6, 0.6)) for _ in range(90)]
     rates = []
@@ -278,7 +269,6 @@ def test_the_noise_of_a_trial_is_found_once():
 
 
 def test_runs_that_scatter_by_where_they_began_are_none_that_another_policy_steadies():
-    """ "More than 50 runs would show the gain", and the next was handed out: it may be steadier."""
     worth, costs = (-2.1, -1.8, -4.2), np.array([0.3, 0.0, 2.6])
     for explained, placed in ((costs, True), (0.1 * costs, False), (np.array([np.nan] * 3), False)):
         starts = SimpleNamespace(costs=lambda _, e=explained: e)

@@ -122,7 +122,6 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
 
 
 def test_losses_before_and_after_a_change_of_the_model_end_a_search_that_says_so():
-    """An arm's search went on after five losses, because `adopt` began the count anew."""
     story = Story().add().add(bad).add(bad)
     story.candidates = [replace(c, model="before") for c in story.candidates]
     story.add(bad)
@@ -138,7 +137,6 @@ def test_losses_before_and_after_a_change_of_the_model_end_a_search_that_says_so
 
 
 def test_a_run_of_the_best_that_makes_an_ended_search_go_on_says_so():
-    """A car's search had ended; a run to verify its result brought a new candidate, unasked."""
     story = Story(tolerance=0.2)
     while story.propose().candidate is not None:
         story.add()
@@ -175,7 +173,6 @@ def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypat
 
 
 def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
-    """An arm with armature and a lag lost half its cost four times, and ended as converged."""
     story = Story().add()
     while story.propose().candidate is not None:
         story.add(bad)
@@ -191,7 +188,6 @@ def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
 
 @pytest.mark.parametrize(("off", "asks"), [(0.5, False), (50.0, True)])
 def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnosis(off, asks):
-    """A boat's step cost 4,021 for 23, as `adopt` had left out its thrust; half a step was next."""
     story = Story().add().add(lambda trial: bad(trial, off))
     now = story.now
     assert now.phase == "propose" and now.step is not None
@@ -214,10 +210,6 @@ def test_a_small_promise_that_is_not_kept_asks_for_nothing():
 def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
     monkeypatch, scatter, goes_on, lost
 ):
-    """An excavator at its noise went on for 9 trials, to no better policy.
-
-    It goes on if the best one's runs scatter by as much as they cost: another may be steadier.
-    """
     story = Story().add().add()
     story = story.add(bad if lost == "lost" else cut) if lost else story
     noisy = lambda h: tuple(replace(one, deviation=scatter) for one in h)  # noqa: E731
@@ -242,7 +234,6 @@ def test_a_negative_promise_is_none(monkeypatch):
 
 
 def test_a_step_like_one_that_an_earlier_best_lost_by_is_as_doubtful():
-    """A belt drive ran two steps that both lost twice the best cost, one from each of two bests."""
     story = Story().add().add(bad).add()
     best, lost = story.now.incumbent, story.now.history[1]
     assert best.candidate.id == "c0003" and lost.lost and lost.candidate.base == "c0001"
@@ -342,7 +333,6 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
 
 
 def test_a_lucky_winner_loses_its_luck():
-    """c0001's only trial was lucky; c0002 is truly better and wins once c0001 was run again."""
     story = Story(rerun_incumbent=True).add().add()
     honest = [story.task.utility(t) for t in story.trials]
     assert honest[1] > honest[0]
@@ -359,11 +349,6 @@ def test_a_lucky_winner_loses_its_luck():
 
 
 def test_a_doubt_ends_with_the_best_that_it_was_about():
-    """An excavator's third best ran 35 times because the second seemed unlucky beside the first.
-
-    c0002 wins, c0003 loses by little, so c0002 runs again, badly: now it is c0002 that lost to
-    c0001 by little, but c0003 has beaten both.
-    """
     story = Story(rerun_incumbent=True, tolerance=0.0).add().add().add(worse(0.02))
     first, second, third = (story.task.utility(t) for t in story.trials)
     assert first < third < second and story.now.outstanding.id == "c0002"
@@ -478,7 +463,6 @@ def test_a_step_is_not_run_from_a_run_that_was_set_aside():
 
 
 def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost():
-    """c0007 was proposed still, after the run of c0006 that was its reason had been set aside."""
     story = Story().add().add(cut)
     made = story.propose().candidate
     assert made.seen == tuple(trial.id for trial in story.trials) and len(made.seen) == 2
@@ -493,7 +477,6 @@ def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost()
 
 @pytest.mark.parametrize("slopes", ["", "corrected", "original"])
 def test_a_step_learnt_from_a_discarded_trial_counts_as_no_loss(slopes):
-    """After `discard` of a wild run the step that it had led to still counted: -9.604."""
     story = Story().add().add(cut)
     made = replace(story.propose().candidate, slopes=slopes)
     story.candidates[2:] = [made]
@@ -824,5 +807,4 @@ def test_losses_of_other_slopes_raise_no_damping():
 
 
 def test_fingerprints_are_taken_where_numpys_generator_would_draw():
-    """Those of earlier versions were, and candidates keep them."""
     assert (fixed_draws(3000) == np.random.default_rng(0).random(3000)).all()

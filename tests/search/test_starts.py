@@ -60,7 +60,6 @@ def story():
 
 
 def test_a_better_candidate_that_began_off_is_run_again_and_becomes_the_best(story):
-    """A boat's c0004 began 96 mm off, lost by 0.53, was "no better" and ended the search."""
     now = story.run(1, OFF)
     best, doubt = now.history
     assert doubt.utility < best.utility and doubt.gain_over(best) > 0
@@ -142,7 +141,6 @@ def test_where_starts_are_known_to_be_what_runs_scatter_by_none_is_taken_as_alik
 
 
 def test_another_run_for_a_loss_in_doubt_says_what_is_at_stake(story, monkeypatch):
-    """The last two of a boat's six runs were for 2.6 % of what its best one cost."""
     now = story.run(1, worse=0.05)
     best = now.incumbent
     assert now.outstanding is not None and "stop with" not in now.sentence  # promises much
@@ -160,7 +158,6 @@ def test_another_run_for_a_loss_in_doubt_says_what_is_at_stake(story, monkeypatc
 
 
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
-    """Only the log began off the start: a rover's start was told to matter little."""
     policy = story.candidates[1].policy
     late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])
     assert late.plan.model.n > TASK.model.n

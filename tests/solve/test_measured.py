@@ -125,7 +125,6 @@ def test_a_clamped_input_keeps_no_gain(lagging):
 
 
 def test_rounding_does_not_grow_where_inputs_are_cheap():
-    """An arm of two joints got 900 N m/rad where its plan had 30, and a singular matrix."""
     planner = lagging_by_two(two_axes, 1e-6)
     problem = planner.plan.problem()
     found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
@@ -148,7 +147,6 @@ def test_inputs_that_cost_nothing_and_do_the_same_are_shared():
 
 
 def test_a_line_that_is_never_left_tells_nothing_of_the_speed():
-    """A balancing robot with a filtered speed got 120,000 V per metre off its line, and fell."""
     model = Model(
         states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "r": "rad/s"},
         inputs={"left": "V", "right": "V"},

@@ -1,7 +1,4 @@
-"""kill -9 at any moment, and lost caches: the same state, the same next candidate, byte for byte.
-
-A dozen kills here; GROUNDED_KILLS=300 for a night.
-"""
+"""kill -9 at any moment, and lost caches."""
 
 import os
 import shutil

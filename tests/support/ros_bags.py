@@ -79,10 +79,7 @@ def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
 
 
 def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
-    """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s.
-
-    `seen` is a topic of its pose.
-    """
+    """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s."""
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
         "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
@@ -108,10 +105,7 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
 
 
 def rover_bag(folder, *, seen=""):
-    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry.
-
-    With `seen`, the topic of a camera's poses, nothing else is logged beside the commands.
-    """
+    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry."""
     topics = {"/cmd_vel": "geometry_msgs/msg/Twist"}
     if seen:
         topics |= {seen: "geometry_msgs/msg/PoseStamped"}
@@ -180,10 +174,7 @@ def turned(roll, pitch, yaw):
 
 
 def drone_bag(folder, yaw=1.4, turning=0.0, followed=True):
-    """Write a bag of a drone as mavros does: the velocity of its odometry is in its own axes.
-
-    Not `followed`: its attitude ignores the commands.
-    """
+    """Write a bag of a drone as mavros does: the velocity of its odometry is in its own axes."""
     topics = {
         "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
         "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
@@ -233,15 +224,7 @@ def arm_bag(folder, scale=1.0):
 def commanded_arm_bag(
     folder, order=("shoulder", "elbow"), goals=True, seed=0, measured_torques=False
 ):
-    """Write a bag of a vertical arm: JointState in alphabetical order, commands without names.
-
-    Args:
-        folder: of the bag.
-        order: of the torques in the array of commands.
-        goals: new ones every second; False: it hangs at rest, the torques are noise of the loop.
-        seed: of goals and noise.
-        measured_torques: JointState has efforts, noisy.
-    """
+    """Write a bag of a vertical arm: JointState in alphabetical order, commands without names."""
     rng, own, h = np.random.default_rng(seed), ("shoulder", "elbow"), 0.002
     topics = {
         "/joint_states": "sensor_msgs/msg/JointState",
@@ -322,14 +305,7 @@ def crane_bag(folder, joint="trolley", load="/sway/state"):
 
 
 def thruster_bag(folder, swapped=False, names=False, late=0):
-    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array.
-
-    Args:
-        folder: of the bag.
-        swapped: the array is [right, left].
-        names: the thrusters' commands are on a topic each, /thruster/left and /thruster/right.
-        late: samples by which positions are late.
-    """
+    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array. Args."""
     rng, h = np.random.default_rng(3), 0.02
     array, number = T["std_msgs/msg/Float64MultiArray"], T["std_msgs/msg/Float64"]
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)

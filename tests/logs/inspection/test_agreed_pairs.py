@@ -41,7 +41,6 @@ def found_in(folder, **renamed):
 
 
 def test_what_unit_derivative_and_the_only_pair_agree_on_is_sure(tmp_path):
-    """Four of five lines were UNSURE, and all of them right."""
     by = found_in(tmp_path)
     assert {name: g.path for name, g in by.items()} == {
         "x": "/csv.cart_mm",
@@ -65,7 +64,6 @@ def test_without_a_unit_it_is_asked(tmp_path):
 
 
 def test_an_angle_and_its_rate_that_look_exchanged_are_asked_and_told(tmp_path):
-    """The rate was negated, as surely right, and the diagnosis found sensors that were slow."""
     by = found_in(tmp_path, pole_deg="w", pole_speed="th")
     assert not by["th"].sure and not by["w"].sure and by["w"].scale == 1
     assert holds(" ".join(by["w"].reasons), "/csv.th and /csv.w look exchanged", "sign")
@@ -75,7 +73,6 @@ def test_an_angle_and_its_rate_that_look_exchanged_are_asked_and_told(tmp_path):
 
 
 def test_a_negated_rate_in_the_angle_s_column_is_told_with_its_scale(tmp_path):
-    """`init` wrote such a scale, and no exchange was found with it."""
     by, log = found_in(tmp_path, pole_deg="th", pole_speed="w"), tmp_path / "hand.csv"
     assert by["th"].sure and by["w"].sure
     table, t = np.loadtxt(log, delimiter=",", skiprows=1), np.arange(0, 30, 0.02)

@@ -54,7 +54,6 @@ def found_in(folder: Path, names: dict[str, str]) -> dict[str, tuple[str, bool, 
 
 
 def test_a_boats_columns_are_found(tmp_path: Path) -> None:
-    """None fitted, and `yaw_rate_deg_s` was a rival of `heading_deg`."""
     named = {"north": "north_m", "east": "east_m", "heading": "heading_deg"}
     named |= {"surge": "surge_m_s", "sway": "sway_m_s", "yaw_rate": "yaw_rate_deg_s"}
     found = found_in(tmp_path, named)
@@ -85,7 +84,6 @@ def test_a_speed_is_no_sway(tmp_path: Path) -> None:
 
 
 def test_a_trolleys_pos_is_its_x(tmp_path: Path) -> None:
-    """`x` was left to the smoother, which can't know a position from a swing's angle."""
     t = np.arange(0, 10, 0.02)
     rows = np.column_stack([t, np.sin(3 * np.floor(t)), 0.3 * np.sin(t), 5 * np.cos(4 * t)])
     path = tmp_path / "crane.csv"

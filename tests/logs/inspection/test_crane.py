@@ -49,7 +49,6 @@ def test_a_trolley_and_its_load_are_told_apart(tmp_path, joint, th):
 
 @pytest.mark.parametrize("joint, kind", [("trolley", "crane"), ("hinge", "pendulum")])
 def test_a_trolley_with_a_load_is_a_crane(tmp_path, joint, kind):
-    """It was a pendulum, on the grid of its sensor."""
     found = begin(tmp_path / "w", crane_bag(tmp_path / "bag", joint))
     assert found.kind == kind and found.dt == 0.04
     if kind == "crane":
@@ -95,7 +94,6 @@ def test_joints_that_slide_by_their_names(joint, slide):
 
 
 def test_a_crane_from_its_log_to_its_target(tmp_path):
-    """Ranges had no units, and nothing said how a load is brought to rest, or to draw it at all."""
     (tmp_path / "mine.py").write_text(CRANE.format(th="th"))
     w, log = tmp_path / "w", crane_bag(tmp_path / "bag")
     begin(w, log, model=tmp_path / "mine.py")

@@ -49,7 +49,6 @@ def balancer_bag(folder, second=0.0):
 
 
 def test_what_moves_and_is_in_the_unit_is_found_and_the_one_command(tmp_path):
-    """The pitch and its rate were read from two numbers that were always 0, the rate in m/s."""
     (tmp_path / "mine.py").write_text(MODEL)
     log = balancer_bag(tmp_path / "bag")
     begun = begin(tmp_path / "w", log, model=tmp_path / "mine.py")

@@ -192,7 +192,6 @@ def test_a_table_wider_than_the_list_says_so(tmp_path):
 
 
 def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
-    """A part of a quaternion was offered for `volts` before `/motor/voltage`."""
     log, t = tmp_path / "log.csv", np.arange(0, 5, 0.01)
     columns = np.column_stack([t, np.sin(t), 3 * np.sin(2 * t), np.sin(3 * t)])
     np.savetxt(log, columns, "%.5f", ",", header="t,tilt,motor_voltage,orientation_x", comments="")
@@ -211,7 +210,6 @@ def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
     ],
 )
 def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
-    """The only other number of a cart's only command topic was "UNSURE no name in the log fits"."""
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()

@@ -51,7 +51,6 @@ def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent)
 
 
 def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_path):
-    """Of poses and commands alone, cmd_omega was the state omega, and `turn` had nothing."""
     rows = np.loadtxt(table(tmp_path / "a.csv", "abcdefgh"), delimiter=",", skiprows=1)
     named = "t,x,y,theta,cmd_v,cmd_omega"
     kept = rows[:, [0, 1, 2, 3, 6, 7]]
@@ -63,7 +62,6 @@ def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_p
 
 
 def test_commands_beside_a_camera_s_poses_are_no_measured_speeds(tmp_path):
-    """/cmd_vel became the states v and omega, and "nothing in the log fits" speed and turn."""
     done = begin(tmp_path / "w", rover_bag(tmp_path / "bag", seen="/mocap"))
     found = {g.name: g.path for g in (*done.states, *done.inputs)}
     assert found["speed"] == "/cmd_vel.linear.x" and found["turn"] == "/cmd_vel.angular.z"

@@ -119,7 +119,6 @@ def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
 
 
 def test_a_changed_model_that_foretells_the_incumbent_judges_its_own_plan(noisy):
-    """A model that predicted the incumbent well (-1.275 for -1.307) had a plan of -0.17."""
     about, task, best = noisy.about, noisy.task, noisy.now.incumbent
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     about.make = Maker(better, about.make.now, "c0099", model_fingerprint(better.plan))
@@ -199,7 +198,6 @@ def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
 
 
 def test_the_noise_of_a_first_sample_is_no_motion():
-    """A load at rest read 0.09 rad/s: the bias of the first step promised a fifth of the cost."""
     task = cart_task()
     rows = [begun(task, noise=0.02, seed=seed) for seed in range(3)]
     assert np.abs(np.mean([run.states[0] for run in rows], axis=0) - task.start).max() > 0
@@ -211,7 +209,6 @@ def test_the_noise_of_a_first_sample_is_no_motion():
 
 
 def test_a_run_begins_where_the_samples_before_it_tell():
-    """Of a boat that was held before its run, one noisy sample was taken for where it began."""
     task = cart_task()
     run = begun(task, off=0.1, noise=0.02)
     told = replace(run, start_states={"x": 0.12})
@@ -222,7 +219,6 @@ def test_a_run_begins_where_the_samples_before_it_tell():
 
 
 def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():
-    """A ball at rest read -0.031 m/s: `discard` its best run, it was said."""
     task, false = cart_task(), 0
     said = begun(task).states
     for seed in range(20):
@@ -296,7 +292,6 @@ def test_of_what_the_model_gives_otherwise_only_known_reasons_are_told(as_run, e
 
 
 def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
-    """The model replays the mean of three runs; -0.25 of -1.25 was "not explained by scatter"."""
     from grounded_cli.propose import _so_far
 
     task = cart_task()
@@ -315,7 +310,6 @@ def test_what_the_scatter_of_runs_costs_is_not_called_unexplained():
 
 
 def test_a_difference_with_one_reason_has_one_number():
-    """A crane's 0.4687 worse than measured was -0.5257 by the scatter of its runs."""
     from grounded_cli.propose import _so_far
 
     task = cart_task()

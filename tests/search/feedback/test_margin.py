@@ -67,7 +67,6 @@ def test_noise_and_fresh_samples_alone_cost_what_a_run_with_noise_costs(planner)
 
 
 def test_what_holds_stays_as_it_is():
-    """With little noise and without friction or memory, old samples do not raise the cost."""
     planner = joint([("delay:tau", {"d": 0.005})], change=1.0)
     own = planner.narrowed(planner.first_policy()[0])
     assert planner.needs_margin and planner.loosened(planner.plan.problem(exact=True)) is None
@@ -75,7 +74,6 @@ def test_what_holds_stays_as_it_is():
 
 
 def test_gains_that_rely_on_fresh_samples_are_made_gentler():
-    """An arm's first run was predicted at -0.014, oscillated from step to step, and gave -61."""
     planner = joint([("delay:tau", {"d": 0.0148})], change=1e-7)
     problem = planner.plan.problem(exact=True)
     own, made = planner.narrowed(planner.first_policy()[0]), made_by(planner)
@@ -110,7 +108,6 @@ def test_a_policy_of_the_task_s_own_model_is_as_it_was():
 
 
 def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
-    """A gain on it, a quotient of rounding errors, could reach 1e27, and the plan was refused."""
     plain = speed_rover_task(speed_rover())
     reward = replace(plain.reward, input_change=np.array([0.01, 0.003]))
     slow = replace(plain, low=np.array([-0.3, -0.3]), high=np.array([1.5, 0.3]), reward=reward)

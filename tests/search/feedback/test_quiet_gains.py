@@ -45,7 +45,6 @@ def gains(made):
 
 
 def test_a_step_after_a_loss_of_gentler_gains_has_no_more_than_those():
-    """On a SCARA it had all of those that had oscillated, and ended in a limit cycle at -97."""
     run = search(0.03, 4)
     loud, gentle, *steps = run.candidates
     assert gentle.way == "gentler gains" and not run.history[1].accepted
@@ -135,7 +134,6 @@ def test_a_plan_that_replays_swings_is_no_measure_of_them(told):
 
 @pytest.mark.parametrize("cycle", [False, True])
 def test_noise_that_gains_carry_is_told_from_a_limit_cycle(cycle):
-    """17 swings of a boat's thruster "oscillated", by noise that `propose` had announced."""
     rng, T = np.random.default_rng(0), 120
     shaken = np.convolve(rng.normal(0, 0.12, T + 2), [0.3, 0.5, 0.3], "valid")
     moves = 0.2 * np.sin(0.7 * np.arange(T)) + 0.3 * shaken if cycle else 1.6 * shaken

@@ -219,7 +219,6 @@ def wired_wrongly(task, candidate):
 
 
 def test_a_run_with_a_motor_wired_wrongly_corrects_no_derivatives():
-    """Its law gave a helicopter a step that lost six times the best cost."""
     task = cart_task()
     found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 1)
     made = found.search.ask()
@@ -250,7 +249,6 @@ def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
 
 
 def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
-    """With the wild run of a motor they gave -2,014 for a best run of -1.553."""
     task = cart_task()
     found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     planner, history = Planner(task, task), found.search.standing.history

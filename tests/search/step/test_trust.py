@@ -56,8 +56,6 @@ def test_a_damping_is_written_as_in_the_table_of_status():
 def test_a_step_that_may_lose_much_gives_way_to_the_model_s_own_derivatives(
     monkeypatch, may_gain, own_gain, taken
 ):
-    """Seen: derivatives corrected by one noisy pair of trials promised 9.1 of 23 and lost 8."""
-
     def step(gain):
         return SimpleNamespace(candidate=SimpleNamespace(expected_gain=gain))
 
