@@ -8,7 +8,6 @@ import pytest
 
 from grounded.compile import Problem, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
-from grounded.compile.run import jit
 from grounded.compile.run.compiled import Kernels
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
@@ -34,9 +33,8 @@ def pair(name, horizon=37, **changes):
 
 def cases():
     for name in sorted(SPECS):
-        for delay in (0.0, 0.4, 1.0, 2.7):
-            for limit in (np.inf, 0.2):
-                yield name, delay, limit
+        for delay, limit in ((0.0, 0.2), (0.4, np.inf), (2.7, 0.2)):
+            yield name, delay, limit
 
 
 @pytest.mark.parametrize(("name", "delay", "limit"), list(cases()))
@@ -148,7 +146,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "m", "dense"),
-    [(1, 1, True), (3, 5, True), (7, 8, False), (16, 4, True), (26, 3, False), (6, 9, True)],
+    [(1, 1, True), (7, 8, False), (26, 3, False), (6, 9, True)],
 )
 def test_sizes_written_out_and_looped(n, m, dense):
     fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
@@ -222,21 +220,6 @@ def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypat
         np.testing.assert_allclose(mine, theirs, **TIGHT)
 
 
-def test_what_is_not_finite_reaches_no_other_derivative():
-    """At x = 0 the log of x has none; y's own, and that of a branch not taken, have theirs."""
-
-    def step(s, a, p, dt):
-        other = np.where(s.y > 0, s.y * s.y, np.log(s.x))
-        return {"x": np.log(s.x) + p.k * s.y, "y": np.maximum(a.u, s.y) + other}
-
-    names = {"states": ("x", "y"), "inputs": ("u",), "params": ("k",)}
-    system = traced(step, kind="step", **names)
-    at = (np.array([[0.0, 2.0]]), np.array([[1.0]]), np.array([3.0]), 0.1)
-    f_x, f_u, f_p = system.sensitivities(*at)
-    assert np.isinf(f_x[0, 0, 0]) and f_x[0, 0, 1] == 3.0 and f_p[0, 0, 0] == 2.0
-    assert f_x[0, 1].tolist() == [0.0, 5.0] and f_u[0].tolist() == [[0.0], [0.0]]
-
-
 def test_a_failed_sweep_names_the_same_step():
     zero = np.zeros(1)
     fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
@@ -250,22 +233,6 @@ def test_a_failed_sweep_names_the_same_step():
         bad[4] = np.nan
         found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
         assert found.failed_at >= 0
-
-
-def test_lanes_fit_the_machine():
-    assert jit.lanes() in (4, 8)
-
-
-@pytest.mark.slow
-def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
-    big = wide(100, 2, True)
-    assert big.system.how == "traced" and "100 states" in big.system.note
-    forty = wide(40, 4, True)
-    assert forty.system.how == "compiled"
-    u = np.zeros((12, 4))
-    with running(Engine(2), copied=False):
-        costs = each(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2)
-    assert costs[0] == costs[1] == solve(forty, u).cost
 
 
 def test_steps_one_after_the_other_are_those_steps():

@@ -99,32 +99,6 @@ def test_a_warm_process_does_not_import_llvm(tmp_path: Path) -> None:
     assert [line.split() for line in said] == [["compiled", "True"], ["compiled", "False"]]
 
 
-def test_a_machine_is_asked_again_once_it_was_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("GROUNDED_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(jit, "BOOT", tmp_path / "boot")
-    asked = jit._host.__wrapped__
-    jit._here.cache_clear()
-    try:
-        assert jit._here() == "" and jit._remembered() is None  # no such file
-        (tmp_path / "boot").write_text("first")
-        jit._here.cache_clear()
-        assert jit._remembered() is None
-        if not jit._here():
-            pytest.skip("LLVM is not where llvmlite's wheels have it")
-        assert asked() == jit._remembered() == asked()
-        (file,) = (tmp_path / "cache").glob("*.machine")
-        file.write_bytes(file.read_bytes()[:-1])
-        assert jit._remembered() is None  # damaged
-        assert asked() == jit._remembered()
-        (tmp_path / "boot").write_text("second")
-        jit._here.cache_clear()
-        assert jit._remembered() is None
-    finally:
-        jit._here.cache_clear()
-
-
 @here
 def test_code_that_writes_to_its_own_memory_is_left_to_llvm() -> None:
     text = """

@@ -1,7 +1,6 @@
 """What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, losses, wrap
-from grounded.effects.joint import FAMILIES, has_viscous, like_a_load, pairs_of
+from grounded.effects import Library, wrap
+from grounded.effects.joint import FAMILIES, has_viscous, pairs_of
 from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -96,23 +95,6 @@ def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
     assert {f"joint_spring:{pair}" for pair in SPRINGS} <= set(names)
     single = [effect.name for effect in Library().candidates(lift)]
     assert "coupling:w<-z" in single and "joint_spring:volts<-z" not in single
-
-
-def test_gains_of_several_joints_of_an_arm_are_like_a_load():
-    (tau, w), (other, _) = (pair.split("<-") for pair in PAIRS)
-    known = replace(arm, params={"m2": Param(1.0, "kg")})
-    assert like_a_load(known, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
-    gains = [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"]
-    assert like_a_load(known, gains)
-    assert not like_a_load(known, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
-    assert not like_a_load(arm, gains)  # its mass was free beside them
-    load = replace(
-        arm,
-        params={"m2": Param(1.0, "kg"), "load": Param(0.0, "kg", std=0.3)},
-        derivative=lambda s, a, p: dynamics(s, a, SimpleNamespace(m2=p.m2 + p.load)),
-    )
-    assert not like_a_load(load, gains)  # nor one that is zero in the model
-    assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])
 
 
 def test_where_inertia_is_constant_the_joint_has_its_old_names():
@@ -246,27 +228,6 @@ def test_an_inertia_that_was_left_out_is_found():
     assert found.ranking[0].params["J"].value == pytest.approx(0.08, rel=0.03)
 
 
-def test_a_step_with_a_spring_is_that_of_many_small_ones():
-    x, u, k = np.array([0.4, -0.3, 1.0, 2.0]), np.array([1.0, -0.2]), (3.0, 0.5)
-    model, fine, parts = arm, x.copy(), 2000
-    for pair, one in zip(SPRINGS, k, strict=True):
-        model = wrap(Library().effect(f"joint_spring:{pair}", model), {"k": one, "b": 0.0}, DT)
-    got = model.system.step(x[None], u[None], model.values, DT)[0]
-    none = arm.system.step(x[None], u[None], arm.values, DT)[0]
-    for _ in range(parts):
-        middle = fine + 0.5 * DT / parts * rates(fine, u, (0.0, 0.0), (0.0, 0.0), k)
-        fine = fine + DT / parts * rates(middle, u, (0.0, 0.0), (0.0, 0.0), k)
-    assert np.abs(got - fine).max() < 0.02 * np.abs(none - fine).max()
-
-
-@pytest.mark.slow
-def test_a_cable_at_a_joint_is_found():
-    found = gr.diagnose(arm, real_trials(k=(2.0, 0.0)))
-    assert found.effects == ("joint_spring:t1<-q1",)
-    assert found.ranking[0].params["k"].value == pytest.approx(2.0, rel=0.03)
-    assert found.ranking[0].params["b"].value == pytest.approx(0.0, abs=0.03)
-
-
 def crane(unit):
     """A trolley with a hanging load, its command in any unit."""
 
@@ -342,27 +303,3 @@ def test_a_mujoco_model_finds_mujocos_own_friction():
     assert found.ranking[0].params["c"].value == pytest.approx(0.5, rel=0.05)
     assert not found.preflight  # its own half step is no sensor's delay
     assert not any(name.startswith("sensor_") for name in found.effects)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_rows_of_losses_are_solved_by_machine_code_as_by_numpy(count):
-    """A diagnosis of an arm spent a third of its time in a few lines of NumPy."""
-    rng = np.random.default_rng(5)
-    rows = [list(rng.normal(size=(count, 40))) for _ in range(3)]
-    gain = [list(row) for row in np.abs(rng.normal(size=(count, count, 40)))]
-    at = losses.Loads(rows[0], rows[1], gain, rows[2], ())
-    for family, values in (
-        (FAMILIES[0], {"c": 0.6, "b": 0.1, "width": np.full(40, 0.02)}),
-        (FAMILIES[1], {"c": 0.1, "k": 0.2, "b": 0.0, "width": 0.02}),
-        (FAMILIES[2], {"J": 0.3}),
-    ):
-        for means, known in ((family.loss, ()), (family.early, rows[2])):
-            every, own = (means,) * count, [values] * count
-            mine = losses._compiled(every, own, at, known, 0.01)
-            theirs = (
-                [losses._beside(every, own, at, known, i, 0.01) for i in range(count)]
-                if known
-                else losses._swept(every, own, at, 0.01)
-            )
-            assert mine is not None
-            np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)

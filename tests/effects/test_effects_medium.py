@@ -9,12 +9,11 @@ import pytest
 
 import grounded as gr
 from grounded import Model, Param, Trial
-from grounded.challenge.truth import Truth, _Run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
+from grounded.effects import Effect, Library, scales_of, wrapping_order
 from grounded.effects.medium import turning
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -236,22 +235,6 @@ def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
     np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
 
 
-def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
-    model = adopted(CURRENT)
-    data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
-    found = Predictor(data).next(h, data.y[:-1])
-    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
-    for both in (adopted(CURRENT, DRAG), adopted(DRAG, CURRENT), joined(DRAG, model)):
-        want = both.system.step(x, u, both.values, DT)
-        np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
-
-
-def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
-    """The model with one more effect."""
-    name, values = part
-    return wrap(Library().effect(name, model), values, DT)
-
-
 @pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
 def test_its_slopes_are_those_of_its_steps(parts):
     """A current's exactly; where a rate's kick moves the model, to two per cent, as of any rate."""
@@ -297,16 +280,6 @@ def test_a_black_box_is_linearised_about_what_the_medium_sees():
     assert np.abs(columns[0][1][..., 1:]).max() > 0.01
 
 
-def test_the_challenges_truth_has_the_same_current():
-    """Integrated inside the derivative by other code."""
-    truth = Truth(boat, ((effect(CURRENT[0]), CURRENT[1]),))
-    run = _Run(truth, np.random.default_rng(0), np.zeros(6), np.zeros(2), DT)
-    for x, u in zip(TRIALS[0].states[10::30], TRIALS[0].inputs[10::30], strict=False):
-        s, a = dict(zip(STATES, x, strict=True)), dict(zip(INPUTS, u, strict=True))
-        want = rates(s, a, SIZES, water=(0.15, -0.08))
-        np.testing.assert_allclose(run.rates(x, u, 0.0), list(want.values()), atol=1e-5)
-
-
 SEA = [
     ({"water": (0.15, -0.08)}, "current:u+v"),
     ({"push": (0.12, 0.2)}, "push_world:u+v"),
@@ -326,21 +299,18 @@ def test_the_cause_is_found_with_its_size(truth, name):
 
 
 ADDED = [
-    ((1.5, 0.0, 0.0), "u", "v * r", "1"),  # this boat hardly slides
-    ((0.0, 0.5, 0.0), "v", "u * r", "1"),
-    ((0.0, 0.0, 0.5), "r", "u * v", "rad/m^2"),
+    ((0.0, 0.0, 0.5), "r", "rad/m^2"),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("added", "rate", "product", "unit"), ADDED)
-def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, product, unit):
+@pytest.mark.parametrize(("added", "rate", "unit"), ADDED)
+def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, unit):
     """A `rate_gain` would change the drag and the thrust as well."""
     found = gr.diagnose(boat, driven(added=added, steps=100))
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]
     assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
-    assert f"* {product} more (Coriolis" in found.sentence
 
 
 @pytest.mark.slow

@@ -5,20 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import grounded.diagnosis.likelihood.predictor as predictor_module
 from grounded import Trial
 from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Estimate, Ranked, Verdict
-from grounded.diagnosis.writer import _in_action
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
 from grounded.effects.memory import shifted
 from grounded.models.car import model as car
 from grounded.task import Task
 from grounded.utility import Reward
-from grounded_trials.workspace.adoptable import joined
 from grounded_trials.workspace.adopted import in_order, planner_of
 
 DT, STEPS = 0.05, 60
@@ -144,26 +140,6 @@ def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
     assert off.max() < 0.015  # inputs that arrive at different times
 
 
-def test_the_memory_of_a_trial_follows_what_arrives():
-    planner = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)])
-    trial = Trial(
-        predicted((LIMIT, PART)),
-        commands(),
-        DT,
-        car.state_names,
-        car.input_names,
-        start_inputs=HELD,
-    )
-    states, plan = planner.lift(trial).states, planner.plan
-    received = np.stack(
-        [shifted(commands()[None, :, j], HELD[[j]], plan.latency[j] / DT)[0] for j in range(2)],
-        axis=1,
-    )
-    after = plan.model.system.step(states[:-1], received, plan.model.values, DT)
-    np.testing.assert_allclose(after[:, car.n :], states[1:, car.n :], atol=1e-9)
-    np.testing.assert_allclose(after, states[1:], atol=0.01)  # the model takes the limit's mean
-
-
 @pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])
 def test_what_was_held_before_went_through_all_effects(parts):
     names = (car.state_names, car.input_names)
@@ -178,11 +154,6 @@ def test_what_was_held_before_went_through_all_effects(parts):
     received = predictor.received(hypothesis(parts))[0]
     np.testing.assert_allclose(received, np.tile(received[-1], (STEPS, 1)), atol=1e-12)
     assert np.abs(received[0] - HELD).max() > 0.04
-
-
-def test_effects_on_inputs_do_not_commute():
-    one, other = predicted((LAG, LIMIT)), predicted((LIMIT, LAG))
-    assert np.abs(one - other).max() > 1e-3
 
 
 def test_a_delay_acts_last_whenever_it_was_claimed():
@@ -213,26 +184,6 @@ def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
     assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
 
 
-def test_effects_are_adopted_in_the_order_in_which_they_were_fitted():
-    """By credit the gain comes first, as `next:` prints it; the dead zone acts first."""
-    fitted = (ZONE, WEAKER, DELAY)
-    by_credit = (DELAY, WEAKER, ZONE)
-    names = tuple(name for name, _ in by_credit)
-    ranking = tuple(
-        Ranked(name, claimed=True, params={q: Estimate(v) for q, v in values.items()})
-        for name, values in by_credit
-    )
-    order = _in_action(hypothesis(fitted), names)
-    assert order == (ZONE[0], WEAKER[0], DELAY[0])
-    found = Diagnosis(Verdict("several", effects=names), ranking=ranking, acting=order)
-    assert list(found.joining) == list(order)
-    _, effects = joined(found, names, [], {}, {})
-    np.testing.assert_allclose(
-        adopted([(e.pop("name"), e) for e in effects]), predicted(fitted), atol=1e-9
-    )
-    assert np.abs(predicted(by_credit) - predicted(fitted)).max() > 1e-3
-
-
 def test_what_is_wrapped_last_acts_first():
     families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
     assert acting_order(families) == [1, 3, 0]
@@ -257,19 +208,3 @@ def test_inputs_by_run_are_those_of_whole_trials():
     assert np.ptp(whole[..., 1]) > 0
     at = int(data.trial_of[-1]), int(data.step_at[-1, 5] - data.lengths[:2].sum())
     np.testing.assert_array_equal(whole[5, -1], predictor.received(h, leads=True)[at])
-
-
-def test_an_effect_on_one_input_leaves_the_cached_other(monkeypatch):
-    names = (car.state_names, car.input_names)
-    trial = Trial(np.full((STEPS + 1, car.n), 0.1), commands(), DT, *names, start_inputs=HELD)
-    made, own = [], predictor_module.arriving
-
-    def counted(acting, data, j):
-        made.append(j)
-        return own(acting, data, j)
-
-    monkeypatch.setattr(predictor_module, "arriving", counted)
-    predictor = Predictor(prepare(car, [trial]))
-    for parts in ([], [LAG], [ZONE], [LAG]):
-        predictor.inputs(hypothesis(parts))
-    assert sorted(made) == [0, 0, 0, 1]

@@ -100,13 +100,6 @@ def test_its_slopes_are_those_of_its_steps(late, name, values):
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02
 
 
-@pytest.mark.parametrize("late", [LATE["both"], LATE["part of a step"]], ids=["both", "part"])
-def test_a_limit_of_a_rate_takes_its_parts_of_a_step_of_what_moves(late):
-    test_what_moves_a_model_with_late_logs_steps_as_the_model_that_adopts_it(
-        late, "slew_limit:delta", {"r": 0.5}
-    )
-
-
 def test_names_say_which_value_moves():
     model = built(LATE["both"])
     names = dict(zip(seen_names(model), model.state_names, strict=True))
@@ -157,29 +150,3 @@ def test_a_friction_is_found_behind_a_late_log():
     found = gr.diagnose(model, lifted, options)
     assert found.verdict.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, abs=0.03)
-
-
-@pytest.mark.parametrize(
-    ("state", "name", "values"),
-    [("psi", "sensor_delay:psi", {"d": 0.12}), ("v", "sensor_lag:v", {"tau": 0.1})],
-)
-def test_true_values_behind_a_late_log_do_not_drift_away_from_it(state, name, values):
-    model = Model(
-        states={state: "rad" if state == "psi" else "m/s"},
-        inputs={"u": "1"},
-        params={"g": Param(1.0, "1", 0.5, 2.0)},
-        derivative=lambda s, a, p: {state: p.g * a.u},
-    )
-    rng, steps = np.random.default_rng(0), 400
-    u = np.repeat(rng.uniform(-1, 1, steps // 10), 10)
-    late = [(name, values)]
-    real = built(late, model.with_values({"g": 1.2}))
-    z = [np.zeros(real.n)]
-    for value in u:
-        z.append(real.system.step(z[-1][None], np.array([[value]]), real.values, DT)[0])
-    log = np.array(z)[:, :1] + 0.004 * rng.standard_normal((steps + 1, 1))
-    trial = Trial(log, u[:, None], DT, (state,), ("u",), start_inputs=np.zeros(1))
-    true = real.state_names.index(f"{state}_true")
-    off = memory_of(built(late, model), model, trial)[:, true - 1] - np.array(z)[:, true]
-    alone = 0.2 * DT * np.cumsum(u)  # what the model misses
-    assert np.abs(off).max() < 0.3 * np.abs(alone).max()

@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ahead import missed
-from grounded.effects import Library, wrap
+from grounded.effects import Library
 from grounded.effects.actuator import first_order_lag, rate_limit
 from grounded.effects.memory import Sent, shifted_within
 from grounded.models.car import model as car
@@ -150,28 +150,3 @@ def test_an_input_that_stalls_acts_after_its_delay_and_not_by_its_mean():
     two = [h, Hypothesis().plus(late, {"d": 0.02})]  # of two folds, each row has its own
     both = missed(Predictor(data), two, moments % 2, data.y, moments, one, 1)[-1]
     assert np.abs(both[::2]).max() < 1e-4 and np.abs(both[1::2]).max() > 1e-3
-
-
-def test_an_adopted_lag_moves_positions_as_the_actuator_does():
-    name, value = CASES[2]
-    data = prepare(joint, [trial(name, value, 1)], np.zeros(1))
-    effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
-    wrapped = wrap(effect, {effect.free[0].name: value}, DT)
-    u, x = commands_of(1), np.array([0.0, 0.0, commands_of(1)[0]])
-    path = [x]
-    for torque in u:
-        x = wrapped.system.step(x[None], np.array([[torque]]), wrapped.values, DT)[0]
-        path.append(x)
-    off = np.diff(np.array(path)[:, 0] - data.y[:, 0, 0])
-    assert off.std() < 2.5e-5  # of which encoders make 1.4e-5
-
-
-def test_predictions_a_second_ahead_know_what_arrives_within_a_step():
-    name, value = CASES[1]
-    data = prepare(joint, [trial(name, value, 1, noise=0.0)], np.zeros(1))
-    effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
-    h = Hypothesis().plus(effect, {"d": value})
-    moments = np.arange(0, 90, 10)
-    one = np.zeros(len(moments), int)
-    off = missed(Predictor(data), [h], one, data.y, moments, one, 50)[-1]
-    assert np.abs(off[:, 0]).max() < 3e-5  # 3e-4 from means alone

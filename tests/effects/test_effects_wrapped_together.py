@@ -1,7 +1,5 @@
 """Several rate effects adopted together are the ones that were diagnosed together."""
 
-import math
-
 import numpy as np
 import pytest
 from test_effects_order import DT, HELD, STEPS, commands, task
@@ -32,7 +30,6 @@ PAIRS = [
     (GAIN, SLIP),
     (SLEW, FRICTION),
     (SLEW, GAIN),
-    (SLEW, ("slew_limit:v", {"r": 0.5})),
     (TREND, UNDERSTEER),
 ]
 BOTH_ORDERS = PAIRS + [(b, a) for a, b in PAIRS]
@@ -94,34 +91,6 @@ def test_the_carried_heading_rate_stays_the_headings(parts):
     assert np.abs(drift[[20, 60]]).max() < 0.01
 
 
-@pytest.mark.slow
-def test_pairs_wrapped_in_any_order_are_one_model():
-    one, models = trial(), []
-    for parts in ((SLEW, FRICTION, GAIN), (GAIN, SLEW, FRICTION)):
-        model = car
-        for name, values in parts:
-            model = wrap(Library().effect(name, model), values, DT)
-        models.append(model)
-    first, second = (drive(model, one) for model in models)
-    np.testing.assert_allclose(first, second, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "name, values, uncertain",
-    [
-        ("input_curve:throttle", {"a": 0.0, "b": -0.13, "U": 1.0}, {"b"}),
-        ("input_curve:throttle", {"a": 0.2, "b": -0.13, "U": 1.0}, {"a", "b"}),
-        ("input_gain:throttle", {"g": 0.0}, {"g"}),
-        ("coulomb_friction:v", {"c": 0.0}, {"c"}),
-    ],
-)
-def test_the_side_of_an_input_that_was_never_seen_stays_unknown(name, values, uncertain):
-    model = wrap(Library().effect(name, car), values, DT)
-    stem = name.replace(":", "_") + "_"
-    free = {n.removeprefix(stem) for n, p in model.params.items() if p.uncertain}
-    assert free & set(values) == uncertain
-
-
 def test_a_heading_rate_carried_by_the_users_own_step_follows_too():
     rk4 = plain_step(car)
     own = Model(
@@ -134,18 +103,3 @@ def test_a_heading_rate_carried_by_the_users_own_step_follows_too():
     )
     x = drive(wrap(Library().effect(FRICTION[0], own), FRICTION[1], DT), trial())
     np.testing.assert_allclose(x[:, 5], x[:, 1] * np.sin(x[:, 0]) / 0.15, atol=2e-3)
-
-
-def test_pythons_own_math_is_compiled_through_two_effects():
-    swing = Model(
-        states={"angle": "rad", "rate": "rad/s"},
-        inputs={"torque": "1"},
-        derivative=lambda s, a, p: {
-            "angle": s.rate,
-            "rate": max(a.torque, 0.0) - math.sin(s.angle),
-        },
-    )
-    model = swing
-    for name, values in (("offset:rate", {"c": 0.1}), ("input_gain:torque", {"g": 0.1})):
-        model = wrap(Library().effect(name, model), values, DT)
-    assert not model.system.note

@@ -1,4 +1,4 @@
-"""Budgets of time and memory, stamps, ids: what 0.1 read for minutes, or wrongly."""
+"""Budgets of time and memory, stamps, ids of channels."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mcap.writer import CompressionType, Writer
 
 from bombs import BOMBS, OTHERS, explode, idl, log, ros
 from facts import holding
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_walk import DamagedFile, read_records
+from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
@@ -29,37 +29,24 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.within import MEMORY, SECONDS, OverBudget, within
 from pace import slowness
 
-QUICK = ("JSON, nested lists",)
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
-def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
-    """Fails on 0.1: 12 kB of JSON took 3.1 GB, a packed list 1.7 GB (FACTS 9)."""
-    told = {what: cost.wrong for what, cost in explode(name, tmp_path).items()}
-    assert not any(told.values()), told
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in BOMBS | OTHERS if name not in QUICK])
+@pytest.mark.parametrize("name", BOMBS | OTHERS)
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
-    """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9)."""
     told = {what: cost.wrong for what, cost in explode(name, tmp_path, budget_s=1.0).items()}
     assert not any(told.values()), told
 
 
 def test_a_trial_in_many_small_chunks_is_read_in_linear_time() -> None:
-    """Fails on 0.1: time grew with the square of the steps, 19 s for 400,000 (FACTS 9)."""
     steps = 20_000
     trial = Trial(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), 1.0, ("x",), ("u",))
     data = trial_bytes(trial, {})
     began = time.process_time()
     assert read_trial(data)[0].steps == steps
-    assert time.process_time() - began < 2.0 * slowness()  # 0.15 here; 0.1 took 30 s
+    assert time.process_time() - began < 2.0 * slowness()
 
 
 def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) -> None:
-    """Fails on 0.1: each use of a constant read its text again, and of a typedef its chain."""
     long = "1" + "0" * 2000
     members = "".join(f"long m{i}[C];" for i in range(20_000))
     text = f"const long C = {long};\nmodule a {{ struct M {{ {members} }}; }};"
@@ -124,23 +111,6 @@ def test_a_reader_ends_at_each_limit_which_is_named(
     assert set(Path(tempfile.gettempdir()).glob("grounded-*")) <= room
 
 
-def test_memory_and_time_are_limited_where_a_child_is_no_copy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setenv(SECONDS, "2")
-    for function, setting in ((endless, SECONDS), (slowly_hungry, MEMORY)):
-        with pytest.raises(OverBudget, match=holding("a.log", setting)):
-            within("a.log", 0, function)
-
-
-def slowly_hungry() -> None:
-    held = []
-    while True:
-        held.append(np.ones(10**6))
-        time.sleep(0.01)
-
-
 def test_results_and_errors_come_back(either: str) -> None:
     assert within("a.log", 10**8, echo, np.arange(5), b=[1]).tolist() == [1, 2, 3, 4, 5]
     with pytest.raises(DamagedFile, match="a hole") as damaged:
@@ -189,12 +159,6 @@ def test_ctrl_c_ends_the_child_as_well(either: str, tmp_path: Path) -> None:
 def note_and_wait(path: Path) -> None:
     path.write_text(str(os.getpid()))
     endless()
-
-
-def test_a_setting_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(SECONDS, "much")
-    with pytest.raises(GroundedError, match="'much'"):
-        within("a.log", 0, divided)
 
 
 def two_channels() -> bytes:
@@ -264,7 +228,6 @@ def test_stamps_outside_the_calendar_are_refused(stamp: str, tmp_path: Path) -> 
 
 
 def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path) -> None:
-    """Fails on 0.1: it wrapped around to 1677 (FACTS 9)."""
     path = tmp_path / "log.mcap"
     stream = io.BytesIO()
     writer = Writer(stream)
@@ -279,21 +242,3 @@ def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path
         read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
     saved = recover_log(path, tmp_path / "saved.mcap")
     assert saved.messages == {"/t": 2} and not saved.complete
-
-
-def test_a_trial_may_start_before_zero() -> None:
-    trial = Trial(np.arange(6.0)[:, None], np.ones((5, 1)), 0.5, ("x",), ("u",))
-    back, meta, _ = read_trial(trial_bytes(trial, {}, start_ns=-3 * 10**9))
-    assert np.array_equal(back.states, trial.states) and meta["start_ns"] == "-3000000000"
-
-
-def test_small_chunks_are_handed_on_together(tmp_path: Path) -> None:
-    data = ros("float64 x", (b"\0\1\0\0" + bytes(8) for _ in range(1000)), chunk=1)
-    batches = [r for r in read_records(io.BytesIO(data), "f") if hasattr(r, "starts")]
-    assert len(batches) == 1 and len(batches[0]) == 1000
-    assert batches[0].log_times.tolist() == [i * 10**7 for i in range(1000)]
-
-
-def test_a_message_lists_few_names() -> None:
-    text = nearest("x", (f"name{i}" for i in range(100_000)))
-    assert len(text) < 1000 and "99960 more" in text

@@ -77,11 +77,6 @@ def names(trial: Trial) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return trial.state_names, trial.input_names
 
 
-def test_equal_trials_are_equal_files() -> None:
-    assert trial_bytes(a_trial(), {"a": "b"}, b"p") == trial_bytes(a_trial(), {"a": "b"}, b"p")
-    assert trial_bytes(a_trial(), {}) != trial_bytes(a_trial(seed=1), {})
-
-
 @pytest.mark.parametrize("feedback", [True, False])
 def test_a_candidate_comes_back_exactly(feedback: bool, tmp_path: Path) -> None:
     policy, rng = a_policy(feedback=feedback), np.random.default_rng(2)
@@ -112,22 +107,6 @@ def test_other_tools_read_named_fields() -> None:
     summary = reader.get_summary()
     assert summary is not None and summary.statistics is not None
     assert (summary.statistics.metadata_count, summary.statistics.attachment_count) == (1, 1)
-
-
-@pytest.mark.parametrize("repeated", [False, True])
-def test_a_schema_is_what_the_protobuf_package_writes(repeated: bool) -> None:
-    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-
-    names = [f"größe_{i}" * (1 + i % 40) for i in range(300)]
-    files = FileDescriptorSet()
-    file = files.file.add(name="grounded/State.proto", package="grounded", syntax="proto3")
-    message = file.message_type.add(name="State")
-    label = Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
-    for number, name in enumerate(names, start=1):
-        message.field.add(name=name, number=number, label=label, type=Field.TYPE_DOUBLE)
-    mine = file_descriptor_set("State", names, repeated=repeated)
-    assert mine == files.SerializeToString(deterministic=True)
 
 
 def test_a_live_trial_that_is_cut_off_keeps_all_but_its_last_second(tmp_path: Path) -> None:
@@ -266,12 +245,6 @@ def test_a_file_without_its_checksum_is_refused() -> None:
     writer.finish()
     with pytest.raises(GroundedError, match=holding("checksum")):
         read_trial(stream.getvalue())
-
-
-def test_a_candidate_that_lost_its_end_is_refused() -> None:
-    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
-    with pytest.raises(GroundedError, match=holding("21 steps", "21 messages")):
-        read_candidate(with_metadata(candidate, "steps", "21"))
 
 
 @pytest.mark.parametrize("repeated", [False, True])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from cli import grounded, plain
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
@@ -88,18 +87,3 @@ def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
     moving = tmp_path / "moving"
     begin(moving, excavator(tmp_path / "bag2"), model=model)
     assert Workspace(moving).config.task.start == {}
-
-
-def test_a_recovered_log_that_log_can_read_is_to_be_ingested(tmp_path, model):
-    log = excavator(tmp_path / "bag", still=100, storage=StoragePlugin.MCAP)
-    begin(tmp_path / "w", log, model=model)
-    cut = tmp_path / "cut.mcap"
-    whole = next(log.glob("*.mcap")).read_bytes()
-    cut.write_bytes(whole[: len(whole) * 2 // 3])
-    refused = grounded("-C", tmp_path / "w", "ingest", "--data", cut)
-    assert f"(at byte {cut.stat().st_size})" in refused.err
-    done = grounded("-C", tmp_path / "w", "recover", cut)
-    saved = tmp_path / "cut-recovered.mcap"
-    assert plain(done.out).rstrip().endswith(f"ingest --data {saved}") and done.code == 3
-    elsewhere = grounded("-C", tmp_path, "recover", cut, "-o", tmp_path / "again.mcap")
-    assert "inspect" in plain(elsewhere.out).splitlines()[-1]

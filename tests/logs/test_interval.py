@@ -152,15 +152,3 @@ def test_jitter_does_not_make_an_odd_interval():
     assert round_interval(0.0303) == pytest.approx(1 / 33, rel=1e-5)
     assert (round_interval(1e-5), round_interval(90.0)) == (0.001, 90.0)
     assert [round_interval(rows) for rows in (0.996, 1.999, 2.5, 10.02)] == [1.0, 2.0, 2.5, 10.0]
-
-
-def test_a_camera_s_log_has_its_interval(tmp_path):
-    rng = np.random.default_rng(2)
-    t = np.arange(300) / 30 + rng.uniform(-2e-3, 2e-3, 300)
-    force = np.round(rng.normal(0, 1, 300), 3)
-    v = np.cumsum(force) / 30
-    columns = np.column_stack([t, np.cumsum(v) / 30, v, force])
-    np.savetxt(tmp_path / "r.csv", columns, "%.5f", ",", header="t,x,v,force", comments="")
-    (tmp_path / "m.py").write_text(MODEL)
-    found = begin(tmp_path / "w", tmp_path / "r.csv", model=tmp_path / "m.py")
-    assert found.dt == 0.0333333 and found.horizon == 200

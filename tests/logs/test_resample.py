@@ -166,15 +166,6 @@ def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
     assert len(grid(x, u, span=Span(end=0.9)).inputs) == 8  # outside the span it does not matter
 
 
-def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
-    def slow(s: Series) -> Series:
-        t = EPOCH + 1000 * (s.t - EPOCH)
-        return replace(s, t=t, log_times=t)
-
-    with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
-        grid(slow(pose(np.sin)), slow(command()))
-
-
 def test_one_shot_topics() -> None:
     u = series(np.array([0.0]), np.array([0.3]), SignalSpec("/u", "log"))
     found = grid(pose(np.sin), u)
@@ -333,53 +324,3 @@ def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
     assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
     with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
         grid(later, command())
-
-
-def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -> None:
-    t = np.arange(-0.5, 3.0, 0.016)
-    seen = np.floor(t / 0.04 + 1e-9) * 0.04
-    x, y = series(t, np.sin(3 * seen)), series(t, np.cos(2 * seen))
-    fast = series(t, np.sin(t))
-    found = to_grid({"x": x, "y": y, "z": fast, "u": command()}, 0.05, ["x", "y", "z"], ["u"])
-    (told,) = (w for w in found.warnings if "Hz" in w)
-    assert re.match(r"'x' and 'y' change at 25(\.\d)? Hz", told) and "62.5 Hz" in told
-    assert "0.012 s late" in told and "'z'" not in told
-
-
-def test_what_holds_of_a_whole_message_is_said_once_and_one_sorted_stamp_not_at_all() -> None:
-    def of_pose(order: np.ndarray):  # type: ignore[no-untyped-def]
-        x = pose(np.sin)
-        one = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])
-        names = ["x", "y", "psi"]
-        return to_grid({**dict.fromkeys(names, one), "u": command()}, 0.05, names, ["u"])
-
-    order = np.arange(len(pose(np.sin).t))
-    order[10:12] = 11, 10
-    found = of_pose(order)
-    assert found.reports[0].out_of_order == 1 and not found.warnings
-    order[10:20] = np.arange(20, 10, -1) - 1
-    (said,) = of_pose(order).warnings
-    assert said == "'x', 'y' and 'psi': 9 stamps out of order"
-
-
-def test_a_sample_far_outside_everything_else_is_told() -> None:
-    def spiked(t: np.ndarray) -> np.ndarray:
-        y = np.sin(t)
-        y[len(y) // 2] = 1e4
-        return np.asarray(y)
-
-    assert any("'x'" in text and "1e+04" in text for text in grid(pose(spiked)).warnings)
-    stepped = grid(pose(lambda t: np.where(t > 1.0, 500.0, np.sin(t))))
-    assert not any("far outside" in text for text in stepped.warnings)
-
-
-def test_a_state_that_vanishes_half_way_is_told() -> None:
-    whole, part = pose(np.sin), pose(np.cos)
-    n = len(part.t) // 2
-    cut = {name: getattr(part, name)[:n] for name in ("t", "values", "log_times")}
-    half = replace(part, **cut)
-    signals = {"x": whole, "v": half, "u": command()}
-    found = to_grid(signals, 0.05, ["x", "v"], ["u"])
-    assert any("'v'" in text for text in found.warnings)
-    found = to_grid(signals | {"v": part}, 0.05, ["x", "v"], ["u"])
-    assert not any("'v'" in text for text in found.warnings)

@@ -8,7 +8,6 @@ import pytest
 from cli import grounded
 from facts import holds
 from grounded_trials.logs.stated_units import (
-    bare_command,
     factor_between,
     in_english,
     same_unit,
@@ -101,28 +100,10 @@ def test_the_end_of_a_name_says_a_unit(path, unit, bare):
 
 
 @pytest.mark.parametrize(
-    ("path", "unit", "bare"),
-    [
-        ("/mcu.steering_deg_cmd", "deg", "/mcu.steering"),
-        ("/mcu.steering_cmd_deg", "deg", "/mcu.steering"),
-        ("/mcu.speed_setpoint", "", "/mcu.speed"),
-        ("/mcu._cmd", "", "/mcu._cmd"),
-        ("/mcu.ref", "", "/mcu.ref"),
-    ],
-)
-def test_a_command_s_role_stands_before_its_unit_or_after(path, unit, bare):
-    assert (unit_in_name(path), bare_command(path)) == (unit, bare)
-
-
-@pytest.mark.parametrize(
     ("named", "inputs", "scales"),
     [
-        ("steering_pct,throttle_pct", ("steering", "throttle"), (0.01, 0.01)),
-        ("steering_percent,throttle_percent", ("steering", "throttle"), (0.01, 0.01)),
-        ("steer_cmd,throttle_cmd", ("steering", "throttle"), (1, 1)),
         ("steering_deg,throttle_ref", ("steering", "throttle"), (np.pi / 180, 1)),
         ("steering_pct,speed_cmd", ("steering", "speed"), (0.01, 1)),
-        ("steering_cmd_rad,speed_setpoint_mps", ("steering", "speed"), (1, 1)),
     ],
 )
 def test_a_car_s_commands_are_found_whatever_unit_or_role_their_names_end_with(
@@ -197,8 +178,6 @@ def begun(tmp_path, head: str, factors: dict[str, float]) -> dict:
     "head",
     [
         "t,r_mm,rd,th_deg,thd_deg,volt",
-        "t,r_mm,rd_m_s,th_deg,thd_deg_s,volt_V",
-        "t,r [mm],rd,th [deg],thd [deg/s],volt",
         "t,r [mm],rd [m/s],th [deg],thd,volt",
     ],
 )
@@ -209,7 +188,6 @@ def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path,
         n: pytest.approx(factors.get(n, 1.0)) for n in found
     }
     assert all(one["sure"] for one in found.values())
-    assert holds(" ".join(found["r"]["reasons"]), "says mm", "the model m")
 
 
 def test_a_rate_without_a_unit_that_is_as_large_as_its_position_says_is_asked_for(tmp_path):
@@ -217,20 +195,6 @@ def test_a_rate_without_a_unit_that_is_as_large_as_its_position_says_is_asked_fo
     found = begun(tmp_path, "t,r_cm,rd,th,thd,volt", {"r": 0.01, "rd": 0.01})
     assert found["r"]["scale"] == found["rd"]["scale"] == pytest.approx(0.01)
     assert not found["rd"]["sure"]
-
-
-def test_a_name_in_degrees_that_the_position_contradicts_is_unsure(tmp_path):
-    found = begun(tmp_path, "t,r,rd,th,thd_deg,volt", {})
-    assert not found["thd"]["sure"] and found["thd"]["scale"] == 1
-    assert holds(" ".join(found["thd"]["reasons"]), "deg", "rad/s")
-
-
-def test_ingest_warns_of_a_name_whose_unit_no_scale_makes_up_for(tmp_path):
-    begun(tmp_path, "t,r_mm,rd,th,thd,volt", {"r": MM})
-    file = tmp_path / "w" / "grounded.toml"
-    file.write_text(file.read_text().replace("scale = 0.001\n", ""))
-    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "log.csv", "--json")
-    assert holds(done.json["trials"][0]["warnings"][0], "r", "mm", "scale = 0.001")
 
 
 ROLLING = """from grounded import Model, Param
@@ -273,30 +237,6 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
     assert [one["scale"] for one in log["state"].values()] == [pytest.approx(np.pi / 180)] * 4
 
 
-def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
-    names = ["a_deg", "b_deg", "c_deg", "d_dps", "e_dps", "f_dps"]
-    out, text = helicopter(tmp_path, names, linked=False)
-    assert "UNSURE" in out
-    table = text[text.index("[log]") :]
-    assert "remove all 3 #" in table
-    log = tomllib.loads(
-        table.replace("# [", "[").replace("# path", "path").replace("# scale", "scale")
-    )
-    for one in log["log"]["state"].values():
-        assert one["scale"] == pytest.approx(np.pi / 180)
-
-
-def test_states_of_one_s_own_model_are_found_by_their_derivatives_if_no_name_fits(tmp_path):
-    names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
-    out, text = helicopter(tmp_path, names)
-    log = tomllib.loads(text)["log"]
-    signals = {**log["state"], **log["input"]}
-    assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
-    assert out.count("UNSURE") == 7 and "or /csv.f" in out  # 6, and a sentence that says so
-    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "a.csv")
-    assert done.code == 0, done.err  # a model without parameters brought a traceback
-
-
 FURUTA = """from grounded import Model
 model = Model(
     states={"arm": "rad", "arm_rate": "rad/s", "pend": "rad", "pend_rate": "rad/s"},
@@ -329,9 +269,7 @@ def furuta(folder, names):
 @pytest.mark.parametrize(
     "names, sure, volt",
     [
-        (("arm_deg", "pend_deg", "volt"), True, "/csv.volt"),
         (("arm_deg", "pend_deg", "motor_cmd"), True, "/csv.motor_cmd"),
-        (("armAngle", "pendAngle", "volt"), True, "/csv.volt"),
         (("theta_deg", "alpha_deg", "volt"), False, "/csv.volt"),
         (("arm_deg", "pend_deg", "u", "battery"), True, None),
     ],
@@ -348,35 +286,8 @@ def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, name
     assert all(path in " ".join(notes) for path in unused)
 
 
-def test_a_log_in_which_nothing_is_found_says_what_need_not_be_in_it(tmp_path):
-    found, notes, text = furuta(tmp_path, ("enc1", "enc2", "pwm"))
-    assert not any(one["path"] for one in found.values())
-    assert any("[estimate]" in note and "arm_rate" in note for note in notes)
-    assert any("/csv.enc1" in note for note in notes)
-    mapped = text.replace("# [estimate]", "[estimate]").replace("# measured", "measured")
-    assert set(tomllib.loads(mapped)["estimate"]["measured"]) == {"arm", "pend"}
-
-
 def test_words_are_translated_only_if_all_parts_are_known():
     assert in_english("Gierwinkelgeschwindigkeit") == "yaw_rate"
     assert in_english("U_Nick") == "u_pitch" and in_english("Lenkwinkel") == "steering_angle"
     for name in ("nickname", "village", "Kraftwerk", "pitch_motor", "strombus", "x_soll_x1"):
         assert in_english(name) == name.replace("soll", "target").lower()
-
-
-def test_the_last_column_with_the_unit_of_the_last_state_is_it(tmp_path):
-    t = np.arange(0, 400, 2.0)
-    heat = 50.0 * (t > 20)
-    warm = 23 + 20 * (1 - np.exp(-np.maximum(t - 20, 0) / 90))
-    rows = np.column_stack([1000 * t, warm, heat])
-    head = "millis,temp_C,heater_pct"
-    np.savetxt(tmp_path / "a.csv", rows, "%.4f", ",", header=head, comments="")
-    (tmp_path / "m.py").write_text(
-        'from grounded import Model\nmodel = Model(states={"T": "degC"}, inputs={"heater": "%"}, '
-        'params={}, derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20)})\n'
-    )
-    files = ("--from", tmp_path / "a.csv", "--model", tmp_path / "m.py")
-    made = grounded("init", tmp_path / "w", *files)
-    assert "UNSURE" not in made.out
-    log = tomllib.loads((tmp_path / "w" / "grounded.toml").read_text())["log"]
-    assert log["state"]["T"] == {"path": "/csv.temp_C"}

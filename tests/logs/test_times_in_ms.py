@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.logs.log_table import LogMapping, mapped_signals, read_log
+from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.starting.begin import begin
 
@@ -60,10 +59,3 @@ def test_the_first_row_at_0_of_a_slow_log_is_kept(tmp_path):
     mapping = LogMapping({"v": specs[0]}, {"force": specs[1]})
     found = read_log(log, mapping, 10.0)
     assert [one.unstamped for one in found.reports] == [0, 0]
-
-
-def test_a_log_table_without_inputs_says_so(tmp_path):
-    mapping = LogMapping({"v": SignalSpec("/csv.v")}, {})
-    with pytest.raises(GroundedError, match=r"maps no input;.*\[log\.input\.NAME\]") as refused:
-        mapped_signals(table(tmp_path / "a.csv"), mapping, ["v"], [])
-    assert "no state" not in str(refused.value)

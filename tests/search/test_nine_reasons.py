@@ -1,4 +1,4 @@
-"""Regression tests for nine failures of the search of version 0.1 on third-party simulators."""
+"""What third-party simulators showed: starts, rival plans, limit cycles, endings, repeats."""
 
 import importlib
 from dataclasses import replace
@@ -11,7 +11,6 @@ import pytest
 from grounded import Model
 from grounded.accounts.judge import judge
 from grounded.plant import Plant
-from grounded.search import first_policy as starts
 from grounded.search import making
 from grounded.search.ask_tell import Search, learn
 from grounded.search.first_guess import filled_target
@@ -50,26 +49,6 @@ def test_the_first_plan_is_finished_and_the_best_of_many_starts(mechanisms):
     assert plan.cost < 0.9 * held.cost  # an optimum that the held input does not lead to
 
 
-def test_early_plans_are_among_the_starts(mechanisms, monkeypatch):
-    """Every other further start has the final weights from some step on."""
-    task, weights, solve = mechanisms.cart_task("smooth"), [], starts.finished
-
-    def finished(problem, *start, **options):
-        weights.append(problem.state_weight)
-        return solve(problem, *start, **options)
-
-    monkeypatch.setattr(starts, "finished", finished)
-    monkeypatch.setattr(starts, "MANY", 8)
-    first_policy(task)
-    own = task.problem().state_weight
-    early = [weight for weight in weights if not np.array_equal(weight, own)]
-    assert len(early) == 4
-    begins = [int(np.argmax((weight == own[-1]).all(axis=1))) for weight in early]
-    assert len(set(begins)) == 4 and min(begins) > 0 and max(begins) < task.horizon
-    for weight, begin in zip(early, begins, strict=True):
-        assert (weight[:begin] == own[:begin]).all() and (weight[begin:] == own[-1]).all()
-
-
 def test_only_columns_that_are_weighed_shape_the_guess(mechanisms):
     """Reason 3: 0.1 took every finite target column as prescribed, whatever its weight."""
     task = mechanisms.arm_task()
@@ -97,7 +76,7 @@ def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
     assert max(map(task.utility, told)) > -0.125  # its optimum is -0.115
 
 
-@pytest.mark.parametrize("seed", (20, 32, 40))
+@pytest.mark.parametrize("seed", (20,))
 def test_what_no_model_predicts_is_in_no_other_unit(late_arm, seed):
     """An arm that spins is not taken for one logged in degrees, with a dead zone for its delay."""
     task, rng = late_arm.task, np.random.default_rng(seed)

@@ -122,14 +122,6 @@ def test_a_loss_that_scatter_may_explain_breaks_no_promise():
     assert promises((best, *again), "better")[0].broken  # five such losses are no bad luck
 
 
-def test_a_step_made_from_a_discarded_trial_broke_no_promise():
-    best = step("c1", "", "better", float("nan"), -1.6)
-    wild = step("c2", "c1", "better", 1.2, -9.6, accepted=False)
-    assert promises((best, wild), "better")[0].broken
-    disowned = step("c2", "c1", "better", 1.2, -9.6, accepted=False, lost=False)
-    assert promises((best, disowned), "better")[0] == Promises()
-
-
 def test_a_run_that_was_stopped_on_its_path_broke_no_promise():
     task, target = CASES["cart"]
     plant, options = Plant(other(task.model, 1.3)), SearchOptions()

@@ -8,7 +8,6 @@ import pytest
 
 from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
-from grounded.search import making
 from grounded.search.feedback.oscillation import between_limits, limit_cycle
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
@@ -91,49 +90,6 @@ def test_the_changed_models_plan_is_run_with_its_own_gains(late_boom):
     assert off < 0.5 * np.abs(first.policy.gain).mean()
     assert best < 10 * utility
     assert utility == pytest.approx(fresh, rel=0.1)
-
-
-def test_a_limit_cycle_needs_no_promise(late_boom, monkeypatch):
-    """A model that replays a limit cycle does not predict runs without one."""
-    monkeypatch.setattr(making, "wild", lambda tried: False)
-    monkeypatch.setattr(making.About, "_worth", lambda self, made: -np.inf)
-    first = SimpleNamespace(**vars(late_boom))
-    first.candidates, first.trials = late_boom.candidates[:1], late_boom.trials[:1]
-    assert step(first, late_boom.better)[0].way == "own plan"
-    monkeypatch.setattr(making, "limit_cycle", lambda tried, task: False)
-    first.candidates, first.trials = late_boom.candidates[:1], late_boom.trials[:1]
-    assert step(first, late_boom.better)[0].way == ""
-
-
-def test_noise_that_gains_carry_leaves_half_of_them_and_a_limit_cycle_far_less(monkeypatch):
-    """A quadrotor with 8 % of its gains flew three times worse than with all of them."""
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "m/s^2"},
-        params={"k": Param(1.0, "1")},
-        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u},
-    )
-    t = np.linspace(0.0, 1.0, 61)
-    x = 10 * t**3 - 15 * t**4 + 6 * t**5
-    task = Task(
-        model=model,
-        dt=0.05,
-        target=np.column_stack([x, np.gradient(x, 0.05)]),
-        reward=Reward(np.array([100.0, 1.0]), np.zeros(2), np.array([1e-3]), np.array([1e-4])),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-20.0]),
-        high=np.array([20.0]),
-    )
-    plant = Plant(model, noise=Noise(measurement={"x": 0.02, "v": 0.3}))
-    left = {}
-    for violent in (False, True):
-        monkeypatch.setattr(making, "between_limits", lambda tried, task, is_=violent: is_)
-        run = SimpleNamespace(task=task, plant=plant, candidates=[], trials=[])
-        (first, _), (made, _) = (step(run, Planner(task, task)) for _ in range(2))
-        assert made.way == "gentler gains"
-        left[violent] = np.abs(made.policy.gain).mean() / np.abs(first.policy.gain).mean()
-    assert left[True] < 0.2 < 0.3 < left[False] < 0.5
 
 
 def test_an_input_that_is_at_both_limits_for_long_swings_between_them():

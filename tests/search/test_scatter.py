@@ -16,9 +16,7 @@ from grounded.search.scatter import (
     PIECES,
     Repeats,
     by_pieces,
-    explained_by_starts,
     noise_cost,
-    noise_missed,
     sensor_noise,
     with_errors,
 )
@@ -141,38 +139,6 @@ def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
     assert abs(told.promised - told.utility) < 0.6 * missed
 
 
-def test_no_plan_promises_to_remove_the_noise_of_a_log():
-    task, noise = cart_task(), np.array([0.02, 0.02])
-    made = propose(task, [], [], SearchOptions()).candidate
-    whole = noise_cost(task, made.policy, noise)
-    cheap = replace(made, base="c0001", predicted_utility=-0.5 * whole)
-    rough = made.predicted_states + 0.02 * np.random.default_rng(0).standard_normal(
-        made.predicted_states.shape
-    )
-    shown = replace(cheap, predicted_states=rough)
-    assert shown.grounded
-    assert shown.predicted_utility - noise_missed(task, shown, noise) <= -whole + 1e-12
-    best = Tried(made, (), (-1.5 * whole,), True, noise_cost=whole)
-    assert cheap.promised_over(best) == pytest.approx(0.5 * whole)
-    assert cheap.promised_over(replace(best, noise_cost=0.0)) == pytest.approx(whole)
-    # noise that seems to cost more than the whole run tells nothing
-    assert cheap.promised_over(replace(best, noise_cost=2 * whole)) == pytest.approx(whole)
-
-
-def test_a_notebook_shows_the_candidates_and_the_phase():
-    """It showed the keys of the JSON document under the title "Standing"."""
-    task = cart_task()
-    first = propose(task, [], [], SearchOptions()).candidate
-    run = drive(task, Plant(task.model), first)
-    now = standing(task, [first], [run], SearchOptions(), first.model)
-    (row,), header = now.table()
-    assert len(row) == len(header) and row[0] == first.id and row[-1] == "first"
-    shown = now._repr_html_()
-    cells = [f"<td>{cell}</td>" for cell in row]
-    assert "".join(cells) in shown and shown.index(row[0]) < shown.index(now.sentence)
-    assert shown.index(now.sentence) < shown.index("<details>")
-
-
 def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
     """Before any repeat: the scatter is unknown, but runs of one policy do not differ so much."""
     reward = Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1))
@@ -212,19 +178,6 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
     assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0
 
 
-def test_a_fast_motion_is_no_noise_of_an_interpolated_log():
-    rng, dt, roll = np.random.default_rng(4), 0.01, 0.0
-    holds = [np.full(rng.integers(3, 12), rng.uniform(-0.6, 0.6)) for _ in range(90)]
-    rates = []
-    for aileron in np.concatenate(holds)[:600]:
-        rates.append(roll)
-        for _ in range(10):  # it settles within two steps of 0.1 s
-            roll += dt * (4.0 * aileron - 6.5 * roll)
-    log = (np.array(rates) + 0.0065 * rng.standard_normal(600))[:, None]
-    white = white_noise(log)[0]
-    assert resampled_noise(log)[0] == white < 0.012 < white_noise(log[::2])[0]
-
-
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_drive_by_steps_shows_its_noise_once_it_has_settled(share):
     """A rover's turn rate: 0.019 rad/s counted of a sensor with 0.010, a promise of 2.6 times."""
@@ -256,23 +209,3 @@ def test_the_noise_of_all_columns_is_that_of_each_alone(gaps):
     with np.errstate(invalid="ignore"):
         alone = [resampled_noise(log[:, [j]])[0] for j in range(4)]
         np.testing.assert_array_equal(resampled_noise(log), alone)
-
-
-def test_the_noise_of_a_trial_is_found_once():
-    log = np.random.default_rng(5).standard_normal((60, 2))
-    trial = Trial(log, np.zeros((59, 1)), 0.1, ("x", "v"), ("force",))
-    np.testing.assert_array_equal(trial.noise(), resampled_noise(log))
-    np.testing.assert_array_equal(trial.noise(20), resampled_noise(log[:20]))
-    assert trial.noise() is trial.noise(1000) is not trial.noise(20) is trial.noise(20)
-    other = replace(trial, states=2 * log)
-    np.testing.assert_array_equal(other.noise(), resampled_noise(2 * log))
-
-
-def test_runs_that_scatter_by_where_they_began_are_none_that_another_policy_steadies():
-    worth, costs = (-2.1, -1.8, -4.2), np.array([0.3, 0.0, 2.6])
-    for explained, placed in ((costs, True), (0.1 * costs, False), (np.array([np.nan] * 3), False)):
-        starts = SimpleNamespace(costs=lambda _, e=explained: e)
-        made = SimpleNamespace(id="c0001", base="")
-        (one,) = with_errors([Tried(made, (None,) * 3, worth, True, starts=starts)])
-        assert one.placed == placed and explained_by_starts([one]) == placed
-        assert replace(one, deviation=2.0).is_unsteady == (not placed)

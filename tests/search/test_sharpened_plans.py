@@ -1,14 +1,10 @@
 """A plan made with smoothed kinks has about the same utility without smoothing."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from grounded.model import Model, Param
-from grounded.search import first_policy as first
 from grounded.search.planner import Planner, planner_with
-from grounded.solve import ddp
 from grounded.task import Task
 from grounded.utility import Reward
 
@@ -69,12 +65,3 @@ def test_a_swing_up_with_dry_friction_is_no_worse_as_written_than_as_planned():
     run = exact.system.rollout(exact, found.u, found.K, found.z[:-1])
     assert run.cost[0] < 400  # less than a sixth of doing nothing
     assert abs(run.z[0, -1, 2] - np.pi) < 0.2 and np.abs(run.z[0, :, 0]).max() < 1.0
-    for share in (share for share in first.SHARPER if share < 0.2):
-        blend = replace(planner.plan.problem(), smoothing=share * planner.plan.smoothing)
-        assert first._cost(blend, found) < 800, share
-
-
-def test_a_plan_that_was_made_as_the_model_is_written_stays_as_it_is():
-    task = replace(swing_up(2.0).plan, smoothing=0.0)
-    plan = ddp.solve(task.problem(), np.zeros((STEPS, 1)))
-    assert first._sharpened(task, task.problem(), plan, None) is plan

@@ -1,13 +1,10 @@
 """A drone's log as mavros writes it: body velocities in the odometry, an attitude as command."""
 
-import re
-
 import numpy as np
 import pytest
 
 import ros_bags
 from grounded.errors import GroundedError
-from grounded_trials import Workspace
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.shapes import Drive, path_target
@@ -95,20 +92,3 @@ def test_a_path_of_a_drone_keeps_its_height(tmp_path):
     assert (path_target("line", Drive(), model, 0.02, {}, {"z": 3.0})["z"] == 3.0).all()
     with pytest.raises(GroundedError, match="itself sets 'x'"):
         path_target("circle", Drive(), model, 0.02, {"x": 1.0, "z": 1.0})
-
-
-def test_a_hover_in_wind_is_found_though_its_limits_leave_out_zero(tmp_path):
-    """The tilt against the wind is a state that the target leaves free; its thrust is known."""
-    grounded_file = tmp_path / "w" / "grounded.toml"
-    begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
-    source = tmp_path / "w" / "model.py"
-    windy = source.read_text().replace("- p.drag * s.vx,", "- p.drag * s.vx + 0.3,")
-    source.write_text(windy)
-    workspace = Workspace(tmp_path / "w")
-    workspace.target(path_target("circle", Drive(), workspace.base_model, 0.02, {"z": 2.0}))
-    text = re.sub(r"(?m)^thrust = .*$", "thrust = [0.4, 0.9]", grounded_file.read_text())
-    grounded_file.write_text(re.sub(r"(?m)^start = .*$", "start = { }", text))
-    workspace.forget()
-    (note,) = [n for n in workspace.propose().proposal.notes if "the plan assumes" in n]
-    thrust = float(re.search(r"start = .*thrust = ([\d.]+)", note)[1])
-    assert thrust == pytest.approx(0.5 / np.cos(np.arctan(0.3 / 9.81)), abs=2e-3)

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
-from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
+from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_guess import Guess, guess_mapping, is_simulated
@@ -49,22 +49,6 @@ def test_service_events_are_read() -> None:
     assert values["/add_two_ints/_service_event.info.event_type"] == (1, 2)
     assert values["/add_two_ints/_service_event.request[0].a"] == (1, 3)
     assert values["/add_two_ints/_service_event.response[0].sum"] == (4, 6)
-
-
-@needs_data
-@pytest.mark.parametrize(
-    ("bag", "says"),
-    [
-        ("pitch-45bag", "@rpy.pitch show the same motion with OPPOSITE SIGN (correlation -1.000)"),
-        ("flybag", "@rpy.pitch show the same motion with OPPOSITE SIGN"),
-        ("yx3bag", "/vicon/Group466CF/Group466CF/pose has a gap of 0.930 s"),
-        ("yx4bag", "/cf_logpos has values that are not numbers, first in /cf_logpos.position.x"),
-        ("flybag", "/cf_command has a single message"),
-    ],
-)
-def test_the_crazyflie_bags_defects_are_found_and_said(bag: str, says: str) -> None:
-    report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
-    assert any(says in remark for remark in report.remarks), report.remarks
 
 
 @needs_data
@@ -178,26 +162,6 @@ def test_twins() -> None:
     (twins,) = find_twins(samples)
     assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
     assert twins.opposite and twins.correlation < -0.999
-
-
-def test_a_table_wider_than_the_list_says_so(tmp_path):
-    for columns, said in ((150, False), (206, True)):
-        path = tmp_path / f"{columns}.csv"
-        rows = [",".join(["t", *(f"u{i}" for i in range(columns))])]
-        rows += [",".join(f"{k * 0.01 + i:.3f}" for i in range(columns + 1)) for k in range(40)]
-        path.write_text("\n".join(rows) + "\n")
-        found = inspect_log(path)
-        assert len(found.topics[0].fields) == min(columns, FIELD_LIMIT)
-        assert any(str(FIELD_LIMIT) in remark for remark in found.remarks) == said
-
-
-def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
-    log, t = tmp_path / "log.csv", np.arange(0, 5, 0.01)
-    columns = np.column_stack([t, np.sin(t), 3 * np.sin(2 * t), np.sin(3 * t)])
-    np.savetxt(log, columns, "%.5f", ",", header="t,tilt,motor_voltage,orientation_x", comments="")
-    units = {"theta": "rad", "volts": "V"}
-    (theta,), (volts,) = guess_mapping(inspect_log(log), ["theta"], ["volts"], units)
-    assert (theta.path, volts.path) == ("/csv.tilt", "/csv.motor_voltage")
 
 
 @pytest.mark.parametrize(

@@ -99,14 +99,6 @@ def test_gains_do_not_count_on_a_joint_that_sticks():
     assert np.abs(made.gain[60:80, 0, 0]).min() > 0.1  # while it is to stand still
 
 
-def test_a_policy_of_the_task_s_own_model_is_as_it_was():
-    """Without adopted effects the check is skipped, and the same trials give the same candidate."""
-    plain = planner_with(speed_rover_task(speed_rover()), [])
-    own, _ = plain.first_policy()
-    made = propose(plain.task, [], [], SearchOptions(), planner=plain).candidate
-    np.testing.assert_array_equal(made.policy.gain, plain.narrowed(own).gain)
-
-
 def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
     plain = speed_rover_task(speed_rover())
     reward = replace(plain.reward, input_change=np.array([0.01, 0.003]))

@@ -10,7 +10,6 @@ from grounded.plant import Plant
 from grounded.search.ask_tell import Search, learn
 from grounded.search.candidate import BY_STEP, Tried
 from grounded.search.feedback.margin import worse_costs
-from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import standing
 from grounded.search.step.by_step import PRICES, Told, believed_by_step, worth
@@ -54,14 +53,6 @@ def test_a_search_goes_on_where_laws_of_the_whole_run_lose(story):
     assert steps[0].candidate.damping == 10.0
 
 
-def test_the_search_on_the_rails_repeats_itself(story):
-    again = learn(TASK, lambda c: drive(TASK, Plant(RAILS), c), SearchOptions()).standing
-    for one, other in zip(story.history, again.history, strict=True):
-        np.testing.assert_array_equal(
-            one.candidate.policy.feedforward, other.candidate.policy.feedforward
-        )
-
-
 @pytest.fixture
 def grounded():
     """Return a search after two trials, and the crude model grounded on the best one."""
@@ -93,27 +84,6 @@ def test_slopes_that_change_along_the_run_are_found(grounded):
     law = Told.by(others, own, problem).law(PRICES[0])
     q = E.shape[2]
     assert np.abs(law[:, :, :q] - E).max() < 0.1 * np.abs(E).max()
-
-
-def test_a_single_trial_is_explained_and_says_nothing_about_other_directions(grounded):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, (other,) = turning(own, 1)
-    told = Told.by([other], own, problem)
-    law, dear = told.law(PRICES[0]), worth(own, problem)
-    assert told.off(PRICES[0], other, own, problem, dear) < 0.01
-    R = told.doubt(PRICES[0], dear)
-    d = np.hstack([other.x - own.x, other.u - own.u])
-    across = np.stack([d[:, 1], -d[:, 0], 0 * d[:, 0]], axis=1)
-
-    def doubt(d):
-        return np.sum(np.einsum("tpq,tq->tp", R, d) ** 2) / np.sum(d**2)
-
-    assert doubt(d) < 0.1 * doubt(across)
-    n = own.x.shape[1]
-    step = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], across)
-    known = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], d)
-    assert np.abs(step).mean() < np.abs(known).mean()
 
 
 @pytest.mark.parametrize("age", [0.0, 0.013])
@@ -257,14 +227,6 @@ def test_one_other_trial_is_too_few(grounded):
     assert believed_by_step(Planner(TASK, TASK), best, search.standing.history, problem) is None
 
 
-def test_slopes_by_step_do_not_refute_laws_of_the_whole_run(grounded):
-    search, best, _ = grounded
-    history = losing(search, 2, way=BY_STEP, slopes="corrected", predicted_gain=1.0)
-    now = replace(search.standing, history=tuple(history))
-    maker = Maker(Planner(TASK, TASK), now, "c0099", best.candidate.model)
-    assert About(maker, best, SearchOptions(), "")._refuted() == 0
-
-
 def test_small_gains_before_the_first_of_them_do_not_end_the_search(story):
     """Patience starts anew with other derivatives."""
     by_step = [t.candidate.way == BY_STEP and bool(t.accepted) for t in story.history]
@@ -274,21 +236,3 @@ def test_small_gains_before_the_first_of_them_do_not_end_the_search(story):
     options = SearchOptions(tolerance=0.5)  # all gains are small
     now = standing(TASK, candidates, trials, options, candidates[0].model)
     assert now.phase == "propose"
-
-
-def test_the_plain_model_is_no_witness_after_it_mispredicted_losses(grounded):
-    search, best, _ = grounded
-    now, planner = search.standing, Planner(TASK, TASK)
-
-    def about(history):
-        maker = Maker(planner, replace(now, history=tuple(history)), "c0099", best.candidate.model)
-        return About(maker, best, SearchOptions(), "")
-
-    history = losing(search, 1)
-    told = about(history)
-    change = predicted(told.plain, history[-1].candidate.policy).utility - told.plainly
-    right = replace(history[-1], utilities=(best.utility + 0.8 * change,))
-    wrong = replace(history[-1], utilities=(best.utility + 0.1 * change,))
-    assert not about([*history[:-1], right])._plain_refuted
-    assert about([*history[:-1], wrong])._plain_refuted
-    assert not about(now.history)._plain_refuted
