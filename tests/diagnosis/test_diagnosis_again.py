@@ -22,7 +22,6 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
-from small_tasks import pushed_cart
 
 worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
 
@@ -120,14 +119,6 @@ def test_predictions_start_from_filtered_states_wherever_the_track_lies():
     assert off[1] == pytest.approx(off[2], rel=0.05)
     errors = [Ruler(predictor).errors(fit).rms[:-1] for fit in (held, risen)]
     np.testing.assert_allclose(errors[0], errors[1], rtol=0.02)
-
-
-def test_constants_that_data_chose_stay_when_the_values_move():
-    model, _ = pushed_cart(trials=1, steps=2)
-    effect = Library().effect("coulomb_friction:v", model)
-    width = 3 * effect.fixed["width"]
-    h = Hypothesis().plus(effect, {"c": 0.2, "width": width})
-    assert h.with_theta(h.theta).values[0]["width"] == width
 
 
 @pytest.mark.parametrize(("name", "same"), [("input_gain:u", True), ("viscous_friction:v", False)])

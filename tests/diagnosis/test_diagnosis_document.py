@@ -4,7 +4,6 @@ import json
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -100,22 +99,6 @@ def test_an_older_document_is_read_with_what_it_has():
     oldest = Diagnosis.from_json({"verdict": {"kind": "none"}})
     assert not oldest.gap.measured and math.isnan(oldest.gap.before) and oldest.ranking == ()
     assert again(oldest) == oldest
-
-
-def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
-    found = Diagnosis.from_json(DIAGNOSIS)
-    with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
-        found.values("drag:v")
-    with pytest.raises(GroundedError, match="none of any effect"):
-        Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")
-
-
-def test_null_is_nan_and_what_is_missing_is_the_default():
-    value = {"value": None, "std": None, "interval": None, "unit": None}
-    read = Estimate.from_json(value)
-    assert math.isnan(read.value) and read.unit == "" and np.isnan(read.interval or ()).all()
-    assert Estimate.from_json({"value": 1}).interval is None
-    assert "interval" not in Estimate(1.0).to_json()
 
 
 @pytest.mark.parametrize(
