@@ -50,11 +50,6 @@ def two_axes(s, a, p):
     }
 
 
-def twins(s, a, p):
-    """Both moments do the same."""
-    return {**two_axes(s, a, p), "w": a.moment + a.other, "v": a.moment + a.other - 5 * s.q}
-
-
 def lagging_by_two(derivative, weight):
     """Two axes whose moments lag, at rest; inputs cost `weight`."""
     model = Model(
@@ -133,38 +128,3 @@ def test_rounding_does_not_grow_where_inputs_are_cheap():
     assert np.abs(K).max() < 2 * np.abs(found.K).max()
     full, made = (disturbed(problem, run, k, 4) for k in (found.K, K))
     assert made < 4 * full
-
-
-def test_inputs_that_cost_nothing_and_do_the_same_are_shared():
-    """Q_uu is singular there, and DDP goes on with a damping of its own."""
-    planner = lagging_by_two(twins, 0.0)
-    problem = planner.plan.problem()
-    found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
-    assert found.ok
-    K = measured_gains(problem, found.z, found.u, found.K, 4)
-    np.testing.assert_allclose(K[:, 0], K[:, 1], atol=1e-6 * np.abs(K).max())
-    assert np.isfinite(K).all() and K.any() and not K[:, :, 4:6].any()
-
-
-def test_a_line_that_is_never_left_tells_nothing_of_the_speed():
-    model = Model(
-        states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "r": "rad/s"},
-        inputs={"left": "V", "right": "V"},
-        params={},
-        derivative=lambda s, a, p: {
-            "x": s.v * np.cos(s.psi),
-            "y": s.v * np.sin(s.psi),
-            "psi": s.r,
-            "v": a.left + 1.05 * a.right - 0.5 * s.v,
-            "r": 8 * (1.1 * a.right - a.left) - 3 * s.r,
-        },
-    )
-    H, weigh = 100, np.array([10.0, 10.0, 1.0, 0.1, 0.1])
-    target = np.zeros((H + 1, 5))
-    target[:, 0] = np.linspace(0.0, 1.0, H + 1)
-    reward = Reward(weigh, weigh, np.full(2, 1e-4), np.full(2, 1e-3))
-    limits = np.full(2, 12.0)
-    task = Task(model, 0.02, target, reward, np.zeros(5), np.zeros(2), -limits, limits)
-    planner = planner_of(task, [{"name": "sensor_lag:v", "tau": 0.025}])
-    policy, _ = planner.first_policy()
-    assert np.abs(policy.gain[:, :, 1]).max() < 1e3
