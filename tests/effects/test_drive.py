@@ -7,7 +7,6 @@ import pytest
 
 import grounded as gr
 from grounded import Model, Param, Trial
-from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
@@ -182,21 +181,6 @@ def test_a_friction_moves_with_the_track_in_the_slopes_of_a_fit():
         assert np.quantile(np.abs(by[..., i] - slope), 0.95) < 0.05 * np.abs(slope).max()
         if i == 1:  # through the friction, which turns with the speed
             assert np.abs(slope[..., 1]).max() > 1e-3
-
-
-def test_a_track_is_fitted_beside_the_friction_of_both_wheels():
-    data = prepare(cart, [carted()])
-    search = HypothesisSearch(data, ())
-    search.nulls()
-    found, *_ = search.refined([search.fresh(frictions(data))], 40)
-    k, track, tau, tau_r = cart.values + found.hypothesis.shift
-    assert track == pytest.approx(0.27, rel=0.01) and k == pytest.approx(0.83, rel=0.02)
-    assert (tau, tau_r) == pytest.approx((0.14, 0.14), rel=0.03)
-    values = dict(zip(found.hypothesis.names, found.hypothesis.values, strict=True))
-    assert values["input_gain:right"]["g"] == pytest.approx(0.745 / 0.83 - 1, abs=0.01)
-    for name in (LEFT, RIGHT):
-        assert values[name]["c"] == pytest.approx(0.22 * 0.14 / 0.83, rel=0.1)
-        assert values[name]["b"] < 0.02
 
 
 @pytest.mark.slow

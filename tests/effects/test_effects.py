@@ -1,5 +1,7 @@
 """Every effect: adopted and diagnosed one equation, it compiles, it is absent at its start."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from grounded.effects import (
     Quantity,
     RateFamily,
     Scales,
+    SensorLagFamily,
     memory_of,
     memory_start,
     scales_of,
@@ -224,15 +227,6 @@ def test_several_effects_wrap_one_another():
     assert memory_of(model, car, TRIAL).shape == (TRIAL.steps + 1, 4)
 
 
-def test_a_delay_passes_its_oldest_input_on_in_steps_shorter_than_its_own():
-    late = wrap(Library().effect(f"delay:{pendulum.input_names[0]}", pendulum), {"d": 0.03}, 0.02)
-    x, short = np.zeros((1, late.n)), 1e-5
-    x[0, -1] = 2.0
-    after = late.system.step(x, np.zeros((1, 1)), late.values, short)[:, : pendulum.n]
-    at_once = pendulum.system.step(x[:, : pendulum.n], [[2.0]], pendulum.values, short)
-    np.testing.assert_allclose(after, at_once)
-
-
 def test_sensor_delay():
     """A logged heading that is 0.1 s old is the true heading two steps ago."""
     effect = Library().effect("sensor_delay:psi", car, sizes(TRIAL))
@@ -301,3 +295,23 @@ def lag_of(dt, duration):
 def test_lags_are_sought_within_their_bound(dt, steps):
     tau = lag_of(dt, steps * dt)
     assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high
+
+
+def test_an_adopted_sensor_lag_is_a_filter():
+    effect = Library().effect("sensor_lag:v", car, sizes(TRIAL))
+    assert isinstance(effect.family, SensorLagFamily)
+    model = wrap(effect, {"tau": 0.2}, DT)
+    one = TRIAL.until(40)
+    z = [np.hstack([one.states[0], memory_start(model, car, one)])]
+    for u in one.inputs:
+        z.append(model.system.step(z[-1][None], u[None], model.values, DT)[0])
+    names = model.state_names
+    true, logged = (np.array(z)[:, names.index(name)] for name in ("v_true", "v"))
+    filtered, fine = [true[0]], true[0]
+    for before, after in itertools.pairwise(true):
+        for k in range(200):
+            now = before + (after - before) * (k + 0.5) / 200
+            fine += (now - fine) * DT / 200 / 0.2
+        filtered.append(fine)
+    np.testing.assert_allclose(logged, filtered, atol=2e-3 * np.ptp(true))
+    assert np.abs(logged - true).max() > 0.02

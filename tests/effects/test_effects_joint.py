@@ -97,13 +97,6 @@ def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
     assert "coupling:w<-z" in single and "joint_spring:volts<-z" not in single
 
 
-def test_where_inertia_is_constant_the_joint_has_its_old_names():
-    names = {effect.name for effect in Library().candidates(pendulum)}
-    assert "coulomb_friction:omega" in names
-    assert "joint_friction:torque<-omega" not in names
-    assert "added_inertia:torque<-omega" not in names
-
-
 def test_viscous_friction_that_the_model_has_is_not_offered_twice():
     assert has_viscous(pendulum, "torque<-omega")
     assert not has_viscous(arm, "t1<-w1")
@@ -219,13 +212,6 @@ def test_friction_of_both_joints_is_found():
     size = {row.effect: row.params["c"].value for row in found.ranking if row.claimed}
     assert size["joint_friction:t1<-w1"] == pytest.approx(0.4, rel=0.05)
     assert size["joint_friction:t2<-w2"] == pytest.approx(0.15, rel=0.05)
-
-
-@pytest.mark.slow
-def test_an_inertia_that_was_left_out_is_found():
-    found = gr.diagnose(arm, real_trials(J=(0.08, 0.0)))
-    assert found.effects == ("added_inertia:t1<-w1",)
-    assert found.ranking[0].params["J"].value == pytest.approx(0.08, rel=0.03)
 
 
 def crane(unit):

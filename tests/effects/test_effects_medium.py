@@ -11,7 +11,7 @@ import grounded as gr
 from grounded import Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
+from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrapping_order
 from grounded.effects.medium import turning
@@ -258,28 +258,6 @@ def test_its_slopes_are_those_of_its_steps(parts):
         near(by_param[..., k], [predictor.advance(one, x, u, data.time) for one in moved])
 
 
-def test_a_black_box_is_linearised_about_what_the_medium_sees():
-    """Its steps are not asked again for each nudged value: slopes stand for them."""
-
-    def step(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
-        if s["u"] > 1e9:  # can't be traced
-            return dict(s)
-        moved = dict(s)
-        for _ in range(10):
-            half = {n: moved[n] + 0.05 * dt * v for n, v in rates(moved, a, p).items()}
-            moved = {n: moved[n] + 0.1 * dt * v for n, v in rates(half, a, p).items()}
-        return moved
-
-    box = Model(states=STATES, inputs=INPUTS, params=boat.params, angles=("psi",), step=step)
-    columns = []
-    for model in (box, boat):
-        data, h = prepare(model, TRIALS[:1]), hypothesis(CURRENT, model=model)
-        columns.append(linearise(Predictor(data), h, data.y))
-    for one, other in zip(*columns, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-3)
-    assert np.abs(columns[0][1][..., 1:]).max() > 0.01
-
-
 SEA = [
     ({"water": (0.15, -0.08)}, "current:u+v"),
     ({"push": (0.12, 0.2)}, "push_world:u+v"),
@@ -311,10 +289,3 @@ def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]
     assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
-
-
-@pytest.mark.slow
-def test_none_is_claimed_in_still_water():
-    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(steps=100))
-    told = ("current", "push_world", "coriolis")
-    assert not {n for n in found.verdict.effects if n.startswith(told)}

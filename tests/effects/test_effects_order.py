@@ -1,7 +1,5 @@
 """Several effects together: diagnosis, probe and adopted model agree which of them acts first."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -140,22 +138,6 @@ def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
     assert off.max() < 0.015  # inputs that arrive at different times
 
 
-@pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])
-def test_what_was_held_before_went_through_all_effects(parts):
-    names = (car.state_names, car.input_names)
-    still = Trial(
-        np.full((STEPS + 1, car.n), 0.1),
-        np.tile(HELD, (STEPS, 1)),
-        DT,
-        *names,
-        start_inputs=HELD,
-    )
-    predictor = Predictor(prepare(car, [still], latency=np.full(2, 1.5 * DT)))
-    received = predictor.received(hypothesis(parts))[0]
-    np.testing.assert_allclose(received, np.tile(received[-1], (STEPS, 1)), atol=1e-12)
-    assert np.abs(received[0] - HELD).max() > 0.04
-
-
 def test_a_delay_acts_last_whenever_it_was_claimed():
     np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
 
@@ -188,23 +170,3 @@ def test_what_is_wrapped_last_acts_first():
     families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
     assert acting_order(families) == [1, 3, 0]
     assert wrapping_order(families) == [2, 0, 3, 1]
-
-
-def test_inputs_by_run_are_those_of_whole_trials():
-    """Each input is computed by itself, for the trials in use, and cut into runs."""
-    names, rng = (car.state_names, car.input_names), np.random.default_rng(3)
-    trials = [
-        Trial(rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, 2)), DT, *names)
-        for T in (230, 450, 60)
-    ]
-    data = prepare(car, trials, latency=np.array([0.4 * DT, 0.0]))
-    data = replace(data, **{k: getattr(data, k)[1:] for k in ("state_at", "step_at", "valid")})
-    data = replace(data, trial_of=data.trial_of[1:])  # its start still has to be filtered
-    predictor = Predictor(data)
-    for parts in ([], [LAG], [LIMIT, WEAK, PART], [BIAS, THROTTLE]):
-        h = hypothesis(parts)
-        whole = data.runs(predictor.received(h, leads=True))
-        np.testing.assert_array_equal(predictor.inputs(h), whole)
-    assert np.ptp(whole[..., 1]) > 0
-    at = int(data.trial_of[-1]), int(data.step_at[-1, 5] - data.lengths[:2].sum())
-    np.testing.assert_array_equal(whole[5, -1], predictor.received(h, leads=True)[at])

@@ -12,7 +12,6 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_of, wrap
-from grounded.effects.sensed import moved_model, seen_names
 from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
@@ -98,14 +97,6 @@ def test_its_slopes_are_those_of_its_steps(late, name, values):
         ends = [predictor.advance(h, x + s * nudge, u, data.time) for s in (1, -1)]
         error = np.abs(F[..., j] - (ends[0] - ends[1]) / (2 * size))
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02
-
-
-def test_names_say_which_value_moves():
-    model = built(LATE["both"])
-    names = dict(zip(seen_names(model), model.state_names, strict=True))
-    assert names["v"] == "v_true" and names["v_logged"] == "v"
-    assert moved_model(model).state_names == car.state_names
-    assert seen_names(car) == car.state_names and moved_model(car) is car
 
 
 cart = Model(

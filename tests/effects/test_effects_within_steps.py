@@ -1,7 +1,5 @@
 """What arrives early within a step moves positions farther (`MemoryFamily.lead`)."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,9 @@ from grounded import Model, Trial
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ahead import missed
 from grounded.effects import Library
 from grounded.effects.actuator import first_order_lag, rate_limit
 from grounded.effects.memory import Sent, shifted_within
-from grounded.models.car import model as car
 
 DT, FINE = 0.02, 200
 LIBRARY = Library()
@@ -128,25 +123,3 @@ def test_a_lag_and_a_delay_that_ends_within_a_step_are_told_apart(dt, tau, late)
     (fit,) = search.refined([search.fresh(h)], 40)
     assert fit.hypothesis.values[0]["tau"] == pytest.approx(tau, abs=0.001)
     assert fit.hypothesis.values[1]["d"] == pytest.approx(late, abs=0.001)
-
-
-def test_an_input_that_stalls_acts_after_its_delay_and_not_by_its_mean():
-    """A car's throttle, 30 ms late, that does nothing below a threshold: from rest to driving."""
-    u = np.zeros((8, 2))
-    u[2:], u[5:] = 0.3, 0.5  # the mean of the first such step, 0.12, is below the threshold
-    x, states = np.zeros((1, car.n)), [np.zeros(car.n)]
-    for before, now in itertools.pairwise([np.zeros(2), *u]):
-        first = np.array([[now[0], before[1]]])  # the steering is in time
-        x = car.system.step(x, first, car.values, 0.03)
-        x = car.system.step(x, now[None], car.values, 0.02)
-        states.append(x[0])
-    trial = Trial(np.array(states), u, 0.05, car.state_names, car.input_names, start_inputs=u[0])
-    data = prepare(car, [trial], np.zeros(2))
-    late = LIBRARY.effect("delay:throttle", car, data.scales)
-    h = Hypothesis().plus(late, {"d": 0.03})
-    moments, one = np.arange(8), np.zeros(8, int)
-    off = missed(Predictor(data), [h], one, data.y, moments, one, 1)[-1]
-    assert np.abs(off).max() < 1e-4
-    two = [h, Hypothesis().plus(late, {"d": 0.02})]  # of two folds, each row has its own
-    both = missed(Predictor(data), two, moments % 2, data.y, moments, one, 1)[-1]
-    assert np.abs(both[::2]).max() < 1e-4 and np.abs(both[1::2]).max() > 1e-3

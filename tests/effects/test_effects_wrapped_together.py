@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from test_effects_order import DT, HELD, STEPS, commands, task
 
-from grounded import Model, Trial
+from grounded import Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, memory_start, wrap
-from grounded.effects.plain_step import plain_step
+from grounded.effects import Library, memory_start
 from grounded.models.car import model as car
 from grounded_trials.workspace.adopted import planner_of
 
@@ -89,17 +88,3 @@ def test_the_carried_heading_rate_stays_the_headings(parts):
     rate = (ahead[:, 4] - x[:, 4]) / h
     drift = (x[:, 5] - rate) - (x[0, 5] - rate[0])
     assert np.abs(drift[[20, 60]]).max() < 0.01
-
-
-def test_a_heading_rate_carried_by_the_users_own_step_follows_too():
-    rk4 = plain_step(car)
-    own = Model(
-        states=car.states,
-        inputs=car.inputs,
-        params=car.params,
-        angles=car.angles,
-        roles=car.roles,
-        step=lambda s, a, p, dt: rk4(s, a, p, dt),
-    )
-    x = drive(wrap(Library().effect(FRICTION[0], own), FRICTION[1], DT), trial())
-    np.testing.assert_allclose(x[:, 5], x[:, 1] * np.sin(x[:, 0]) / 0.15, atol=2e-3)

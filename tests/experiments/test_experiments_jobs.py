@@ -21,6 +21,8 @@ from grounded.trial import Trial
 from grounded_trials.workspace.user_files.model_file import load_module
 from shared_data import SUPPORT
 
+pytest.importorskip("joblib", reason="joblib is not installed")
+
 
 def draws(count, sleep=0.0):
     return [Job(experiment_jobs.draw, {"seed": seed, "sleep": sleep}) for seed in range(count)]

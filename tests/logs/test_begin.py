@@ -1,7 +1,6 @@
 """A workspace from somebody else's log: what is found, what is asked, and that it then works."""
 
 import json
-import math
 import re
 from pathlib import Path
 
@@ -17,10 +16,8 @@ from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
 from grounded.places import integrals
 from grounded_trials import Workspace
-from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.starting.begin import begin
-from grounded_trials.starting.first_toml import held_first
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.candidates.exporting import void_exports
@@ -113,25 +110,6 @@ def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(
     assert not found.unsure
     roles = Workspace(tmp_path / "arm").base_model.roles
     assert roles["level"] == ("shoulder_position", "elbow_position")  # from the base
-
-
-def test_torques_that_motion_does_not_tell_apart_are_unsure_and_both_are_named(tmp_path):
-    found = begin(tmp_path / "arm", commanded_arm_bag(tmp_path / "bag", goals=False))
-    inputs = {guess.name: guess for guess in found.inputs}
-    both = [f"/effort_controller/commands.data[{i}]" for i in range(2)]
-    assert [inputs[f"{joint}_effort"].path for joint in ("shoulder", "elbow")] == both
-    assert inputs["shoulder_effort"].others == (both[1],)
-    assert inputs["elbow_effort"].others == (both[0],)
-    assert {guess.name for guess in found.unsure} >= {"shoulder_effort", "elbow_effort"}
-
-
-def test_an_array_of_commands_comes_before_the_torques_that_were_measured(tmp_path):
-    """Efforts are what came out, after the drive's delay, at the rate of the encoders."""
-    log = commanded_arm_bag(tmp_path / "bag", measured_torques=True)
-    found = begin(tmp_path / "arm", log, kind="arm")
-    paths = ["/effort_controller/commands.data[0]", "/effort_controller/commands.data[1]"]
-    assert [guess.path for guess in found.inputs] == paths
-    assert found.dt == 0.02
 
 
 @pytest.mark.parametrize("goals", [True, False])
@@ -238,11 +216,6 @@ def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
     assert own == 0 and refused.code == 1 and "c0001.mcap" in refused.err
 
 
-def test_rates_are_found_in_any_model(mine, tmp_path):
-    begin(tmp_path / "w", arm_bag(tmp_path / "bag"), model=mine)
-    assert velocities(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
-
-
 def test_the_real_car_of_a_laboratory(tmp_path):
     """DART: the speed has no name, and is found; what two topics hold is asked."""
     folder = data("dart_small_car")
@@ -263,14 +236,6 @@ def test_a_real_drone_s_commands_are_asked_for(tmp_path):
     by = {g.name: g for g in found.states}
     assert by["x"].path.startswith("/vicon/") and not by["x"].sure
     assert not any(by[name].path or by[name].sure for name in ("vx", "vy", "vz"))
-
-
-def test_a_robot_in_the_plane_without_commands(tmp_path):
-    bag = data("mcap_format_fixtures") / "evo" / "nav2_turtlebot_SIM.mcap"
-    found = begin(tmp_path / "w", bag)
-    assert found.kind == "rover" and all(g.sure for g in found.states)
-    assert found.states[1].path == "/odom.twist.twist.angular.z"
-    assert not any(g.path for g in found.inputs)
 
 
 def test_what_only_the_log_names_is_never_sure(tmp_path):
@@ -390,39 +355,6 @@ def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_p
     assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
 
 
-def test_a_number_offered_in_a_comment_comes_with_its_clock(tmp_path):
-    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="car")
-    assert not any(guess.path for guess in found.inputs)
-    path = tmp_path / "w/grounded.toml"
-    text = path.read_text()
-    assert '# clock = "log"' in text and "remove all 3 #" in text
-    used = {"steering": 0, "speed": 1}
-    for name, k in used.items():
-        head, _, rest = text.partition(f"# [log.input.{name}]")
-        block, _, after = rest.partition("\n\n")
-        lines = [line.removeprefix("# ") for line in f"[log.input.{name}]{block}".splitlines()]
-        lines[1] = lines[1].replace("data[0]", f"data[{k}]")
-        text = head + "\n".join(lines) + "\n\n" + after
-    path.write_text(text)
-    assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
-
-
-def test_a_generic_model_has_each_of_its_numbers_once(tmp_path):
-    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="generic")
-    paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
-    assert len(set(paths.values())) == len(paths) and "" not in paths.values()
-    assert paths["x"].endswith("position.x") and paths["linear_x"].endswith("linear.x")
-    assert paths["angular_z"].endswith("angular.z") and paths["data_1"].endswith("data[1]")
-    assert not any(".orientation." in path and "@" not in path for path in paths.values())
-
-
-def test_a_measured_rate_is_no_input(tmp_path):
-    log = boat_bag(tmp_path / "bag", "/thruster/left", "/thruster/right")
-    found = begin(tmp_path / "w", log, kind="drone")
-    (rate,) = [guess for guess in found.inputs if guess.name == "yaw_rate"]
-    assert not rate.path and not rate.sure
-
-
 @pytest.mark.parametrize(
     ("names", "kind"),
     [
@@ -493,25 +425,6 @@ def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     assert len(done["notes"]) == 1 and "model.py" in done["notes"][0]  # its equations are missing
     wrong = grounded("init", tmp_path / "u", "--from", log, "--inputs", "aa,cc")
     assert wrong.code == 1 and "cc" in wrong.err and not (tmp_path / "u").exists()
-
-
-def test_a_person_has_the_numbers_of_the_log_to_choose_from(wheels, tmp_path):
-    offered = {}
-    begin(
-        tmp_path / "w",
-        wheels("port,starboard"),
-        kind="rover",
-        ask=lambda guess: offered.setdefault(guess.name, guess.others) and "",
-    )
-    assert "/csv.port" in offered["turn"]
-
-
-def test_inspect_goes_on_as_init_does(wheels, tmp_path):
-    (tmp_path / "model.py").write_text(TWO_WHEELS)
-    found = begin(tmp_path / "w", wheels(), model=tmp_path / "model.py")
-    w = Workspace(tmp_path / "w")
-    assert w.inspect(wheels()).then == found.then
-    assert "unsure" not in grounded("-C", w.folder, "inspect", wheels()).out
 
 
 @pytest.fixture
@@ -601,13 +514,6 @@ def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_pa
     )
 
 
-def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):
-    found = begin(tmp_path / "w", swung(linked=False))
-    assert found.kind == "generic" and "pendulum" in found.why
-    assert [g.name for g in found.inputs] == ["u"]
-    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
-
-
 # targets
 
 
@@ -675,33 +581,6 @@ def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
     assert moving.code == 1 and "--to v=0" in moving.err
     nowhere = grounded("-C", w, "target", "line", "--to", "v=0")
     assert nowhere.code == 1 and "--to x=" in nowhere.err
-
-
-def test_a_velocity_ends_at_rest_on_a_path_with_hold():
-    """Also of a robot whose velocities are those of its coordinates, without roles."""
-    point = Model(
-        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
-        inputs={"ax": "m/s^2", "ay": "m/s^2"},
-        roles={"position": ("x", "y")},
-        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
-    )
-    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
-    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
-    for place, rate in (("x", "vx"), ("y", "vy")):
-        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
-        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
-    assert (columns["side"] == 0).all()  # moves nothing
-    with pytest.raises(GroundedError, match="--hold"):
-        path_target("circle", Drive(), point, 0.02, to)
-
-
-def test_a_swing_up_does_not_hold_the_rate_of_its_angle():
-    from grounded.models.pendulum import model
-
-    angle, rate = model.state_names
-    assert swing_up(model, 0.02, 2.0, {angle: math.pi})
-    with pytest.raises(GroundedError, match=rate):
-        swing_up(model, 0.02, 2.0, {rate: 0.0})
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
@@ -897,20 +776,6 @@ def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path
     assert void_exports(w, made) == ()
 
 
-def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error_names(tmp_path):
-    made = workspaces.make(tmp_path / "w")
-    file = made.folder / "grounded.toml"
-    before = read_target(made.folder / "target.csv")[1]
-    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
-    refused = grounded("-C", made.folder, "propose")
-    assert refused.code == 1 and "dt = 0.025 s, but" in refused.err
-    named = refused.err.replace("\\\n", "").split("next: grounded ")[1].split()
-    assert grounded(*named).code == 0
-    after = read_target(made.folder / "target.csv")[1]
-    np.testing.assert_allclose(after[::2], before, atol=1e-9)
-    assert grounded("-C", made.folder, "propose").code == 0
-
-
 def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):
     rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
     servo = 10 * np.sign(np.sin(2 * t)) + rng.normal(0, 1, len(t))
@@ -928,18 +793,6 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
 
 
-def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
-    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
-    columns = [t, np.sin(t), rng.normal(0, 0.005, len(t)), np.sign(np.sin(2 * t))]
-    header = "t,pose,roll_rate,servo"
-    table = np.column_stack(columns)
-    np.savetxt(tmp_path / "a.csv", table, "%.5f", ",", header=header, comments="")
-    command = ("init", tmp_path / "w", "--from", tmp_path / "a.csv", "--inputs", "servo")
-    made = grounded(*command)
-    assert made.code == 0 and "left out of model.py: roll_rate" in made.err
-    assert Workspace(tmp_path / "w").base_model.state_names == ("pose",)
-
-
 @pytest.mark.parametrize("name", ["force", "grip [N]"])
 def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     t = 0.02 * np.arange(500)
@@ -950,31 +803,3 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     assert made.code == 0, made.err
     model = Workspace(tmp_path / "w").base_model
     assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
-    rng, t = np.random.default_rng(seed), 0.02 * np.arange(500)
-    moves = np.clip(t - 1, 0, None)
-    columns = {
-        "z": 0.8 + 0.3 * np.sin(moves) + rng.normal(0, 1e-3, 500),
-        "vz": 0.3 * np.cos(moves) * (t > 1) + rng.normal(0, 0.012, 500),
-    }
-    sent = {"thrust": 5.33 + 1.5 * np.sin(2 * moves) + rng.normal(0, 0.07, 500)}
-
-    def v(s, a, p):
-        return {"z": s.vz, "vz": a.thrust - 5.33}
-
-    model = Model({"z": "m", "vz": "m/s"}, {"thrust": "N"}, {}, derivative=v)
-    ranges = {n: (x.min(), x.max()) for n, x in {**columns, **sent}.items()}
-    found = held_first(model, columns, sent, 0.02, ranges)
-    assert found["z"] == pytest.approx(0.8, abs=0.002)
-    assert found["thrust"] == pytest.approx(5.33, abs=0.1)
-    ramp = {"thrust": sent["thrust"] + np.clip(1 - 2 * t, 0, None)}  # it is still settling
-    assert not held_first(model, columns, ramp, 0.02, ranges)
-    sinks = {**columns, "z": columns["z"] - 0.3 * t}
-    assert held_first(model, sinks, sent, 0.02, ranges) is None
-    low = {**columns, "z": columns["z"] - 0.8}
-    idle = {"thrust": np.where(t > 1, sent["thrust"] - 5.33, 0.0)}
-    spans = {n: (x.min(), x.max()) for n, x in {**low, **idle}.items()}
-    assert held_first(model, low, idle, 0.02, spans) == {}  # an arm hung at 0: "shows no rest"

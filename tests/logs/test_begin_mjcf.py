@@ -83,15 +83,6 @@ def test_limits_of_a_model_file_are_taken_without_a_log_and_told_beside_those_of
     assert len(told) == 1 and told[0].startswith("shoulder =") and "[-9, 8]" in told[0]
 
 
-def test_an_mjcf_s_steps_are_as_long_as_its_own_allow(tmp_path):
-    """Steps of 0.05 s told inputs apart; of 4 ms there are twelve and a half in it."""
-    (tmp_path / "arm.xml").write_text(MJCF)
-    log = commanded_arm_bag(tmp_path / "bag")
-    found = begin(tmp_path / "w", log, model=tmp_path / "arm.xml")
-    paths = [guess.path for guess in found.inputs]
-    assert paths == [f"/effort_controller/commands.data[{i}]" for i in range(2)]
-
-
 @pytest.mark.parametrize("inside", [True, False])
 def test_meshes_of_a_urdf_come_along_from_its_own_folder(tmp_path, inside):
     """MuJoCo names the files of an MJCF, and of a URDF none but itself."""

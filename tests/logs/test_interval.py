@@ -124,24 +124,6 @@ def test_changes_at_any_time_are_in_no_step():
     assert phase_of(at * 1e-9, 0.025, late * 1e-9) is None
 
 
-def test_commands_with_stamps_of_their_own_are_late_by_nothing():
-    t = np.round((0.003 + 0.02 * np.arange(50)) * 1e9).astype(np.int64)
-    at, late = changes_of(t, np.arange(50.0))
-    assert not late.any()
-    assert phase_of(at * 1e-9, 0.02, late * 1e-9) == (pytest.approx(0.003), 0.0)
-
-
-def test_a_command_that_stays_at_its_limits_is_not_held_between_rows():
-    rng = np.random.default_rng(3)
-    sent = np.clip(np.cumsum(rng.normal(0, 4, 1000)), -7.4, 7.4)
-    sent[400:] = 7.4
-    sent[:100] = 0.0
-    assert np.mean(np.diff(sent) == 0) > 0.6
-    t = 10_000_000 * np.arange(1000)
-    assert not changes_of(t, sent)[1].any()
-    assert changes_of(t // 4, np.repeat(sent[::4], 4))[1].any()
-
-
 @pytest.mark.parametrize("hz", [2, 7.5, 12, 15, 24, 25, 30, 45, 50, 60, 75, 90, 100, 120, 125, 144])
 def test_the_interval_of_a_loop_is_that_of_its_rows(hz):
     assert round_interval(1 / hz) == pytest.approx(1 / hz, rel=3e-3)

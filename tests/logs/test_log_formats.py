@@ -12,13 +12,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from grounded.errors import GroundedError
-from grounded_trials import Workspace
-from grounded_trials.formats.tables import npz_records
 from grounded_trials.formats.text_tables import column_units, table_remarks
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
-from workspaces import make
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000
 TIME = np.arange(N) * DT
@@ -299,19 +295,6 @@ def test_each_table_of_an_npz_has_its_own_column_names(tmp_path):
     assert found["v"].values.max() == 0 and found["u"].values.min() == 1
 
 
-def test_several_runs_in_one_archive(tmp_path):
-    path = tmp_path / "runs.npz"
-    runs = {
-        "a": np.ones((5, 2)),
-        "a_t": np.arange(5.0),
-        "b": np.zeros((7, 2)),
-        "b_t": np.arange(7.0),
-    }
-    np.savez(path, columns=np.array(["x", "v [m/s]"]), **runs)
-    topics = {t.topic: [f.path for f in t.fields] for t in inspect_log(path).topics}
-    assert topics == {"/a": ["/a.x", "/a.v"], "/b": ["/b.x", "/b.v"]}
-
-
 def test_a_file_is_told_by_its_content(tmp_path):
     log = file_of(ros2(tmp_path / "log"))
     renamed = log.rename(Path(tmp_path / "log.dat"))
@@ -326,20 +309,3 @@ def test_zstd_files_of_any_log(tmp_path):
     packed = tmp_path / "log.csv.zst"
     packed.write_bytes(zstandard.compress(plain.read_bytes()))
     assert inspect_log(packed).messages == N
-
-
-def test_an_exported_candidate_is_no_log(cart_candidate):
-    folder, file = cart_candidate
-    with pytest.raises(GroundedError, match=r"best\.npz is an exported candidate, c0001"):
-        list(npz_records(file))
-    for k in range(4):
-        (folder / f"drive{'abcd'[k]}.csv").write_text("t,x\n0,0\n")
-    with pytest.raises(GroundedError, match="newest of the 4 logs"):
-        log_files(folder / "another.csv")
-
-
-@pytest.fixture
-def cart_candidate(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.export(w.propose().candidate.id, tmp_path / "best.npz", form="npz")
-    return tmp_path, tmp_path / "best.npz"

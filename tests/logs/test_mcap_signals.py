@@ -175,19 +175,6 @@ def refused(path: Any, spec: SignalSpec, says: str) -> None:
     assert says in str(caught.value), str(caught.value)
 
 
-def test_what_a_person_is_told(tmp_path: Path) -> None:
-    path = floats(tmp_path / "a.mcap", 0, 10)
-    refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")
-    refused(path, SignalSpec("/u.datum"), "has no field 'datum': did you mean 'data'?")
-    refused(path, SignalSpec("/u.data"), 'no header stamp; set clock = "log"')
-    refused(path, SignalSpec("/u"), "it ends at a std_msgs/Float32; add one of its fields: data")
-    refused(path, SignalSpec("/u.data.@jaw", "log"), "no function '@jaw'")
-    refused(tmp_path / "no.mcap", U, "does not exist")
-    refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u': none is defined")
-    (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
-    refused(tmp_path / "c.mcap", U, "`recover` saves")
-
-
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream)

@@ -66,11 +66,6 @@ def test_a_trial_with_a_hole_has_to_be_run_again(cart, trial, tmp_path):
     assert refused.code == 1 and f"{at}.mcap" in refused.err and "[log]" not in refused.err
 
 
-def test_a_sound_file_is_called_so(trial, tmp_path):
-    done = grounded("recover", trial, "-o", tmp_path / "s.mcap")
-    assert done.code == 0 and str(trial) in done.out and not done.err
-
-
 @needs_data
 def test_a_foreign_log_says_which_seconds_are_gone(tmp_path):
     assert DATA is not None

@@ -108,17 +108,6 @@ def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
     assert told["x"] == pytest.approx(0.0, abs=0.03)
 
 
-def test_a_start_is_no_mean_while_a_speed_is_off_zero() -> None:
-    """A slow drift hides in the noise of a position, but not in that of its speed."""
-    speeds = {"x": noisy(lambda t: 0.05 * t, 4), "v": noisy(lambda t: 0.05 + 0 * t, 5)}
-    log = {**speeds, "u": command(0.7)}
-    drifts = to_grid(log, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
-    assert drifts["x"] == pytest.approx(0.035, abs=0.02) and drifts["v"] != pytest.approx(0.0)
-    rests = {**log, "v": noisy(np.zeros_like, 5)}
-    held = to_grid(rests, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
-    assert held["x"] < drifts["x"]  # the mean, of half a second before
-
-
 def test_scale_offset_and_unwrapping() -> None:
     def wrapped_degrees(t: np.ndarray) -> np.ndarray:
         return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)
@@ -151,19 +140,6 @@ def test_held_inputs_grow_old() -> None:
     strict = replace(u, spec=replace(u.spec, max_age_s=0.5))
     with pytest.raises(GroundedError, match=r"\bgap .*\b0.5\d* s .*\b0.100 s"):
         grid(pose(np.sin), strict)
-
-
-def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
-    x = pose(np.sin)
-    for count, refused in ((2, False), (8, True)):  # 5 intervals of 0.05 s may be bridged
-        u = command()
-        u.values[10 : 10 + count] = np.nan
-        if refused:
-            with pytest.raises(GroundedError, match="has a gap of"):
-                grid(x, u)
-        else:
-            assert grid(x, u).inputs[10:13, 0].tolist() == [9, 9, 12]
-    assert len(grid(x, u, span=Span(end=0.9)).inputs) == 8  # outside the span it does not matter
 
 
 def test_one_shot_topics() -> None:
@@ -261,15 +237,6 @@ def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
     assert grid(pose(np.sin), u).moved_s == 0  # a candidate's run begins with its first command
 
 
-def test_data_whose_commands_do_not_change_in_steps_stay_where_they_are() -> None:
-    for change in (0.005, 0.035):
-        found = grid(pose(np.sin), held(change, 0.0), rest=np.zeros(1))
-        assert found.moved_s == 0 and found.warnings == ()
-        t = np.arange(0.0, 2.0, 0.005).reshape(-1, 10)  # the rows of each step
-        mean = np.floor(t / change + 1e-9).mean(axis=1)
-        np.testing.assert_allclose(found.inputs[:40, 0], mean, atol=1e-9)
-
-
 def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
     """A command that a driver changes at any row, at least so many seconds apart, at 100 Hz."""
     rng, t = np.random.default_rng(2), np.arange(0.0, 20.0, 0.025)
@@ -308,19 +275,3 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
         return
     times = 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)
-
-
-@pytest.mark.parametrize("topic, late", [("/x", 0.02), ("/u", 0.0)])
-def test_only_rows_of_states_show_a_command_late(topic: str, late: float) -> None:
-    t = np.arange(0, 2, 0.02)
-    sent = series(t, np.floor(t / 0.1 + 1e-6), SignalSpec(f"{topic}.force", "log"))
-    assert grid(pose(np.sin), sent).row_s == pytest.approx(late)
-
-
-def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
-    later = pose(np.sin)
-    later = replace(later, t=later.t + 20 * 10**9, log_times=later.log_times + 20 * 10**9)
-    seldom = command(0.0, 0.3)
-    assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
-    with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
-        grid(later, command())

@@ -9,7 +9,6 @@ from cli import grounded
 from facts import holds
 from grounded_trials.logs.stated_units import (
     factor_between,
-    in_english,
     same_unit,
     unit_in_name,
     without_unit,
@@ -190,13 +189,6 @@ def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path,
     assert all(one["sure"] for one in found.values())
 
 
-def test_a_rate_without_a_unit_that_is_as_large_as_its_position_says_is_asked_for(tmp_path):
-    """Two columns in mm, of which one says so, or a name that ends like a unit and is none."""
-    found = begun(tmp_path, "t,r_cm,rd,th,thd,volt", {"r": 0.01, "rd": 0.01})
-    assert found["r"]["scale"] == found["rd"]["scale"] == pytest.approx(0.01)
-    assert not found["rd"]["sure"]
-
-
 ROLLING = """from grounded import Model, Param
 model = Model(
     states={"pitch": "rad", "yaw": "rad", "pitch_rate": "rad/s", "yaw_rate": "rad/s"},
@@ -284,10 +276,3 @@ def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, name
     assert set(tomllib.loads(text)["estimate"]["measured"]) == {"arm", "pend"}
     unused = [f"/csv.{name}" for name in names if name in ("u", "battery")]
     assert all(path in " ".join(notes) for path in unused)
-
-
-def test_words_are_translated_only_if_all_parts_are_known():
-    assert in_english("Gierwinkelgeschwindigkeit") == "yaw_rate"
-    assert in_english("U_Nick") == "u_pitch" and in_english("Lenkwinkel") == "steering_angle"
-    for name in ("nickname", "village", "Kraftwerk", "pitch_motor", "strombus", "x_soll_x1"):
-        assert in_english(name) == name.replace("soll", "target").lower()

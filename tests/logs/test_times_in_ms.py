@@ -5,8 +5,6 @@ import pytest
 
 from cli import grounded
 from grounded_trials import Workspace
-from grounded_trials.logs.log_table import LogMapping, read_log
-from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.starting.begin import begin
 
 
@@ -51,11 +49,3 @@ def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path)
     rows[:, 0] += 1.764e12
     np.savetxt(tmp_path / "b.csv", rows, "%.1f", ",", header="time_s,v,force", comments="")
     assert begin(tmp_path / "w", tmp_path / "b.csv", kind="generic", inputs=["force"]).dt < 2
-
-
-def test_the_first_row_at_0_of_a_slow_log_is_kept(tmp_path):
-    log = table(tmp_path / "a.csv")
-    specs = SignalSpec("/csv.v"), SignalSpec("/csv.force")
-    mapping = LogMapping({"v": specs[0]}, {"force": specs[1]})
-    found = read_log(log, mapping, 10.0)
-    assert [one.unstamped for one in found.reports] == [0, 0]

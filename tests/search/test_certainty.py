@@ -11,7 +11,6 @@ from grounded.search.candidate import Tried
 from grounded.search.certainty import (
     beyond_one_trial,
     chance,
-    cost_of_start,
     error_between,
     owed_to_start,
     student,
@@ -137,33 +136,3 @@ def test_what_a_start_is_worth_is_no_improvement():
     assert owed_to_start(first, away, [first, away]) == 0.0  # nothing tells what -7 cm is worth
     little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
     assert owed_to_start(first, little, [first, little]) == 0.0
-
-
-def test_starts_that_scatter_as_much_are_not_different_ones():
-    """An arm's repeats began -1.5 and -0.6 mrad off, by 2 mrad each: -3.6 % "due to the start"."""
-
-    def ran(name, base, utility, offs, as_run=np.nan):
-        candidate = SimpleNamespace(
-            id=name, base=base, expected_of_base=-4.0, base_as_run=as_run, model="m", seen=()
-        )
-        candidate.predicted_states = np.zeros((30, 1))
-        trials = tuple(map(from_to_zero, offs))
-        return Tried(candidate, trials, tuple(utility for _ in offs), True)
-
-    first = ran("c0001", "", -6.0, (-3.1, 0.0, 1.5, 1.5, -3.1, -3.1))
-    second = ran("c0002", "c0001", -3.9, (0.0, 1.5, 1.5, -3.1, -3.1), as_run=-5.9)
-    third = ran("c0003", "c0002", -3.9, (0.0,), as_run=-4.1)
-    assert owed_to_start(first, second, [first, second, third]) == 0.0
-    apart = ran("c0001", "", -6.0, (-9.1, -6.0, -7.5, -9.1))
-    assert owed_to_start(apart, second, [apart, second, third]) == pytest.approx(1.8)
-
-
-def test_what_starts_cost_is_not_that_of_the_first_runs_alone():
-    trials = tuple(replace(from_to_zero(0.07), id=name) for name in ("t1", "t2"))
-    made = SimpleNamespace(expected_of_base=-4.0, base_as_run=-5.9, seen=("t1", "t2", "t0"))
-    best = Tried(SimpleNamespace(id="c0001"), trials, (-6.0, -6.1), True)
-    assert cost_of_start(best, made) == pytest.approx(1.9)
-    made.seen = ("t1",)
-    assert np.isnan(cost_of_start(best, made))
-    starts = SimpleNamespace(cost=lambda tried: 0.7 if tried.trials == trials else np.nan)
-    assert cost_of_start(replace(best, starts=starts), made) == 0.7

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from grounded import Model
-from grounded.accounts.judge import judge
 from grounded.plant import Plant
 from grounded.search import making
 from grounded.search.ask_tell import Search, learn
@@ -76,24 +75,6 @@ def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
     assert max(map(task.utility, told)) > -0.125  # its optimum is -0.115
 
 
-@pytest.mark.parametrize("seed", (20,))
-def test_what_no_model_predicts_is_in_no_other_unit(late_arm, seed):
-    """An arm that spins is not taken for one logged in degrees, with a dead zone for its delay."""
-    task, rng = late_arm.task, np.random.default_rng(seed)
-    search = Search(task)
-    for _ in range(2):
-        search.tell(late_arm.run(search.ask()))
-    calm = search.trials[1]
-    spun = np.cumsum(rng.normal(size=calm.states.shape), axis=0) * [0.3, 1.0, 10.0, 60.0]
-    wild = replace(calm, states=spun)
-    for trials in ([wild, calm], [wild], [wild, wild, calm]):
-        told = judge(task.model, trials, range(4)).told
-        assert not any(one.account.kind == "unit" for one in told)
-    turned = replace(calm, states=np.rad2deg(calm.states))
-    found = judge(task.model, [turned], range(4)).told
-    assert [one.account.columns for one in found] == [(0, 1, 2, 3)]
-
-
 def test_an_unstable_loop_gets_gentler_gains(late_arm):
     search = Search(late_arm.task)
     search.tell(late_arm.run(search.ask()))
@@ -142,15 +123,6 @@ def test_smaller_steps_hold_a_stiff_friction():
         for _ in range(40):
             x[substeps] = model.system.step(x[substeps], np.zeros((1, 1)), model.values, 0.05)
     assert abs(x[16][0, 0]) < 1e-3 < 0.1 < abs(x[1][0, 0])
-
-
-@pytest.mark.slow
-def test_exact_repeats_end_all_reruns(mechanisms):
-    task = mechanisms.cart_task("gentle")
-    real = task.model.with_values({"b": 2.0})  # 0.1: 30 runs of 26 candidates
-    found = learn(task, lambda candidate: drive(task, Plant(real, substeps=4), candidate))
-    ran = [trial.candidate for trial in found.trials]
-    assert len(ran) - len(set(ran)) <= 1
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded.plant import Noise, Plant
+from grounded.plant import Plant
 from grounded.search.improve import propose
 from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
@@ -52,23 +52,6 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
     _, candidates = searched(task, Plant(true), [("rate_gain:v", {"g": 0.45})])
     assert len(candidates) > 1
     assert not any(c.of_original for c in candidates)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_losses_by_noise_do_not_give_up_an_effect_that_the_runs_confirm(seed):
-    task, _ = CASES["cart"]
-    noise = Noise(process=dict.fromkeys("xv", 0.03), measurement=dict.fromkeys("xv", 0.01))
-    plant = Plant(other(task.model, 1.15), latency={"force": 0.1}, noise=noise)
-    late = replace(planner_with(task, [("delay:force", {"d": 0.1})]), task=task)
-    planner, candidates, trials = Planner(task, task), [], []
-    while len(trials) < 6:
-        made = propose(task, candidates, trials, SearchOptions(), planner=planner).candidate
-        if made is None:
-            break
-        candidates += [made] if made.id not in {c.id for c in candidates} else []
-        trials.append(drive(task, plant, made, 100 * seed + len(trials) + 1))
-        planner = late
-    assert len(candidates) > 2 and not any(c.of_original for c in candidates)
 
 
 def step(

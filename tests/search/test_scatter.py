@@ -1,6 +1,5 @@
 """The scatter between runs: two that agree by chance do not prove that there is none."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,7 +22,6 @@ from grounded.search.scatter import (
 from grounded.search.standing import standing
 from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
-from grounded.utility import Reward
 from small_tasks import cart_task, drive, other
 
 
@@ -114,53 +112,6 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert more.noise_cost == pytest.approx(noise_cost(task, policy, sensor_noise(runs[:3], 2)))
     each = [float(noise_cost(task, policy, sensor_noise([run], 2))) for run in runs[:3]]
     assert min(each) < more.noise_cost < max(each)
-
-
-def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
-    task, size = cart_task(), {"x": 0.02, "v": 0.02}
-    noisy = Plant(other(task.model), noise=Noise(measurement=size))
-    for repeats, shares in ((1, (0.0, 0.1)), (4, (0.6, 0.9))):
-        options = SearchOptions(repeats=repeats)
-        first = propose(task, [], [], options).candidate
-        runs = [drive(task, noisy, first, 100 + seed) for seed in range(repeats)]
-        made = propose(task, [first], runs, options, identity="c0002").candidate
-        assert made.grounded
-        more = [drive(task, noisy, made, 1000 + seed) for seed in range(20)]
-        own = [replace(run, candidate="c0002", id=f"r{k}") for k, run in enumerate(more)]
-        now = standing(task, [first, made], [*runs, *own], SearchOptions(), made.model)
-        told = now.history[-1]
-        whole = noise_cost(task, made.policy, sensor_noise(runs, 2))
-        assert shares[0] <= told.noise_missed / whole < shares[1]
-        assert told.promised == made.predicted_utility - told.noise_missed
-        waits = standing(task, [first, made], runs, SearchOptions(), made.model).history[-1]
-        assert waits.promised == told.promised  # as it was told before the runs
-    missed = made.predicted_utility - told.utility
-    assert missed > 0.2 * -told.utility  # four logs of 41 rows tell the noise to a third or so
-    assert abs(told.promised - told.utility) < 0.6 * missed
-
-
-def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
-    """Before any repeat: the scatter is unknown, but runs of one policy do not differ so much."""
-    reward = Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1))
-    task = cart_task(target=np.zeros((41, 2)), reward=reward)
-    made = propose(task, [], [], SearchOptions()).candidate
-
-    def off(identity, **errors):
-        states = np.array(task.target)
-        for name, error in errors.items():
-            states[:, "xv".index(name)] += error
-        trial = Trial(states, np.zeros((40, 1)), task.dt, ("x", "v"), ("force",))
-        one = replace(made, id=identity, base="c0001")
-        return Tried(one, (trial,), (task.utility(trial),), identity == "c0001")
-
-    best = off("c0001", x=0.01, v=0.10)
-    for errors, doubt in (
-        ({"x": 0.14, "v": 0.01}, False),  # 1.9 times the cost, and fourteen times as far off in x
-        ({"x": 0.01, "v": 0.14}, True),  # as much more cost, but of the same kind
-        ({"x": 0.11, "v": 0.01}, True),  # of another kind, but of nearly equal cost
-    ):
-        loser = off("c0002", **errors)
-        assert in_doubt(task, best, loser, (best, loser), 9) is doubt
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])

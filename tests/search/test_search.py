@@ -14,7 +14,7 @@ from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
 from grounded.search.planner import fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
-from grounded.search.step.step_size import OTHER_WAY, SearchOptions, losers_of
+from grounded.search.step.step_size import OTHER_WAY, SearchOptions
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task
@@ -133,30 +133,6 @@ def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnos
     assert (now.then == NextCommand("diagnose")) is asks
 
 
-def test_a_small_promise_that_is_not_kept_asks_for_nothing():
-    story = Story(tolerance=0.0).add().add().add().add()
-    while story.propose().candidate is not None:
-        story.add(worse(0.05))
-    ended = story.propose().standing
-    assert ended.phase == "converged" and ended.then is None
-
-
-@pytest.mark.parametrize(("scatter", "goes_on"), [(1e-6, True), (0.4, False), (1e3, True)])
-@pytest.mark.parametrize("lost", ["lost", "stopped", ""])
-def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
-    monkeypatch, scatter, goes_on, lost
-):
-    story = Story().add().add()
-    story = story.add(bad if lost == "lost" else cut) if lost else story
-    noisy = lambda h: tuple(replace(one, deviation=scatter) for one in h)  # noqa: E731
-    monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
-    proposal = story.propose()
-    assert (proposal.candidate is not None) == (goes_on or lost != "lost")
-    if proposal.candidate is None:
-        ended = proposal.standing
-        assert (ended.phase, ended.ending) == ("converged", "below the noise")
-
-
 def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
     story = Story(rerun_incumbent=True).add().add(lambda trial: bad(trial, 0.05))
     assert story.now.history[-1].in_doubt and story.now.outstanding.id == "c0001"
@@ -171,14 +147,6 @@ def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
 def test_two_exact_repeats_are_as_good_as_many():
     story = Story(repeats=5).add().add()
     assert story.now.history[0].accepted is True and story.now.phase == "propose"
-
-
-def test_a_copy_beside_repeats_that_differ_is_no_sign_of_a_deterministic_system():
-    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
-    story = Story(plant=noisy, repeats=3).add().add().add().add()
-    story.trials.append(story.trials[-1])
-    assert story.trials[-1].candidate == story.candidates[1].id
-    assert (story.now.phase, story.now.missing) == ("await-trial", 1)
 
 
 def test_repeats_are_averaged_and_all_are_needed():
@@ -233,23 +201,6 @@ def test_a_lucky_winner_loses_its_luck():
         story.trials.append(bad(story.trials[1], 2.0))
         story.trials[-1] = replace(story.trials[-1], candidate="c0001")
     assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
-
-
-def test_a_doubt_ends_with_the_best_that_it_was_about():
-    story = Story(rerun_incumbent=True, tolerance=0.0).add().add().add(worse(0.02))
-    first, second, third = (story.task.utility(t) for t in story.trials)
-    assert first < third < second and story.now.outstanding.id == "c0002"
-    again = replace(story.trials[1])
-    by = next(d for d in np.linspace(0.0, 1.0, 1000) if mean_of(story, bad(again, d)) < first)
-    story.trials.append(bad(again, by))
-    now = story.now
-    assert [t.accepted for t in now.history] == [True, False, True]
-    assert now.incumbent.candidate.id == "c0003" and now.phase == "propose"
-
-
-def mean_of(story, again):
-    """Return the mean utility of the second trial and another one of its candidate."""
-    return (story.task.utility(story.trials[1]) + story.task.utility(again)) / 2
 
 
 def test_losses_are_not_checked_for_ever():
@@ -323,19 +274,6 @@ def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
     assert last.candidate is None and last.standing.phase == "stopped"
 
 
-def test_a_gentler_policy_is_not_run_for_a_crash_that_was_set_aside():
-    story = Story().add(cut)
-    gentle = story.propose().candidate
-    assert gentle.caution == 1
-    story.trials.clear()
-    again = story.propose()
-    assert not again.is_new and again.candidate is story.candidates[0]
-    assert [story.now.verdict(t) for t in story.now.history] == ["waiting", "no trial"]
-    story.add().propose()
-    made = story.candidates[-1]
-    assert (made.id, made.base, made.caution) == ("c0003", "c0001", 0)
-
-
 def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost():
     story = Story().add().add(cut)
     made = story.propose().candidate
@@ -347,23 +285,6 @@ def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost()
     assert again.standing.history[-1].void and again.standing.history[-1].gone == (wrong.id,)
     story.trials.append(wrong)
     assert story.propose().candidate is made  # restored
-
-
-@pytest.mark.parametrize("slopes", ["", "corrected", "original"])
-def test_a_step_learnt_from_a_discarded_trial_counts_as_no_loss(slopes):
-    story = Story().add().add(cut)
-    made = replace(story.propose().candidate, slopes=slopes)
-    story.candidates[2:] = [made]
-    worse = replace(
-        story.trials[0], states=story.trials[0].states + 9.0, id="t9", candidate=made.id
-    )
-    story.trials.append(worse)
-    assert losers_of(story.now.history, made.base, made.model)[-1] is made
-    del story.trials[1]
-    lost = losers_of(story.now.history, made.base, made.model)
-    assert lost == ([] if slopes else [made])
-    assert story.now.history[-1].verdict() == "no better"  # which it was
-    assert story.propose().candidate is story.candidates[1]
 
 
 def test_a_run_whose_last_steps_were_not_recorded_did_not_crash():
@@ -614,21 +535,6 @@ def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
         assert np.abs(second.policy.gain).mean() < 0.5 * np.abs(first).mean()
         story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost and is not tried again
         assert [c.way for c in story.candidates].count("gentler gains") == 1
-
-
-def test_losses_of_other_slopes_raise_no_damping():
-    story = Story(tolerance=1e-9).add()
-    while story.propose().candidate is not None and len(story.candidates) < 3:
-        story.add(bad)
-    now, model = story.now, story.candidates[0].model
-    first = story.candidates[1]
-    assert (first.slopes, first.damping) == ("", 1.0)
-    history = now.history[:2]
-    steps = [
-        story.options.due(history, now.incumbent, model, "", slopes)
-        for slopes in (None, "", "corrected")
-    ]
-    assert [step.damping for step in steps] == [10.0, 10.0, 1.0]
 
 
 def test_fingerprints_are_taken_where_numpys_generator_would_draw():

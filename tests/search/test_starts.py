@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from grounded.plant import Plant
-from grounded.search.certainty import to_settle
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
@@ -93,17 +92,6 @@ def test_starts_that_agree_and_models_that_cannot_tell_leave_the_papers_rule(sto
     assert [t.verdict() for t in blind.history] == [t.verdict() for t in now.history]
     again = Story(rerun_incumbent=False)
     assert again.run(1, OFF).history[1].accepted is False
-
-
-def test_the_candidate_whose_start_matters_more_is_run_again(story):
-    now = story.run(1, OFF)
-    best, doubt = now.history
-    assert to_settle(best, doubt, 2) is doubt and to_settle(best, doubt, 1) is None
-    twice = replace(doubt, trials=doubt.trials * 2, utilities=doubt.utilities * 2)
-    assert to_settle(best, twice, 2) is best
-    assert to_settle(best, twice, 9) is best  # where starts scatter, it was asked for without end
-    policy = doubt.candidate.policy
-    assert worth_of_start(PLANNER, policy, OFF) < 0 == worth_of_start(PLANNER, policy, 0 * OFF)
 
 
 def test_a_start_behind_a_late_sensor_costs_as_much(story):

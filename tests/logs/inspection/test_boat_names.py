@@ -66,18 +66,7 @@ def test_a_boats_columns_are_found(tmp_path: Path) -> None:
     assert found["r"] == ("yaw_rate_deg_s", True, degree, set())
 
 
-def test_earth_fixed_positions_are_found(tmp_path: Path) -> None:
-    named = {"north": "x0", "east": "y0", "surge": "u", "sway": "v", "heading": "psi"}
-    found = found_in(tmp_path, named)
-    assert (found["x"][0], found["y"][0]) == ("x0", "y0")
-
-
 def test_one_axis_of_the_compass_alone_is_no_place(tmp_path: Path) -> None:
     named = {"north": "north_m", "heading": "heading_deg", "yaw_rate": "yaw_rate_deg_s"}
     found = found_in(tmp_path, named)
     assert found["x"][0] == found["y"][0] == ""
-
-
-def test_a_speed_is_no_sway(tmp_path: Path) -> None:
-    named = {"heading": "heading_deg", "surge": "speed", "yaw_rate": "yaw_rate_deg_s"}
-    assert found_in(tmp_path, named)["v"][0] == ""

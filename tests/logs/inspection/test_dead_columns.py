@@ -1,20 +1,11 @@
 """A balancing robot's log: its odometry has columns that never change, its one command no name."""
 
 import numpy as np
-import pytest
 
 from grounded_trials.logs.inspection.inspect_guess import guess_mapping
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.starting.begin import begin
 from ros_bags import START, T, bag, header, odometry, vector
 
-MODEL = """
-from grounded import Model
-model = Model(
-    states={"x": "m", "th": "rad", "v": "m/s", "w": "rad/s"}, inputs={"torque": "N m"},
-    derivative=lambda s, a, p: {"x": s.v, "th": s.w, "v": a.torque, "w": s.th - a.torque},
-)
-"""
 TOPICS = {
     "/odom": "nav_msgs/msg/Odometry",
     "/imu/data": "sensor_msgs/msg/Imu",
@@ -48,21 +39,6 @@ def balancer_bag(folder, second=0.0):
     return bag(folder, TOPICS, messages)
 
 
-def test_what_moves_and_is_in_the_unit_is_found_and_the_one_command(tmp_path):
-    (tmp_path / "mine.py").write_text(MODEL)
-    log = balancer_bag(tmp_path / "bag")
-    begun = begin(tmp_path / "w", log, model=tmp_path / "mine.py")
-    assert {g.name: g.path for g in (*begun.states, *begun.inputs)} == {
-        "x": "/odom.pose.pose.position.x",
-        "th": "/imu/data.orientation.@rpy.pitch",
-        "v": "/odom.twist.twist.linear.x",
-        "w": "/imu/data.angular_velocity.y",
-        "torque": "/cmd_torque.vector.x",
-    }
-    (torque,) = begun.inputs
-    assert not torque.sure and torque.reasons and begun.target != "zeros, to be replaced"
-
-
 def test_what_never_changes_loses_though_its_message_has_other_states(tmp_path):
     units = {"x": "m", "th": "rad", "v": "m/s", "torque": "N m"}
     report = inspect_log(balancer_bag(tmp_path / "bag"))
@@ -71,11 +47,3 @@ def test_what_never_changes_loses_though_its_message_has_other_states(tmp_path):
     assert "/odom.pose.pose.orientation.@rpy.pitch" in th.others
     (y,), _ = guess_mapping(report, ["y"], ["torque"], {"y": "m"})
     assert y.path == "/odom.pose.pose.position.y"  # nothing else is called so: it stands still
-
-
-@pytest.mark.parametrize("second, unit", [(1.0, "N m"), (0.0, "rad")])
-def test_one_of_two_commands_or_of_two_inputs_stays_open(tmp_path, second, unit):
-    report = inspect_log(balancer_bag(tmp_path / "bag", second))
-    inputs = ["torque"] if second else ["torque", "servo"]
-    _, found = guess_mapping(report, ["x"], inputs, dict.fromkeys(inputs, unit) | {"x": "m"})
-    assert all(not one.path and one.others for one in found)

@@ -41,14 +41,6 @@ def test_a_drone_that_turns_has_its_yaw_as_a_state(tmp_path):
     assert model.angles == ("yaw",)
 
 
-def test_an_attitude_that_nothing_follows_is_asked_for(tmp_path):
-    found = begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag", followed=False))
-    by = by_name(found)
-    for name in ("roll_command", "pitch_command"):
-        assert not by[name].sure and not by[name].path
-        assert f"{COMMAND}.orientation.@rpy.{name[:-8]}" in by[name].others
-
-
 def test_the_skeleton_predicts_its_own_drone(tmp_path):
     """The skeleton's equations are those of the bag: right signs, at a yaw of 80 degrees."""
     bag = ros_bags.drone_bag(tmp_path / "bag")
@@ -71,13 +63,6 @@ def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):
     path = f"{COMMAND}.@world_velocity.x"
     with pytest.raises(GroundedError, match=r"needs a message with pose\.pose\.orientation"):
         read_signals((next(bag.glob("*.db3")),), {"v": SignalSpec(path)})
-
-
-def test_a_robot_that_only_rolls_forwards_is_offered_no_velocity_in_the_world(tmp_path):
-    from grounded_trials.logs.inspection.inspect_log import inspect_log
-
-    report = inspect_log(ros_bags.car_bag(tmp_path / "bag"))
-    assert not [f for t in report.topics for f in t.fields if "@world_velocity" in f.path]
 
 
 def test_a_path_of_a_drone_keeps_its_height(tmp_path):

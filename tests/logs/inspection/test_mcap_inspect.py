@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import io
-import json
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from facts import holding
 from grounded.errors import GroundedError
@@ -17,7 +14,7 @@ from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
-from grounded_trials.logs.inspection.inspect_guess import Guess, guess_mapping, is_simulated
+from grounded_trials.logs.inspection.inspect_guess import guess_mapping, is_simulated
 from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
@@ -38,17 +35,6 @@ def test_every_shared_log_can_be_inspected() -> None:
         assert bool(report.damage) == ("derived_corrupt" in str(path)), path.name
         for topic in report.topics:
             assert topic.problem == "" or topic.encoding == "wrong_format", (path.name, topic)
-
-
-@needs_data
-def test_service_events_are_read() -> None:
-    (path,) = files("mcap_format_fixtures/rosbag2/*bags__topics_and_services.mcap")
-    report = inspect_log(path)
-    (events,) = [t for t in report.topics if t.topic == "/add_two_ints/_service_event"]
-    values = {f.path: (f.low, f.high) for f in events.fields}
-    assert values["/add_two_ints/_service_event.info.event_type"] == (1, 2)
-    assert values["/add_two_ints/_service_event.request[0].a"] == (1, 3)
-    assert values["/add_two_ints/_service_event.response[0].sum"] == (4, 6)
 
 
 @needs_data
@@ -129,25 +115,6 @@ def test_number_paths() -> None:
     assert len(number_paths(Dynamic(), deep)) < 20
 
 
-def test_a_json_log_with_odd_names(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("odd topic.name", "json", 0)
-    for i in range(10):
-        body = b'{"timestamp": {"sec": %d, "nsec": 0}, "my value": %d}' % (i, i)
-        writer.add_message(channel, i * 10**9, body, i * 10**9)
-    writer.finish()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stream.getvalue())
-    (topic,) = inspect_log(path).topics
-    paths = [f.path for f in topic.fields]
-    assert paths[-1] == '"odd topic.name"."my value"' and topic.stamped and topic.skew_s == 0
-    guess = Guess("v", paths[-1], "header", True, ())
-    table = tomllib.loads(mapping_toml([guess], []))
-    assert table["log"]["state"]["v"]["path"] == paths[-1]
-
-
 def test_twins() -> None:
     t = np.arange(0, 10, 0.01)
     ns = (t * 1e9).astype(np.int64)
@@ -162,31 +129,6 @@ def test_twins() -> None:
     (twins,) = find_twins(samples)
     assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
     assert twins.opposite and twins.correlation < -0.999
-
-
-@pytest.mark.parametrize(
-    ("others", "found"),
-    [
-        ([], "motor_voltage"),
-        (["motor_voltage_rate"], "motor_voltage"),
-        (["pump_voltage"], ""),
-        (["voltage"], "voltage"),
-    ],
-)
-def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("/cart/command", "json", 0)
-    for i in range(50):
-        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
-        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
-        writer.add_message(channel, i * 10**8, body, i * 10**8)
-    writer.finish()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stream.getvalue())
-    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
-    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)
 
 
 @pytest.mark.parametrize("step", [0.00153, 0.0044, 1e-7])

@@ -42,17 +42,6 @@ def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent)
     assert all(found[name] for name in ("v", "omega", "x", "y", "psi"))
 
 
-def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_path):
-    rows = np.loadtxt(table(tmp_path / "a.csv", "abcdefgh"), delimiter=",", skiprows=1)
-    named = "t,x,y,theta,cmd_v,cmd_omega"
-    kept = rows[:, [0, 1, 2, 3, 6, 7]]
-    np.savetxt(tmp_path / "poses.csv", kept, "%.6f", ",", header=named, comments="")
-    done = begin(tmp_path / "w", tmp_path / "poses.csv")
-    found = {g.name: g.path for g in (*done.states, *done.inputs)}
-    assert found["turn"] == "/csv.cmd_omega" and found["speed"] == "/csv.cmd_v"
-    assert not found["omega"] and not found["v"] and done.then.verb == "ingest"
-
-
 def test_commands_beside_a_camera_s_poses_are_no_measured_speeds(tmp_path):
     done = begin(tmp_path / "w", rover_bag(tmp_path / "bag", seen="/mocap"))
     found = {g.name: g.path for g in (*done.states, *done.inputs)}

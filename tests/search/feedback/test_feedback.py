@@ -14,9 +14,9 @@ from grounded.search.candidate import Candidate
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker, begun_at
-from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
+from grounded.search.planner import Planner, model_fingerprint
 from grounded.search.standing import standing
-from grounded.search.step.step_size import SearchOptions, Step
+from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of
@@ -56,36 +56,6 @@ def noisy():
     return SimpleNamespace(task=task, plant=plant, now=now, about=about, planner=planner)
 
 
-def test_gains_that_hold_are_kept(noisy):
-    about, best = noisy.about, noisy.now.incumbent
-    made = about.candidate(about.theta, Step(), "")
-    np.testing.assert_allclose(made.policy.gain, best.candidate.policy.gain)
-
-
-def test_what_a_model_is_likely_to_miss_grows_with_the_step(noisy):
-    about, own = noisy.about, noisy.now.incumbent.candidate.policy
-    about.least = -np.inf
-    about.missed = 0.5
-    far = replace(own, feedforward=own.feedforward + 1.0)
-    near, moved = (about.candidate(policy, Step(), "") for policy in (own, far))
-    assert moved.likely_off > near.likely_off and moved.doubtful
-    assert moved.expected_gain == pytest.approx(moved.predicted_gain - moved.likely_off)
-
-
-def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
-    """The changed model's own plan only precedes a step if its predicted gain is larger."""
-    about, task = noisy.about, noisy.task
-    better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
-    fingerprint = model_fingerprint(better.plan)
-    about.make = Maker(better, about.make.now, "c0099", fingerprint)
-    about.already, about.least, about.missed = -1e3, 1.0, 0.0  # so that it promises 999
-    assert about.own_plan(None) is None  # the alternatives predict no gain
-    about.alternatives = ()
-    assert about.own_plan(None).candidate.way == "own plan"
-    about.missed = 1e9
-    assert about.own_plan(None) is None
-
-
 def test_a_candidate_says_that_it_may_well_lose():
     fields = dict.fromkeys(("id", "policy", "base", "model", "predicted_states"), "")
     fields |= {"iteration": 1, "alpha": 1.0, "predicted_inputs": "", "predicted_utility": -1.0}
@@ -105,20 +75,6 @@ def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
     _, plain = first_policy(planner.plan)
     _, followed = planner.first_policy()
     assert followed.cost < plain.cost - 0.2
-
-
-def test_what_the_incumbent_lost_by_its_start_is_known(noisy):
-    """The model also predicts the incumbent's run from its real start."""
-    about = noisy.about
-    run = about.candidate(about.theta, Step(), "")
-    trial = noisy.now.incumbent.trials
-    assert np.isfinite(run.base_as_run) and len(trial) >= 1
-    said = noisy.now.incumbent.candidate.predicted_states
-    began = begun_at(about.make.planner.task, trial, said).states[0]
-    start = about.real.start.copy()
-    start[:2] = began
-    told = predicted(replace(about.real, start=start), noisy.now.incumbent.candidate.policy)
-    assert run.base_as_run == pytest.approx(told.utility)
 
 
 def test_the_noise_of_a_first_sample_is_no_motion():
@@ -166,15 +122,3 @@ def begun(task, off=0.0, noise=0.0, seed=0):
     states[:, 0] += off + noise * np.random.default_rng(seed).standard_normal(len(states))
     names = (task.model.state_names, task.model.input_names)
     return Trial(states, np.zeros((len(states) - 1, 1)), task.dt, *names)
-
-
-@pytest.mark.parametrize(("off", "told"), [(0.4, False), (2.4, True)])
-def test_a_start_within_a_step_of_its_encoder_is_not_elsewhere(off, told):
-    """`Its runs began away from [task] start in alpha: +6.4e-04`: by 0.4 counts of its encoder."""
-    task, step = cart_task(), 0.05
-    run = begun(task)
-    read = np.array(run.states)
-    read[:, 0] = step * (np.arange(len(read)) // 6 + off)
-    read[6::6, 0] -= 0.5 * step + 1e-4 * np.arange(len(read[6::6]))  # interpolated
-    found = began_elsewhere(task, [replace(run, states=read)], begun(task).states)
-    assert found == ({"x": "+0.12 m in x"} if told else {})

@@ -9,9 +9,7 @@ from grounded.model import Model
 from grounded.policy import Policy
 from grounded.search.feedback.margin import AGES, worse_costs
 from grounded.search.improve import SearchOptions, propose
-from grounded.search.making import Maker
 from grounded.search.planner import Planner, planner_with, predicted
-from grounded.search.standing import standing
 from grounded.task import Task
 from grounded.utility import Reward
 from small_tasks import speed_rover, speed_rover_task
@@ -97,19 +95,3 @@ def test_gains_do_not_count_on_a_joint_that_sticks():
     its, mine = (worse_costs([problem, loose], policy) for policy in (own, made))
     assert np.log(mine).mean() <= np.log(its).mean() + 1e-9
     assert np.abs(made.gain[60:80, 0, 0]).min() > 0.1  # while it is to stand still
-
-
-def test_a_command_at_its_limit_tells_nothing_of_what_no_sensor_shows():
-    plain = speed_rover_task(speed_rover())
-    reward = replace(plain.reward, input_change=np.array([0.01, 0.003]))
-    slow = replace(plain, low=np.array([-0.3, -0.3]), high=np.array([1.5, 0.3]), reward=reward)
-    planner = planner_with(slow, LATE)
-    policy, plan = planner.first_policy()
-    assert np.isclose(np.abs(plan.u[:, 1]), 0.3).sum() > 5
-    now = standing(slow, [], [], SearchOptions(), planner.fingerprint)
-    maker, problem = Maker(planner, now, "c0001", ""), planner.plan.problem(exact=True)
-    narrow = planner.narrowed(policy)
-    run = predicted(problem, narrow)
-    for caution in (0.5, 1.0, 1.5):
-        gentle = maker._gently(narrow, problem, run, caution)
-        assert np.abs(gentle.gain).max() < 50.0  # 24 on a command that hardly deviates

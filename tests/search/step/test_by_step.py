@@ -119,27 +119,6 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 
 
-@pytest.mark.parametrize("age", [0.0, 0.013])
-def test_runs_together_may_differ_in_bias_and_law(grounded, age):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, others = turning(own, 3)
-    told = Told.by(others, own, problem)
-    models = []
-    for k, price in enumerate(PRICES[:3]):
-        made = Corrected(problem.system, told.law(price), own.x, own.u, own.before).on(problem)
-        bias = made.bias + 1e-3 * k * np.sin(np.arange(made.bias.size)).reshape(made.bias.shape)
-        models.append(replace(made, bias=bias, age=age))
-    policy = best.candidate.policy
-    policies = [replace(policy, gain=share * policy.gain) for share in (1.0, 0.9, 0.8)]
-    alone = [predicted(*each) for each in zip(models, policies, strict=True)]
-    assert np.ptp([one.utility for one in alone]) > 1e-6
-    assert_same_runs(runs(models, policies), alone)
-    open_loop = [replace(policy, gain=None, reference=None), *policies[1:]]
-    alone = [predicted(*each) for each in zip(models, open_loop, strict=True)]
-    assert_same_runs(runs(models, open_loop), alone)
-
-
 def assert_same_runs(found, expected):
     np.testing.assert_allclose(
         [one.utility for one in found], [one.utility for one in expected], rtol=1e-9
@@ -210,16 +189,6 @@ def test_they_wait_until_two_steps_have_lost(grounded, lost, options, error, ste
     incumbent = replace(best, deviation=error)
     model = best.candidate.model
     assert options.due(losing(search, lost), incumbent, model, BY_STEP) == step
-
-
-def test_after_two_of_them_lost_too_the_others_go_on(grounded):
-    search, best, _ = grounded
-    model, options = best.candidate.model, SearchOptions()
-    history = losing(search, 2, way=BY_STEP, slopes="corrected", damping=10.0)
-    assert options.due(history, best, model, BY_STEP) is None
-    by_step = replace(best, candidate=replace(best.candidate, way=BY_STEP))
-    assert options.due(history, by_step, model, BY_STEP) == Step(100.0)
-    assert options.due(history, by_step, "another model", BY_STEP) is None
 
 
 def test_one_other_trial_is_too_few(grounded):

@@ -151,24 +151,6 @@ def lost(found, utility=-100.0, **changes):
     return replace(first, candidate=made, utilities=(utility,), accepted=False, **changes)
 
 
-@pytest.mark.parametrize(("slopes", "believes"), [("", True), ("corrected", False)])
-def test_a_step_by_corrected_slopes_that_lost_far_away_refutes_them(slopes, believes):
-    """Laws may predict the near trials and still lose with each step made from them."""
-    task = cart_task()
-    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
-    first = found.search.standing.history[0]
-    near = [replace(first, candidate=replace(first.candidate, id=f"n{k}")) for k in range(3)]
-    policy = found.best.candidate.policy
-    bump = 2.0 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
-    policy = replace(policy, feedforward=policy.feedforward + bump)
-    run = predicted(found.problem, policy)  # by the model's own slopes
-    trial = replace(found.own, states=run.states, inputs=run.inputs)
-    made = replace(first.candidate, id="far", policy=policy, slopes=slopes)
-    far = replace(first, candidate=made, trials=(trial,), accepted=False)
-    told = believed(Planner(task, task), found.best, (*near, found.best, far), found.problem)
-    assert (told.corrected is not None) is believes
-
-
 def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
     planner, history = Planner(found.task, found.task), found.search.standing.history
     made = believed(planner, found.best, history, found.problem).alternatives
