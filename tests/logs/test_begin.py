@@ -1,8 +1,6 @@
 """A workspace from somebody else's log: what is found, what is asked, and that it then works."""
 
 import json
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ from rosbags.rosbag2 import StoragePlugin
 
 import workspaces
 from cli import grounded
-from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
@@ -71,22 +68,12 @@ def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
         assert any("/odom" in reason for reason in guesses[name].reasons)
 
 
-@pytest.mark.parametrize("names", ["speed turn", "linear angular"])
-def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path, names):
-    log, w, model = rover_bag(tmp_path / "bag"), tmp_path / "w", None
-    if names != "speed turn":
-        begin(tmp_path / "first", log)
-        text = (tmp_path / "first/model.py").read_text()
-        model = tmp_path / "model.py"
-        for old, new in zip(("speed", "turn"), names.split(), strict=True):
-            text = text.replace(f"a.{old}", f"a.{new}").replace(f'"{old}": "', f'"{new}": "')
-        model.write_text(text)
-    found = begin(w, log, model=model)
-    assert (found.kind == "rover") is (model is None)
+def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path):
+    log, w = rover_bag(tmp_path / "bag"), tmp_path / "w"
+    found = begin(w, log)
     paths = {guess.name: guess.path for guess in found.inputs}
-    assert paths == dict(
-        zip(names.split(), ("/cmd_vel.linear.x", "/cmd_vel.angular.z"), strict=True)
-    )
+    assert found.kind == "rover"
+    assert paths == {"speed": "/cmd_vel.linear.x", "turn": "/cmd_vel.angular.z"}
     assert not found.unsure and found.dt == 0.05
     assert grounded("-C", w, "ingest", "--data", log).code == 0
 
@@ -110,21 +97,6 @@ def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(
     assert not found.unsure
     roles = Workspace(tmp_path / "arm").base_model.roles
     assert roles["level"] == ("shoulder_position", "elbow_position")  # from the base
-
-
-@pytest.mark.parametrize("goals", [True, False])
-def test_an_array_s_order_is_told_by_the_torques_that_were_measured(tmp_path, goals):
-    """An effort has its joint's name; a command that is another joint's does not go with it."""
-    order = ("elbow", "shoulder")  # not from the base
-    log = commanded_arm_bag(tmp_path / "bag", order, goals, measured_torques=goals)
-    found = begin(tmp_path / "arm", log, kind="arm")
-    inputs = {guess.name: guess for guess in found.inputs}
-    if not goals:  # nothing tells it; it is said what does
-        assert any("controller" in why for why in inputs["elbow_effort"].reasons)
-        return
-    for i, joint in enumerate(order):
-        assert inputs[f"{joint}_effort"].path == f"/effort_controller/commands.data[{i}]"
-    assert not found.unsure
 
 
 @pytest.mark.parametrize(
@@ -406,11 +378,6 @@ def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
     assert by_wheels[:2] == pytest.approx(by_ground[:2] - 0.035 * by_ground[2:], rel=1e-4)
 
 
-@pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])
-def test_what_is_measured_on_both_sides_drives_nothing(wheels, tmp_path, names):
-    assert begin(tmp_path / "w", wheels(names)).kind == "generic"
-
-
 def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     log = wheels("aa,bb")
     rows = np.loadtxt(log, delimiter=",", skiprows=1)
@@ -449,16 +416,9 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert found.kind == "pendulum" and len(found.unsure) == 3
     paths = [g.path for g in (*found.states, *found.inputs)]
     assert paths == ["/csv.q", "/csv.w", "/csv.u"]
-    status = Workspace(tmp_path / "w").status()
-    assert status.then.verb == found.then.verb == "ingest" and not status.notes
-    assert Path(status.then.arguments[-1]).samefile(found.then.arguments[-1])
-    config = tmp_path / "w/grounded.toml"
-    config.write_text(re.sub("(?m)^seen_in.*", "", config.read_text()))
-    (note,) = Workspace(tmp_path / "w").status().notes
-    assert holds(note, "no log is stored", "`ingest --data LOG`", "`propose`")
+    assert Workspace(tmp_path / "w").status().then.verb == found.then.verb == "ingest"
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
-    assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
 
 
 def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung, tmp_path):
@@ -489,17 +449,6 @@ def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
     assert found["pitch"].path.endswith("tilt") and not found["pitch"].sure
     assert "never changes" in found["pitch"].reasons[0]
     assert found["pitch_rate"].path.endswith("tilt_rate")
-
-
-def test_names_with_other_letters_and_times_in_an_unsaid_unit(tmp_path):
-    log, t = tmp_path / "log.csv", 10.0 * np.arange(400)
-    rows = np.column_stack([t, np.sin(t / 300), np.sign(np.cos(t / 300))])
-    head = "Zeit;Winkel;Stellgröße"
-    np.savetxt(log, rows, "%.4f", ";", header=head, comments="", encoding="utf-8")
-    found = begin(tmp_path / "w", log)
-    assert [g.name for g in found.inputs] == ["Stellgröße"]
-    assert any("_ms" in note for note in found.notes)
-    assert Workspace(tmp_path / "w").task.model.input_names == ("Stellgröße",)
 
 
 def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
@@ -647,25 +596,12 @@ def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
     x, v = rows[:, names.index("x")], rows[:, names.index("v")]
     assert x[0] == 0.5 and v[0] == v[-1] == 0 and len(rows) == done.json["horizon"] + 1
     np.testing.assert_allclose(np.diff(x) / 0.05, (v[1:] + v[:-1]) / 2, atol=0.02)
-    held = grounded("-C", made.folder, "target", "line", "--to", "x=-1", "--hold", "1", "--json")
-    names, rows = read_target(made.folder / "target.csv")
-    assert len(rows) == held.json["horizon"] + 1 and (rows[-20:, 1:] == [-1, 0]).all()
-    assert grounded("-C", made.folder, "target", "line", "--hold", "-1").code == 1
     further = grounded("-C", made.folder, "target", "line", "--size", "2", "--json").json
     assert further["columns"]["x"] == [0.5, 2.5]
     step = grounded("-C", made.folder, "target", "step", "--to", "x=1", "--json").json
     assert step["columns"] == {"x": [0.5, 1.0]}
-    for shape, to, said in (("circle", (), "--to STATE"), ("line", ("--to", "x=0.5"), "x = 0.5")):
-        refused = grounded("-C", made.folder, "target", shape, *to)
-        assert refused.code == 1 and said in refused.err
-    free = "def f(s, a, p):\n    return {'b': a.u, 'c': s.b * a.u}\n"
-    (made.folder / "model.py").write_text(
-        f"from grounded import Model\n{free}\n"
-        "model = Model(states={'b': '1', 'c': '1'}, inputs={'u': '1'}, params={}, derivative=f)\n"
-    )
-    (made.folder / "grounded.toml").write_text(config.replace("x = ", "b = ").replace("force", "u"))
-    refused = grounded("-C", made.folder, "target", "line")
-    assert refused.code == 1 and "--to b=1.0" in refused.err
+    for words in (("circle",), ("line", "--to", "x=0.5")):
+        assert grounded("-C", made.folder, "target", *words).code == 1
 
 
 def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):
@@ -724,10 +660,7 @@ def test_a_csv_of_states_is_a_target_where_logs_are_csv_too(swung, tmp_path):
     assert done["columns"] == {"q": [0.0, 2.0], "w": [1.0, 1.0]}
     done = grounded("-C", w, "target", swung(), "--json").json  # a log is read through [log]
     assert done["horizon"] > 100 and set(done["columns"]) == {"q", "w"}
-    wrong = grounded("-C", w, "ingest", "--data", tmp_path / "run.csv")
-    said = " ".join(wrong.err.split())
-    assert wrong.code == 1 and "'u' is read from '/csv.u'" in said and "'q' is" not in said
-    assert said.count("csv, time in") == 1
+    assert grounded("-C", w, "ingest", "--data", tmp_path / "run.csv").code == 1
 
 
 def test_logs_are_fitted_and_diagnosed_without_a_task(tmp_path):

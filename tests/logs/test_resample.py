@@ -100,14 +100,6 @@ def test_a_start_in_motion_or_after_few_samples_is_the_first_row() -> None:
     assert slow["x"] == pytest.approx(0.14, abs=0.02)
 
 
-def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
-    """A robot reset from y = 8 m to 0 a quarter of a second before its run "began" at 0.51 m."""
-    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
-    assert not grid(reset, command(0.5)).start_states  # seven samples after it
-    told = grid(reset, command(0.9)).start_states
-    assert told["x"] == pytest.approx(0.0, abs=0.03)
-
-
 def test_scale_offset_and_unwrapping() -> None:
     def wrapped_degrees(t: np.ndarray) -> np.ndarray:
         return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)
@@ -191,14 +183,6 @@ def test_clocks_that_jump_or_differ_are_refused() -> None:
     some = x.t.copy()
     some[:3] = 0
     assert grid(replace(x, t=some)).reports[0].unstamped == 3
-
-
-def test_a_skew_that_matters_is_said() -> None:
-    x = pose(np.sin)
-    skewed = replace(x, log_times=x.log_times + 300_000_000)
-    found = grid(skewed)
-    assert found.reports[0].skew_s == pytest.approx(-0.3)
-    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
 
 
 def test_the_span() -> None:

@@ -9,7 +9,6 @@ from cli import grounded
 from facts import holds
 from grounded_trials.logs.stated_units import (
     factor_between,
-    same_unit,
     unit_in_name,
     without_unit,
 )
@@ -40,11 +39,6 @@ model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"
 )
 def test_the_factor_between_two_units(said, wanted, factor):
     assert factor_between(said, wanted) == (factor and pytest.approx(factor))
-
-
-def test_a_unit_is_the_same_whoever_writes_it():
-    assert same_unit("N·m", "N m") and same_unit("m/s²", "m / s^2") and same_unit("Nm", "N m")
-    assert not any(same_unit(one, "m/s") for one in ("mm/s", "m", "rad/s", "m/s^2"))
 
 
 def test_units_in_a_table_s_first_row_become_scales(tmp_path):
@@ -96,33 +90,6 @@ def test_units_in_a_table_s_first_row_become_scales(tmp_path):
 def test_the_end_of_a_name_says_a_unit(path, unit, bare):
     assert unit_in_name(path) == unit
     assert without_unit(path) == bare
-
-
-@pytest.mark.parametrize(
-    ("named", "inputs", "scales"),
-    [
-        ("steering_deg,throttle_ref", ("steering", "throttle"), (np.pi / 180, 1)),
-        ("steering_pct,speed_cmd", ("steering", "speed"), (0.01, 1)),
-    ],
-)
-def test_a_car_s_commands_are_found_whatever_unit_or_role_their_names_end_with(
-    tmp_path, named, inputs, scales
-):
-    """`steering_pct` named a steering, and then nothing in the log fitted the steering."""
-    t = np.arange(0, 8, 0.02)
-    held = 0.05 * np.floor(t / 0.05 + 1e-9)
-    v, psi = 1 + 0.3 * np.sin(t), 0.5 * np.sin(0.7 * t)
-    x, y = 0.02 * np.cumsum(v * np.cos(psi)), 0.02 * np.cumsum(v * np.sin(psi))
-    sent = np.column_stack([np.cos(0.7 * held), 1 + 0.3 * np.sin(held)]) / scales
-    table = np.column_stack([t, x, y, psi, v, sent])
-    head = f"t,x,y,psi,v,{named}"
-    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=head, comments="")
-    made = grounded("init", tmp_path / "w", "--from", tmp_path / "log.csv", "--yes", "--json")
-    found = {one["name"]: one for one in made.json["signals"]}
-    assert made.json["kind"] == "car" and made.json["dt"] == 0.05
-    for name, path, scale in zip(inputs, named.split(","), scales, strict=True):
-        assert found[name]["path"] == f"/csv.{path}"
-        assert found[name]["scale"] == pytest.approx(scale)
 
 
 @pytest.mark.parametrize("unit, size", [("%", 100.0), ("1", 1.0)])
