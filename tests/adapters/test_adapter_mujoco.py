@@ -17,13 +17,9 @@ from grounded.adapters import mujoco as adapter  # noqa: E402
 from grounded.adapters.beside import beside, recorded  # noqa: E402
 from grounded.adapters.mujoco_files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
-from grounded.diagnosis.diagnose import diagnose  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
 from grounded.model import Model  # noqa: E402
 from grounded.places import integrals  # noqa: E402
-from grounded.task import Task  # noqa: E402
-from grounded.trial import Trial  # noqa: E402
-from grounded.utility import Reward  # noqa: E402
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -326,40 +322,6 @@ def test_a_joint_and_its_velocity_are_known_as_such() -> None:
     found = integrals(adapter.model(ARM.format(**NOMINAL)))
     assert [(r.i, r.j) for r in found] == [(0, 2), (1, 3)]
     assert [r.c for r in found] == pytest.approx([1.0, 1.0])
-
-
-@pytest.mark.slow
-def test_a_diagnosis_of_an_adapted_model_finds_the_parameter_that_is_off() -> None:
-    model = adapter.model(PENDULUM, params={"hinge.damping": (0.02, 1.0)})
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.zeros((81, 2)),
-        reward=Reward(np.ones(2), np.zeros(2), np.full(1, 0.01), np.zeros(1)),
-        start=np.array([1.0, 0.0]),
-        past=np.zeros(1),
-        low=np.full(1, -2.0),
-        high=np.full(1, 2.0),
-    )
-    real, rng, trials = model.with_values({"hinge_damping": 0.3}), np.random.default_rng(5), []
-    for _ in range(2):
-        u = np.repeat(rng.uniform(-1, 1, 8), 10)[:, None]
-        x = [task.start]
-        for now in u:
-            x.append(step(real, x[-1], now)[0])
-        noisy = np.array(x) + rng.normal(0, [1e-3, 5e-3], (81, 2))
-        trials.append(
-            Trial(
-                dt=0.02,
-                states=noisy,
-                inputs=u,
-                state_names=model.state_names,
-                input_names=model.input_names,
-            )
-        )
-    found = diagnose(task, trials)
-    assert found.parameters["hinge_damping"].value == pytest.approx(0.3, abs=0.03)
-    assert all("hinge" in name for name in found.verdict.effects)
 
 
 def test_a_control_step_with_the_jitter_of_a_log_is_made_exactly() -> None:

@@ -13,10 +13,8 @@ from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.engine import Engine, each, running
-from grounded.search.planner import planner_with
 from grounded.solve.ddp import solve
 from problems import SPECS, problem
-from small_tasks import scara_task
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -220,21 +218,6 @@ def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypat
         np.testing.assert_allclose(mine, theirs, **TIGHT)
 
 
-def test_a_failed_sweep_names_the_same_step():
-    zero = np.zeros(1)
-    fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
-    weight = np.zeros((10, 2))
-    weight[6:] = 1.0  # nothing to be minimised before step 5 but the future
-    z, u = np.zeros((10, 3)), np.zeros((9, 1))
-    for task in (fast, slow):
-        task = replace(task, state_weight=np.zeros((10, 2)))
-        assert task.system.backward(task, z, u, zero).failed_at == 8
-        bad = z.copy()
-        bad[4] = np.nan
-        found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
-        assert found.failed_at >= 0
-
-
 def test_steps_one_after_the_other_are_those_steps():
     from grounded.models.pendulum import model
 
@@ -271,38 +254,3 @@ def test_functions_agree_with_numpy_where_they_branch():
         u = np.zeros((len(x), 1))
         mine, theirs = (system.step(states, u, p, 0.1) for system in (fast, slow))
         assert np.allclose(mine, theirs, rtol=1e-14, atol=1e-15)
-
-
-@pytest.mark.parametrize("delays", [(0.0,) * 5, (0.0, 0.4, 2.7, 1.0, 0.0)])
-def test_a_run_by_itself_is_the_run_beside_others(delays):
-    """Of a long model, whose entries are taken four at once, with and without some left over."""
-    for n in (8, 10):
-        fast, slow = (
-            replace(
-                wide(n, 5, True, make, np.inf), delay=np.array(delays), angles=np.arange(n) == 1
-            )
-            for make in (system_of, traced)
-        )
-        u = np.random.default_rng(n).normal(size=(12, 5))
-        start = slow.system.rollout(slow, u)
-        gains = slow.system.backward(slow, start.z[0], u, np.zeros(5))
-        policy = (u, gains.K, start.z[0], gains.k)
-        one = fast.system.rollout(fast, *policy, np.array([0.7]))
-        some = fast.system.rollout(fast, *policy, np.array([0.7, 0.2]))
-        reference = slow.system.rollout(slow, *policy, np.array([0.7]))
-        for a, b, c in zip(*(vars(run).values() for run in (one, some, reference)), strict=True):
-            assert np.allclose(a[0], b[0], **TIGHT) and np.allclose(a[0], c[0], **TIGHT)
-
-
-@pytest.mark.slow
-def test_an_arm_with_six_adopted_effects_is_compiled_with_its_derivatives():
-    effects = [
-        ("delay:tau1+tau2", {"d": 0.0149}),
-        ("joint_friction:tau1<-w1", {"c": 0.754, "b": 0.314}),
-        ("joint_friction:tau2<-w2", {"c": 0.235, "b": 0.078}),
-        ("added_inertia:tau2<-w2", {"J": 0.0281}),
-        ("input_gain:tau1+tau2", {"g": -0.407}),
-        ("rate_gain:w2", {"g": 0.068}),
-    ]
-    system = planner_with(scara_task(), effects).plan.model.system
-    assert (system.how, system.note) == ("compiled", "")

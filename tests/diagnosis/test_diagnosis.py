@@ -7,16 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded import GroundedError, Model, Trial
+from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.error_report import Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.validation.blame import ENOUGH, fewest, loss, still
-from grounded.diagnosis.validation.claims import has_size
-from grounded.effects import Library
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from grounded.policy import Policy
@@ -148,28 +144,6 @@ def test_of_two_parameters_that_are_one_only_one_is_blamed():
     assert loss(H, b, [0]) < 1 < 40 < loss(H, b, [])
 
 
-@pytest.mark.parametrize(
-    ("name", "known", "listed"),
-    [
-        ("patch:v", {"c": (5e5, 4.5e8), "x0": (15.4, 143), "radius": (2.31, 1.8)}, False),
-        ("patch:v", {"c": (0.4, 0.5), "x0": (0.01, 143), "radius": (2.31, 1.8)}, True),
-        ("saturation:u", {"c": (0.0, 0.026)}, False),
-        ("saturation:u", {"c": (0.3, 0.026)}, True),
-        ("periodic:v", {"A": (1e-4, 0.1), "B": (0.3, 0.1), "omega": (2.0, 0.1)}, True),
-        ("offset:v", {"c": (-0.1, float("inf"))}, False),
-    ],
-)
-def test_an_explanation_without_a_size_is_not_listed(name, known, listed):
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "m/s^2"},
-        roles={"position": ("x",)},
-        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
-    )
-    effect = Library().effect(name, model)
-    assert has_size(effect, {n: Estimate(*one) for n, one in known.items()}) is listed
-
-
 @pytest.mark.slow
 def test_one_trial_names_no_cause():
     model, trials = pushed_cart(friction=0.5, trials=1)
@@ -226,7 +200,7 @@ def test_the_document_is_plain_json():
 
 
 @pytest.mark.slow
-def test_a_probe_tells_two_explanations_apart(monkeypatch):
+def test_a_probe_tells_two_explanations_apart():
     model, trials = pushed_cart(dead=0.1, steps=60, trials=3)
     H = 100
     task = Task(
@@ -267,12 +241,6 @@ def test_a_probe_tells_two_explanations_apart(monkeypatch):
     assert not alone.little
     surely = probe(task, base, replace(found, indistinguishable=()), trials * 40)
     assert surely.little and surely.about == alone.about
-    monkeypatch.setattr("grounded.diagnosis.excitation.WELL", 1.0)
-    left = (Remainder("v", error=0.2, floor=0.1),)  # nothing else is to be known, beside a gap
-    for gap, told in ((left, True), ((), False)):
-        known = replace(found, indistinguishable=(), leftover=gap)
-        made = probe(task, base, known, trials)
-        assert ("well known already" in made.sentence) == told == made.little
     none = replace(found, verdict=replace(found.verdict, effects=()), parameters={})
     assert probe(task, base, replace(none, indistinguishable=()), trials) is None
 

@@ -7,7 +7,6 @@ from scipy.ndimage import gaussian_filter1d
 from grounded import Model, Param
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.effects import Library
 from grounded.trial import Trial
 
 DT, FINE = 0.05, 10  # [s] control step; steps of the simulation in one
@@ -72,12 +71,6 @@ def test_one_message_is_late_as_a_whole(trials):
     found = preflight(ROVER, trials, one_message=POSE)
     assert late(found.findings) == pytest.approx(dict.fromkeys(POSE, LATE), abs=0.004)
     assert {f"sensor_delay:{name}" for name in POSE} <= found.settled
-
-
-def test_a_speed_may_turn_a_heading_but_not_drive_a_position():
-    names = [e.name for e in Library().candidates(ROVER)]
-    assert "coupling:psi<-v" in names
-    assert not {"coupling:psi<-omega", "offset:psi", "trend:psi", "periodic:psi"} & {*names}
 
 
 def test_unequal_wheels_are_named_and_slip_is_not_given_the_delay(trials):

@@ -7,10 +7,6 @@ import pytest
 
 import grounded as gr
 from grounded import Model, Param, Trial
-from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import linearise
-from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 from grounded.effects.drive import combined_speeds, weights_at
 from grounded.effects.joint import pairs_of, springs_of
@@ -133,20 +129,6 @@ cart = Model(
 )
 
 
-def carted(seed=0, steps=400, dt=0.05, parts=25):
-    """A run of a real cart: track 0.27 m, the right motor 10 % weaker, dry friction of both."""
-    rng, gains, track = np.random.default_rng(seed), np.array([0.83, 0.745]), 0.27
-    u = np.repeat(rng.uniform(-0.4, 0.7, (steps // 8 + 1, 2)), 8, axis=0)[:steps]
-    u[:20], wheels, psi, rows = 0.0, np.zeros(2), 0.0, []
-    for sent in [*u, u[-1]]:
-        seen = np.round(wheels / 0.004) * 0.004
-        rows.append([psi + rng.normal(0, 0.004), seen.mean(), (seen[1] - seen[0]) / track])
-        for _ in range(parts):
-            wheels += dt / parts * ((gains * sent - wheels) / 0.14 - 0.22 * np.tanh(wheels / 0.01))
-            psi += dt / parts * (wheels[1] - wheels[0]) / track
-    return Trial(np.array(rows), u, dt, cart.state_names, cart.input_names)
-
-
 def test_the_weights_of_a_wheels_speed_follow_the_track():
     crudely = dict(zip(cart.param_names, cart.values, strict=True))
     values = crudely | {"track": 0.3, "tau_r": 0.1, "delay_d": 0.02}  # of an adopted effect, too
@@ -158,29 +140,6 @@ def test_the_weights_of_a_wheels_speed_follow_the_track():
         assert at[other] == pytest.approx(side * ratio, rel=1e-6)
         assert crude[other] == pytest.approx(side * (0.125 if other == "r" else 8.0), rel=1e-6)
     assert weights_at(arm, "tau1<-w1", {}) == {"w1": 1.0}
-
-
-def frictions(data, **values):
-    h = Hypothesis()
-    for name in (LEFT, RIGHT, "input_gain:right"):
-        effect = Library().effect(name, data.model, data.scales)
-        given = {"c": 0.03, "b": 0.05, "g": -0.05} | values
-        h = h.plus(effect, {q.name: given.get(q.name, 0.02) for q in effect.quantities})
-    return replace(h, spread=1.0)
-
-
-def test_a_friction_moves_with_the_track_in_the_slopes_of_a_fit():
-    data = prepare(cart, [carted()])
-    predictor, h = Predictor(data), frictions(data)
-    x, u, free = data.y[:-1], predictor.inputs(h), len(h.theta)
-    by = linearise(predictor, h, data.y, whole=False)[1][..., 1 + free :]
-    for i, param in enumerate(cart.params.values()):
-        shift = 1e-4 * param.spread * np.eye(4)[i]
-        ends = [predictor.advance(replace(h, shift=s), x, u, data.time) for s in (shift, -shift)]
-        slope = data.model.difference(*ends) / 2e-4
-        assert np.quantile(np.abs(by[..., i] - slope), 0.95) < 0.05 * np.abs(slope).max()
-        if i == 1:  # through the friction, which turns with the speed
-            assert np.abs(slope[..., 1]).max() > 1e-3
 
 
 @pytest.mark.slow

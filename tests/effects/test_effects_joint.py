@@ -151,29 +151,6 @@ def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
     assert not model.system.note  # it is compiled
 
 
-@pytest.mark.parametrize(("w", "push"), [(0.8, 3.0), (-0.8, 3.0), (0.1, -2.0), (2.0, 0.0)])
-def test_a_position_moves_by_the_loss_as_it_grows_within_the_step(w, push):
-    cart = Model(
-        states={"x": "m", "v": "m/s", "y": "m", "r": "m/s"},
-        inputs={"u": "N"},
-        derivative=lambda s, a, p: {"x": s.v, "v": a.u, "y": -2 * s.r, "r": 0.5 * a.u - s.v},
-    )
-    b, dt = 7.0, 0.02
-    model = wrap(
-        Library().effect("joint_friction:u<-v", cart), {"c": 0.4, "b": b, "width": 0.01}, dt
-    )
-    x, u = np.array([0.0, w, 0.0, 0.0]), np.array([[push]])
-    got = model.system.step(x[None], u, model.values, dt)[0]
-    fine, parts = x.copy(), 4000
-    for _ in range(parts):
-        loss = 0.4 * np.clip(fine[1] / 0.01, -1, 1) + b * fine[1]
-        fine = cart.system.step(fine[None], u - loss, cart.values, dt / parts)[0]
-    held = cart.system.step(x[None], u - (x[1] + dt * push - got[1]) / dt, cart.values, dt)[0]
-    for q in (0, 2):
-        assert abs(got[q] - fine[q]) < 0.25 * abs(held[q] - fine[q])
-    assert got[1] == pytest.approx(fine[1], abs=2e-3)
-
-
 @pytest.mark.parametrize(
     ("family", "values"),
     [

@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import grounded as gr
-from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_of, wrap
-from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
 
@@ -97,47 +94,3 @@ def test_its_slopes_are_those_of_its_steps(late, name, values):
         ends = [predictor.advance(h, x + s * nudge, u, data.time) for s in (1, -1)]
         error = np.abs(F[..., j] - (ends[0] - ends[1]) / (2 * size))
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02
-
-
-cart = Model(
-    states={"x": "m", "v": "m/s"},
-    inputs={"u": "N"},
-    params={"mass": Param(1.0, "kg", 0.5, 2.0)},
-    derivative=lambda s, a, p: {"x": s.v, "v": a.u / p.mass},
-)
-
-
-@pytest.mark.slow
-def test_a_friction_is_found_behind_a_late_log():
-    rng, dt, delay, real = np.random.default_rng(3), 0.025, 0.045, []
-    for _ in range(3):
-        t = dt * np.arange(241)
-        force = 1.2 * np.sign(np.sin(rng.uniform(1, 2) * t + rng.uniform(0, 6)))
-        x, fine = np.zeros(2), [np.zeros(2)]
-        for u in force[:-1]:
-            for _ in range(25):
-                push = u - 0.4 * np.tanh(x[1] / 1e-3)
-                x = x + dt / 25 * np.array([x[1], push])
-            fine.append(x + 0.0)
-        true = np.array(fine)
-        late = np.column_stack([np.interp(t - delay, t, true[:, k]) for k in (0, 1)])
-        seen = late + np.array([2e-3, 0.01]) * rng.standard_normal(late.shape)
-        real.append(Trial(seen, force[:-1, None], dt, ("x", "v"), ("u",)))
-    model = cart
-    for name in ("x", "v"):
-        model = wrap(Library().effect(f"sensor_delay:{name}", model), {"d": delay}, dt)
-    lifted = [
-        replace(
-            t,
-            states=np.hstack([t.states, memory_of(model, cart, t)]),
-            state_names=model.state_names,
-        )
-        for t in real
-    ]
-    hidden = model.state_names[cart.n :]
-    options = DiagnosisOptions(
-        hidden=hidden, but={"sensor_delay:x", "sensor_delay:v"}, max_effects=1
-    )
-    found = gr.diagnose(model, lifted, options)
-    assert found.verdict.effects == ("coulomb_friction:v",)
-    assert found.ranking[0].params["c"].value == pytest.approx(0.4, abs=0.03)

@@ -90,36 +90,3 @@ def test_a_delay_of_a_part_of_a_step_is_estimated_from_encoders(name, value):
     start = search.fresh(Hypothesis().plus(effect, {q.name: 1.2 * value}))
     (fit,) = search.refined([start], 25)
     assert fit.hypothesis.values[0][q.name] == pytest.approx(value, rel=0.02)
-
-
-engine = Model(
-    states={"v": "m/s"},
-    inputs={"thrust": "N"},
-    params={},
-    derivative=lambda s, a, p: {"v": 2.0 * a.thrust - 0.5 * s.v},
-    name="engine",
-)
-
-
-@pytest.mark.parametrize(("dt", "tau", "late"), [(0.1, 0.28, 0.14), (0.1, 0.03, 0.16)])
-def test_a_lag_and_a_delay_that_ends_within_a_step_are_told_apart(dt, tau, late):
-    rng, h, count = np.random.default_rng(1), dt / FINE, 240
-    u = np.repeat(rng.uniform(-1, 1, count // 4), 4) + 0.2 * rng.standard_normal(count)
-    sent = np.concatenate([np.full(round(late / h), u[0]), np.repeat(u, FINE)])
-    z, v, log = u[0], 0.0, [0.0]
-    for k, command in enumerate(sent[: count * FINE]):
-        z = command + (z - command) * np.exp(-h / tau)
-        v += h * (2.0 * z - 0.5 * v)
-        log += [v] if k % FINE == FINE - 1 else []
-    y = np.array(log)[:, None] + 1e-4 * rng.standard_normal((count + 1, 1))
-    one = Trial(y, u[:, None], dt, ("v",), ("thrust",), start_inputs=u[:1])
-    data = prepare(engine, [one], np.zeros(1))
-    lag, delay = (
-        LIBRARY.effect(f"{name}:thrust", engine, data.scales)
-        for name in ("first_order_lag", "delay")
-    )
-    search = HypothesisSearch(data, (lag, delay))
-    h = Hypothesis().plus(lag, {"tau": 1.1 * tau}).plus(delay, {"d": 1.05 * late})
-    (fit,) = search.refined([search.fresh(h)], 40)
-    assert fit.hypothesis.values[0]["tau"] == pytest.approx(tau, abs=0.001)
-    assert fit.hypothesis.values[1]["d"] == pytest.approx(late, abs=0.001)

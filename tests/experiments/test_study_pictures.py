@@ -81,22 +81,6 @@ def results():
     }
 
 
-def test_the_bounds_of_theorem1_are_drawn_in_both_panels():
-    result = results()["theorem1"]
-    for panel, bound in zip(
-        PICTURES["theorem1"](result).panels,
-        (lambda e, K: K * e, lambda e, K: 2 * (K * e) ** 2),
-        strict=True,
-    ):
-        curves = {curve.role: curve for curve in panel.curves}
-        for role, K in (("limit", 2.0), ("model", 41.0)):
-            drawn = 10.0 ** curves[role].y
-            np.testing.assert_allclose(drawn, [bound(e, K) for e in (0.01, 0.1)])
-            for dot in panel.dots:
-                at = np.interp(dot.x, curves[role].x, curves[role].y)
-                assert dot.y <= at + 1e-12
-
-
 def test_every_study_has_its_picture():
     assert set(PICTURES) == set(STUDIES) == set(results())
 

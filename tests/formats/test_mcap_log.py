@@ -139,21 +139,6 @@ def test_a_live_trial_with_jitter_is_on_the_grid_and_one_with_a_gap_is_not() -> 
                 read_trial(stream.getvalue())
 
 
-def test_a_live_trial_on_a_full_disk_says_so() -> None:
-    class Full(io.BytesIO):
-        def write(self, data: object) -> int:
-            if self.tell() > 3000:
-                raise OSError(28, "ENOSPC, full disk")
-            return super().write(data)  # type: ignore[arg-type]
-
-    writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
-    with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
-        for k in range(1000):
-            writer.append(k * 0.1, np.zeros(1), np.zeros(1))
-    with pytest.raises(GroundedError, match="expected 1 numbers"):
-        writer.append(0.0, np.zeros(2), None)
-
-
 def test_a_writer_never_overwrites(tmp_path: Path) -> None:
     path = tmp_path / "trial.mcap"
     path.write_bytes(b"precious")

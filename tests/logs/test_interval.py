@@ -105,17 +105,6 @@ def test_changes_that_rows_show_late_tell_their_phase_together(jitter):
     assert phase - room - 5e-4 < 0.0173 - 0.025 < phase + 5e-4 and room < 0.0055
 
 
-def test_changes_at_either_of_two_rows_are_in_no_step_unless_each_may_be_a_row_late():
-    """A program that sends when a row is written is seen in that row or the next."""
-    t = np.sort(np.random.default_rng(1).choice(80, 40, replace=False)) * 0.05
-    late = np.full(len(t), 0.05)
-    assert phase_of(t, 0.1, late, whole_rows=False) is None
-    phase, room = phase_of(t, 0.1, late)
-    assert abs(phase) % 0.05 == pytest.approx(0.0, abs=0.002) and room < 0.003
-    one = phase_of(t[(t / 0.05).round() % 2 == 1], 0.1, late[:1], whole_rows=False)
-    assert one is not None and abs(one[0]) == pytest.approx(0.05, abs=0.002)
-
-
 def test_changes_at_any_time_are_in_no_step():
     rng = np.random.default_rng(1)
     rows = np.arange(0, 20, 0.010)

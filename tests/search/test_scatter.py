@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from grounded.frozen import calm, resampled_noise, white_noise
+from grounded.frozen import resampled_noise, white_noise
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
@@ -21,7 +21,6 @@ from grounded.search.scatter import (
 )
 from grounded.search.standing import standing
 from grounded.search.step.step_size import SearchOptions
-from grounded.trial import Trial
 from small_tasks import cart_task, drive, other
 
 
@@ -127,36 +126,3 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
     gaps = np.where(np.arange(400)[:, None] % 9, log, np.nan)
     np.testing.assert_allclose(np.median(resampled_noise(gaps)), true, rtol=0.2)
     assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_drive_by_steps_shows_its_noise_once_it_has_settled(share):
-    """A rover's turn rate: 0.019 rad/s counted of a sensor with 0.010, a promise of 2.6 times."""
-    rng, dt, seen = np.random.default_rng(7), 0.05, []
-    noise = 0.01 * rng.standard_normal((1201, 20))
-    sent, rate = np.repeat(rng.uniform(-1.2, 1.2, 80), 15), 0.0
-    for k in range(1200):
-        seen.append(rate)
-        for i in range(10):
-            due = sent[max(0, k - (1 if i < 2 else 2))]  # 60 ms late
-            rate += dt / 10 * (0.9 * due - rate) / 0.12
-    log = np.array(seen)[:, None] + (1 - share) * noise[:-1] + share * noise[1:]
-    found = resampled_noise(log, calm(sent[:-1, None]))
-    true = 0.01 * np.hypot(1 - share, share)
-    assert 0.85 * true < np.median(found) < 1.25 * true
-    assert (found < 1.4 * true).all()
-    driven = resampled_noise(log)  # by all samples, as before
-    assert np.median(driven) > 1.2 * true and driven.max() > 1.8 * true
-    trial = Trial(log[:, :1], sent[:-1, None], dt, ("omega",), ("turn",))
-    np.testing.assert_array_equal(trial.noise(), found[:1])
-
-
-@pytest.mark.parametrize("gaps", [False, True])
-def test_the_noise_of_all_columns_is_that_of_each_alone(gaps):
-    log = np.random.default_rng(5).standard_normal((60, 4)).cumsum(axis=0)
-    if gaps:
-        log[20, 1] = np.nan
-        log[30:, 3] = np.inf
-    with np.errstate(invalid="ignore"):
-        alone = [resampled_noise(log[:, [j]])[0] for j in range(4)]
-        np.testing.assert_array_equal(resampled_noise(log), alone)

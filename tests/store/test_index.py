@@ -8,11 +8,9 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.store import documents as documents_module
-from grounded_trials.store.known import KnownCandidate, KnownTrial
+from grounded_trials.store.known import KnownTrial
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace import folder as folder_module
-from grounded_trials.workspace import identity as identity_module
 from workspaces import CONFIG, make
 
 COUNT = 240
@@ -112,27 +110,6 @@ def test_a_trial_that_was_damaged_behind_the_index_is_found(indexed):
     finally:
         path.write_bytes(data)
     assert Workspace(w.folder).status().standing.trials > 100
-
-
-def read_again(*_):
-    raise AssertionError("the index knows this file")
-
-
-def test_known_candidates_and_notes_are_not_read_again(indexed, monkeypatch):
-    w, _ = indexed
-    first = Workspace(w.folder)
-    first.propose()
-    answer, numbers = first.status().to_json(), [c.policy for c in first.read().candidates]
-    for module, name in ((identity_module, "read_candidate"), (documents_module.Notes, "_of")):
-        monkeypatch.setattr(module, name, read_again)
-    again = Workspace(w.folder)
-    assert again.status().to_json() == answer and again.noted.handed == first.noted.handed
-    monkeypatch.undo()
-    monkeypatch.setattr(folder_module, "MANY", 100)
-    for candidate, policy in zip(again.read().candidates, numbers, strict=True):
-        assert isinstance(candidate, KnownCandidate)
-        np.testing.assert_array_equal(candidate.policy.feedforward, policy.feedforward)
-        assert len(candidate.predicted_states) == len(candidate.predicted_inputs) + 1
 
 
 @pytest.mark.parametrize("how", ["flipped", "another's", "gone"])

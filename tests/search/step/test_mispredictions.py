@@ -11,7 +11,6 @@ from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
 from grounded.search.planner import Planner, predicted
 from grounded.search.step.mispredictions import apart, believed, shared
-from grounded.solve import ddp
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task
 
@@ -50,23 +49,6 @@ def test_the_trial_is_still_replayed_and_others_are_foretold(found):
     assert abs(told - first.utility) < 0.7 * abs(crude - first.utility)
 
 
-def test_a_new_trial_is_foretold_too():
-    """A correction learnt from two trials holds for a third one in another direction."""
-    task = cart_task()
-    plant = Plant(task.model.with_values({"mass": 1.6, "drag": 0.6}))
-    found = searched(task, plant, 2)
-    planner, history = Planner(task, task), found.search.standing.history
-    made = believed(planner, found.best, history, found.problem)
-    assert made.missed < 0.05
-    moved = found.best.candidate.policy
-    bump = 0.5 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
-    moved = replace(moved, feedforward=moved.feedforward + bump)
-    real = task.utility(drive(task, plant, replace(found.best.candidate, policy=moved)))
-    crude = predicted(found.problem, moved).utility
-    told = predicted(made.problem, moved).utility
-    assert abs(told - real) < 0.2 * abs(crude - real)
-
-
 def test_its_derivatives_are_those_of_its_steps(found):
     planner, history = Planner(found.task, found.task), found.search.standing.history
     made = believed(planner, found.best, history, found.problem).corrected
@@ -87,14 +69,6 @@ def test_its_derivatives_are_those_of_its_steps(found):
     by_p = made.sensitivities(x, u, p, dt)[2]
     base = found.problem.system.sensitivities(np.ascontiguousarray(x[:, :n]), u, p, dt)[2]
     np.testing.assert_array_equal(by_p[:, :n], base)
-
-
-def test_it_is_solved_as_any_other_model(found):
-    planner, history = Planner(found.task, found.task), found.search.standing.history
-    made = believed(planner, found.best, history, found.problem)
-    solved = ddp.solve(made.problem, found.own.inputs)
-    assert solved.status == "converged"
-    assert solved.cost <= -found.best.utility
 
 
 def test_a_law_is_found_and_noise_gives_none():
