@@ -144,7 +144,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "m", "dense"),
-    [(1, 1, True), (7, 8, False), (26, 3, False), (6, 9, True)],
+    [(1, 1, True), (16, 4, True), (26, 3, False), (6, 9, True)],
 )
 def test_sizes_written_out_and_looped(n, m, dense):
     fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
@@ -254,3 +254,18 @@ def test_functions_agree_with_numpy_where_they_branch():
         u = np.zeros((len(x), 1))
         mine, theirs = (system.step(states, u, p, 0.1) for system in (fast, slow))
         assert np.allclose(mine, theirs, rtol=1e-14, atol=1e-15)
+
+
+def test_a_failed_sweep_names_the_same_step():
+    zero = np.zeros(1)
+    fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
+    weight = np.zeros((10, 2))
+    weight[6:] = 1.0  # nothing to be minimised before step 5 but the future
+    z, u = np.zeros((10, 3)), np.zeros((9, 1))
+    for task in (fast, slow):
+        task = replace(task, state_weight=np.zeros((10, 2)))
+        assert task.system.backward(task, z, u, zero).failed_at == 8
+        bad = z.copy()
+        bad[4] = np.nan
+        found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
+        assert found.failed_at >= 0

@@ -15,10 +15,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.blame import ENOUGH, fewest, loss, still
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
-from grounded.policy import Policy
-from grounded.task import Task
-from grounded.utility import Reward
-from small_tasks import DT, pushed_cart
+from small_tasks import DT, plain_task, pushed_cart
 
 
 def random_filter(rng, L=4, B=2, n=2):
@@ -203,33 +200,14 @@ def test_the_document_is_plain_json():
 def test_a_probe_tells_two_explanations_apart():
     model, trials = pushed_cart(dead=0.1, steps=60, trials=3)
     H = 100
-    task = Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((H + 1, 2)),
-        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-1.0]),
-        high=np.array([1.0]),
-    )
+    task = plain_task(model, DT, np.zeros((H + 1, 2)), 1.0, 1.0)
     found = diagnose(task, trials)
     tied = replace(
         found,
         verdict=replace(found.verdict, effects=("dead_zone:u",)),
         indistinguishable=(("dead_zone:u", found.ranking[1].effect),),
     )
-    base = Policy(
-        feedforward=0.3 * np.ones((H, 1)),
-        low=task.low,
-        high=task.high,
-        dt=DT,
-        state_names=model.state_names,
-        input_names=model.input_names,
-        depths=(1,),
-        angles=(False, False),
-        past=np.zeros(1),
-    )
+    base = task.policy(0.3 * np.ones((H, 1)), None, None)
     best = probe(task, base, tied, trials)
     assert best is not None
     assert best.expected > 3

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Reward, Task, Trial
+from grounded import Model, Param, Trial
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import one_thing
@@ -22,6 +22,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
+from small_tasks import plain_task
 
 worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
 
@@ -55,13 +56,7 @@ def runs(gain, trials=4, steps=200, wave=0.0, noise=1.0, alike=False):
 
 
 def task(model, steps=200):
-    zero = np.zeros(2)
-    reward = Reward(np.ones(2), zero, np.zeros(1), np.zeros(1))
-    limits = {"low": np.array([-2.0]), "high": np.array([2.0])}
-    target = np.zeros((steps + 1, 2))
-    return Task(
-        model=model, dt=0.05, target=target, reward=reward, start=zero, past=np.zeros(1), **limits
-    )
+    return plain_task(model, 0.05, np.zeros((steps + 1, 2)), 1.0, 2.0)
 
 
 @worse

@@ -19,8 +19,7 @@ from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.places import body_velocity
 from grounded.search.planner import planner_with
-from grounded.task import Task
-from grounded.utility import Reward
+from small_tasks import plain_task
 
 DT, FINE = 0.1, 20
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
@@ -112,17 +111,7 @@ def hypothesis(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Hyp
 
 def adopted(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Model:
     """The model that plans with these effects."""
-    one, two = np.ones(model.n), np.ones(model.m)
-    task = Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((11, model.n)),
-        reward=Reward(one, one, two, two),
-        start=np.zeros(model.n),
-        past=np.zeros(2),
-        low=-two,
-        high=two,
-    )
+    task = plain_task(model, DT, np.zeros((11, model.n)), 1.0, 1.0, terminal=1.0, effort=1.0)
     return planner_with(task, parts).plan.model
 
 

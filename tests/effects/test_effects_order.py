@@ -11,9 +11,8 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
 from grounded.effects.memory import shifted
 from grounded.models.car import model as car
-from grounded.task import Task
-from grounded.utility import Reward
 from grounded_trials.workspace.adopted import in_order, planner_of
+from small_tasks import plain_task
 
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})
@@ -36,16 +35,9 @@ def commands():
 
 
 def task():
-    return Task(
-        model=car,
-        dt=DT,
-        target=np.zeros((STEPS + 1, car.n)),
-        reward=Reward(np.ones(car.n), np.ones(car.n), np.ones(2), np.ones(2)),
-        start=np.full(car.n, 0.1),
-        past=HELD,
-        low=np.array([-1.0, -1.0]),
-        high=np.array([1.0, 1.0]),
-    )
+    rest = {"start": np.full(car.n, 0.1), "past": HELD}
+    weights = dict.fromkeys(("terminal", "effort", "change"), 1.0)
+    return plain_task(car, DT, np.zeros((STEPS + 1, car.n)), 1.0, 1.0, **weights, **rest)
 
 
 def hypothesis(parts, model=car):

@@ -8,9 +8,8 @@ from grounded.model import Model, Param
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.solve.measured import measured_gains
-from grounded.task import Task
-from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of
+from small_tasks import plain_task
 
 
 def roll(s, a, p):
@@ -26,17 +25,8 @@ def lagging():
         params={"inertia": Param(0.01, "kg m^2")},
         derivative=roll,
     )
-    H = 80
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.tile([1.0, 0.0], (H + 1, 1)),
-        reward=Reward(np.array([10.0, 0.0]), np.array([100.0, 1.0]), np.array([1e-4]), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-20.0]),
-        high=np.array([20.0]),
-    )
+    target, ends = np.tile([1.0, 0.0], (81, 1)), [100.0, 1.0]
+    task = plain_task(model, 0.02, target, [10.0, 0.0], 20.0, terminal=ends, effort=1e-4)
     return planner_of(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
 
 

@@ -10,9 +10,7 @@ from grounded.policy import Policy
 from grounded.search.feedback.margin import AGES, worse_costs
 from grounded.search.improve import SearchOptions, propose
 from grounded.search.planner import Planner, planner_with, predicted
-from grounded.task import Task
-from grounded.utility import Reward
-from small_tasks import speed_rover, speed_rover_task
+from small_tasks import plain_task, speed_rover, speed_rover_task
 
 LATE = [
     ("rate_limit:linear", {"r": 0.7}),
@@ -30,16 +28,8 @@ def joint(effects: list[tuple[str, dict[str, float]]], change: float) -> Planner
         derivative=lambda s, a, p: {"q": s.w, "w": 10.0 * a.tau + 0.0 * s.q},
     )
     way = np.clip(0.02 * np.arange(101), 0.0, 1.0)
-    task = Task(
-        model=model,
-        dt=0.01,
-        target=np.column_stack([way * way * (3 - 2 * way), np.full(101, np.nan)]),
-        reward=Reward(np.array([1.0, 0.0]), np.zeros(2), np.zeros(1), np.array([change])),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-5.0]),
-        high=np.array([5.0]),
-    )
+    target = np.column_stack([way * way * (3 - 2 * way), np.full(101, np.nan)])
+    task = plain_task(model, 0.01, target, [1.0, 0.0], 5.0, change=change)
     return planner_with(task, effects)
 
 
