@@ -230,3 +230,9 @@ def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path
         read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
     saved = recover_log(path, tmp_path / "saved.mcap")
     assert saved.messages == {"/t": 2} and not saved.complete
+
+
+def test_a_setting_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SECONDS, "much")
+    with pytest.raises(GroundedError, match="'much'"):
+        within("a.log", 0, divided)

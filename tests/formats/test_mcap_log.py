@@ -21,6 +21,7 @@ from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.schemas import parse_protobuf, struct_of
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+from rewriting import with_metadata
 
 
 def a_trial(steps: int = 40, seed: int = 0) -> Trial:
@@ -207,3 +208,56 @@ def test_our_own_definitions_are_known_without_the_library(
     found = struct_of(Schema(1, "grounded.State", "protobuf", data))
     assert found.name == wanted.name
     assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]
+
+
+def test_a_live_trial_on_a_full_disk_says_so() -> None:
+    class Full(io.BytesIO):
+        def write(self, data: object) -> int:
+            if self.tell() > 3000:
+                raise OSError(28, "ENOSPC, full disk")
+            return super().write(data)  # type: ignore[arg-type]
+
+    writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
+    with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
+        for k in range(1000):
+            writer.append(k * 0.1, np.zeros(1), np.zeros(1))
+    with pytest.raises(GroundedError, match="expected 1 numbers"):
+        writer.append(0.0, np.zeros(2), None)
+
+
+NASTY = ["", "x", "-1", "0", "1e999", "nan", "inf", "null", "[]", "{}", "[[[1]]]", "[1e999, 2]"]
+
+
+@pytest.mark.parametrize("value", [None, *NASTY])
+def test_a_strangers_metadata_is_read_or_refused_with_a_message(value: str | None) -> None:
+    trial = trial_bytes(a_trial(4), {})
+    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
+    candidate = with_metadata(candidate, "sha256", None)  # else it alone would refuse everything
+    for key in ("dt", "states", "inputs", "candidate", "start_inputs", "start_ns"):
+        try:
+            found, _, _ = read_trial(with_metadata(trial, key, value))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert found.steps == 4 and found.dt > 0
+    table = json.loads(read_candidate(candidate)[3]["policy"])
+    for key in ("dt", "states", "inputs", "steps", "policy", *table):
+        changed = value
+        if key in table:
+            try:
+                inner = {**table, key: json.loads(value or "null")}
+            except (ValueError, RecursionError):
+                continue
+            key, changed = "policy", json.dumps(inner)
+        try:
+            policy, _, _, _ = read_candidate(with_metadata(candidate, key, changed))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert policy.horizon == 20 and np.isfinite(policy.feedforward).all()
+
+
+def test_a_candidate_that_lost_its_end_is_refused() -> None:
+    candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
+    with pytest.raises(GroundedError, match=holding("21 steps", "21 messages")):
+        read_candidate(with_metadata(candidate, "steps", "21"))

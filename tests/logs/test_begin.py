@@ -1,6 +1,8 @@
 """A workspace from somebody else's log: what is found, what is asked, and that it then works."""
 
 import json
+import math
+import re
 
 import numpy as np
 import pytest
@@ -736,3 +738,80 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     assert made.code == 0, made.err
     model = Workspace(tmp_path / "w").base_model
     assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
+
+
+def test_a_robot_in_the_plane_without_commands(tmp_path):
+    bag = data("mcap_format_fixtures") / "evo" / "nav2_turtlebot_SIM.mcap"
+    found = begin(tmp_path / "w", bag)
+    assert found.kind == "rover" and all(g.sure for g in found.states)
+    assert found.states[1].path == "/odom.twist.twist.angular.z"
+    assert not any(g.path for g in found.inputs)
+
+
+def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):
+    found = begin(tmp_path / "w", swung(linked=False))
+    assert found.kind == "generic" and "pendulum" in found.why
+    assert [g.name for g in found.inputs] == ["u"]
+    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
+
+
+def test_a_velocity_ends_at_rest_on_a_path_with_hold():
+    point = Model(
+        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
+        inputs={"ax": "m/s^2", "ay": "m/s^2"},
+        roles={"position": ("x", "y")},
+        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
+    )
+    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
+    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
+    for place, rate in (("x", "vx"), ("y", "vy")):
+        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
+        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
+    assert (columns["side"] == 0).all()  # moves nothing
+    with pytest.raises(GroundedError, match="--hold"):
+        path_target("circle", Drive(), point, 0.02, to)
+
+
+def test_a_swing_up_does_not_hold_the_rate_of_its_angle():
+    from grounded.models.pendulum import model
+
+    angle, rate = model.state_names
+    assert swing_up(model, 0.02, 2.0, {angle: math.pi})
+    with pytest.raises(GroundedError, match=rate):
+        swing_up(model, 0.02, 2.0, {rate: 0.0})
+
+
+def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    file.write_text(re.sub(r"(?m)^\[safety\]\n(?:\w.*\n)*", "", file.read_text()))
+    file.write_text(file.read_text() + "\n[safety]\nx = [-2.0, 2.0]\n")
+    near = grounded("-C", made.folder, "target", "step", "--to", "x=1.5")
+    far = grounded("-C", made.folder, "target", "step", "--to", "x=60")
+    assert near.code == far.code == 0
+    assert "[safety]" not in near.err and "[safety]" in far.err and "60" in far.err
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [("0.1,1.5", ()), ("{sine:.4f},1.5", ("--inputs", "force"))],
+    ids=["nothing changes", "the input is constant"],
+)
+def test_a_log_in_which_nothing_to_learn_from_changes_is_refused(tmp_path, rows, words):
+    lines = [f"{0.05 * k:.2f},{rows.format(sine=math.sin(k))}" for k in range(100)]
+    (tmp_path / "off.csv").write_text("\n".join(["t,x,force", *lines]) + "\n")
+    done = grounded("init", tmp_path / "w", "--from", tmp_path / "off.csv", *words)
+    assert done.code == 1 and not (tmp_path / "w").exists()
+
+
+def test_a_target_on_another_grid_leads_to_the_command_that_resamples_it(tmp_path):
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    before = read_target(made.folder / "target.csv")[1]
+    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
+    with pytest.raises(GroundedError) as refused:
+        Workspace(made.folder).propose()
+    then = refused.value.then
+    assert grounded("-C", made.folder, then.verb, *then.arguments).code == 0
+    np.testing.assert_allclose(read_target(made.folder / "target.csv")[1][::2], before, atol=1e-9)
+    assert grounded("-C", made.folder, "propose").code == 0

@@ -12,9 +12,13 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.formats.tables import npz_records
 from grounded_trials.formats.text_tables import column_units, table_remarks
 from grounded_trials.logs.inspection.inspect_log import inspect_log
+from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from workspaces import make
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000
 TIME = np.arange(N) * DT
@@ -309,3 +313,20 @@ def test_zstd_files_of_any_log(tmp_path):
     packed = tmp_path / "log.csv.zst"
     packed.write_bytes(zstandard.compress(plain.read_bytes()))
     assert inspect_log(packed).messages == N
+
+
+def test_an_exported_candidate_is_no_log(cart_candidate):
+    folder, file = cart_candidate
+    with pytest.raises(GroundedError, match=r"best\.npz is an exported candidate, c0001"):
+        list(npz_records(file))
+    for k in range(4):
+        (folder / f"drive{'abcd'[k]}.csv").write_text("t,x\n0,0\n")
+    with pytest.raises(GroundedError, match="newest of the 4 logs"):
+        log_files(folder / "another.csv")
+
+
+@pytest.fixture
+def cart_candidate(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    w.export(w.propose().candidate.id, tmp_path / "best.npz", form="npz")
+    return tmp_path, tmp_path / "best.npz"

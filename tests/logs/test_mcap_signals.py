@@ -289,3 +289,16 @@ def test_reading_takes_memory_for_what_is_mapped_only(tmp_path: Path) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found["u"].t) == 200 and peak < 20e6  # of a file of 200 MB
+
+
+def test_what_a_person_is_told(tmp_path: Path) -> None:
+    path = floats(tmp_path / "a.mcap", 0, 10)
+    refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")
+    refused(path, SignalSpec("/u.datum"), "has no field 'datum': did you mean 'data'?")
+    refused(path, SignalSpec("/u.data"), 'no header stamp; set clock = "log"')
+    refused(path, SignalSpec("/u"), "it ends at a std_msgs/Float32; add one of its fields: data")
+    refused(path, SignalSpec("/u.data.@jaw", "log"), "no function '@jaw'")
+    refused(tmp_path / "no.mcap", U, "does not exist")
+    refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u': none is defined")
+    (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
+    refused(tmp_path / "c.mcap", U, "`recover` saves")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cli import grounded
+from cli import grounded, plain
 from facts import holds
 from reported import cart, copied
 from shared_data import DATA, needs_data
@@ -84,3 +84,16 @@ def test_what_is_no_log_is_said_to_be_none(tmp_path):
     assert folder.code == 1 and "is a folder" in folder.err
     nowhere = grounded("recover", tmp_path / "nowhere.mcap")
     assert nowhere.code == 1 and "nowhere.mcap" in nowhere.err
+
+
+def test_a_sound_file_is_called_so(trial, tmp_path):
+    done = grounded("recover", trial, "-o", tmp_path / "s.mcap")
+    assert done.code == 0 and str(trial) in done.out and not done.err
+
+
+def test_a_candidate_is_written_again_rather_than_repaired(cart, tmp_path):
+    path = copied(cart, tmp_path / "w") / "candidates" / "c0001.mcap"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-500])
+    done = grounded("recover", path)
+    assert done.code == 3 and re.search("^next: grounded propose", plain(done.out), re.M)

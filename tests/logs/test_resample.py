@@ -259,3 +259,59 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
         return
     times = 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)
+
+
+def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
+    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
+    assert not grid(reset, command(0.5)).start_states  # seven samples after it
+    told = grid(reset, command(0.9)).start_states
+    assert told["x"] == pytest.approx(0.0, abs=0.03)
+
+
+def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
+    def slow(s: Series) -> Series:
+        t = EPOCH + 1000 * (s.t - EPOCH)
+        return replace(s, t=t, log_times=t)
+
+    with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
+        grid(slow(pose(np.sin)), slow(command()))
+
+
+def test_a_skew_that_matters_is_said() -> None:
+    x = pose(np.sin)
+    skewed = replace(x, log_times=x.log_times + 300_000_000)
+    found = grid(skewed)
+    assert found.reports[0].skew_s == pytest.approx(-0.3)
+    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
+
+
+def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
+    later = pose(np.sin)
+    later = replace(later, t=later.t + 20 * 10**9, log_times=later.log_times + 20 * 10**9)
+    seldom = command(0.0, 0.3)
+    assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
+    with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
+        grid(later, command())
+
+
+def test_a_sample_far_outside_everything_else_is_told() -> None:
+    def spiked(t: np.ndarray) -> np.ndarray:
+        y = np.sin(t)
+        y[len(y) // 2] = 1e4
+        return np.asarray(y)
+
+    assert any("'x'" in text and "1e+04" in text for text in grid(pose(spiked)).warnings)
+    stepped = grid(pose(lambda t: np.where(t > 1.0, 500.0, np.sin(t))))
+    assert not any("far outside" in text for text in stepped.warnings)
+
+
+def test_a_state_that_vanishes_half_way_is_told() -> None:
+    whole, part = pose(np.sin), pose(np.cos)
+    n = len(part.t) // 2
+    cut = {name: getattr(part, name)[:n] for name in ("t", "values", "log_times")}
+    half = replace(part, **cut)
+    signals = {"x": whole, "v": half, "u": command()}
+    found = to_grid(signals, 0.05, ["x", "v"], ["u"])
+    assert any("'v'" in text for text in found.warnings)
+    found = to_grid(signals | {"v": part}, 0.05, ["x", "v"], ["u"])
+    assert not any("'v'" in text for text in found.warnings)
