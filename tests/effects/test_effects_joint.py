@@ -1,6 +1,7 @@
 """What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.effects.joint import FAMILIES, has_viscous, pairs_of
+from grounded.effects.joint import FAMILIES, has_viscous, like_a_load, pairs_of
 from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -266,3 +267,20 @@ def test_a_mujoco_model_finds_mujocos_own_friction():
     assert found.ranking[0].params["c"].value == pytest.approx(0.5, rel=0.05)
     assert not found.preflight  # its own half step is no sensor's delay
     assert not any(name.startswith("sensor_") for name in found.effects)
+
+
+def test_gains_of_several_joints_of_an_arm_are_like_a_load():
+    (tau, w), (other, _) = (pair.split("<-") for pair in PAIRS)
+    known = replace(arm, params={"m2": Param(1.0, "kg")})
+    assert like_a_load(known, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
+    gains = [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"]
+    assert like_a_load(known, gains)
+    assert not like_a_load(known, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
+    assert not like_a_load(arm, gains)  # its mass was free beside them
+    load = replace(
+        arm,
+        params={"m2": Param(1.0, "kg"), "load": Param(0.0, "kg", std=0.3)},
+        derivative=lambda s, a, p: dynamics(s, a, SimpleNamespace(m2=p.m2 + p.load)),
+    )
+    assert not like_a_load(load, gains)  # nor one that is zero in the model
+    assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])

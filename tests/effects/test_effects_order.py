@@ -162,3 +162,23 @@ def test_what_is_wrapped_last_acts_first():
     families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
     assert acting_order(families) == [1, 3, 0]
     assert wrapping_order(families) == [2, 0, 3, 1]
+
+
+def test_the_memory_of_a_trial_follows_what_arrives():
+    planner = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)])
+    trial = Trial(
+        predicted((LIMIT, PART)),
+        commands(),
+        DT,
+        car.state_names,
+        car.input_names,
+        start_inputs=HELD,
+    )
+    states, plan = planner.lift(trial).states, planner.plan
+    received = np.stack(
+        [shifted(commands()[None, :, j], HELD[[j]], plan.latency[j] / DT)[0] for j in range(2)],
+        axis=1,
+    )
+    after = plan.model.system.step(states[:-1], received, plan.model.values, DT)
+    np.testing.assert_allclose(after[:, car.n :], states[1:, car.n :], atol=1e-9)
+    np.testing.assert_allclose(after, states[1:], atol=0.01)  # the model takes the limit's mean

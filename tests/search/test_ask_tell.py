@@ -1,5 +1,6 @@
 """The public Python API: the ask-and-tell search, and results shown in a notebook."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -216,3 +217,15 @@ def test_an_attribute_error_of_the_users_own_program_stays_what_it_is():
         gr.learn(TASK, lambda candidate: candidate.id.horizon)
     with pytest.raises(AttributeError, match="no attribute 'colour'"):
         gr.learn(TASK, lambda candidate: candidate.colour)
+
+
+def test_results_are_one_line_a_table_and_a_document(search):
+    fitted = gr.fit(TASK, search.trials[:1], ["gain"])
+    found = [search.standing, search.best, search.best.candidate, search.proposal, fitted]
+    for result in found:
+        shown = repr(result)
+        assert "\n" not in shown and len(shown) < 120 and type(result).__name__ in shown
+        assert "<table>" in result._repr_html_()
+        assert json.loads(json.dumps(result.to_json(), allow_nan=False)) == result.to_json()
+    assert search.best.candidate.id in repr(search.standing)
+    assert len(repr(search)) < 80

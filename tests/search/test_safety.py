@@ -7,7 +7,7 @@ import pytest
 
 from grounded.search.candidate import Tried
 from grounded.search.improve import propose
-from grounded.search.safety import MAX_GAIN, objections, spread
+from grounded.search.safety import MAX_GAIN, coasting, coasts_out, objections, spread
 from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
 from small_tasks import cart_task
@@ -84,3 +84,44 @@ def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
         step = replace(made, base="c0001", way=way)
         history = [Tried(step, (ran,), (-1.0,), True)]
         assert spread(task, history, model).size[:, 0].max() == pytest.approx(expected)
+
+
+def test_the_run_that_most_of_the_spread_comes_from_is_named(made):
+    task = cart_task(safety_low=np.full(2, -1.4), safety_high=np.full(2, 1.4))
+    names = task.model.state_names, task.model.input_names
+
+    def ran(off: float, trial: str) -> Trial:
+        states = made.predicted_states + np.array([off, 0.0])
+        return Trial(states, made.predicted_inputs, task.dt, *names, id=trial)
+
+    def told(candidate, *trials) -> str:
+        tried = Tried(candidate, trials, (-1.0,) * len(trials), True)
+        return objections(task, made, spread(task, [tried], made.model))[0]
+
+    step = replace(made, base="c0001", way="")
+    assert "t0005" in told(step, ran(1.4, "t0005"))
+    repeated = ran(0.0, "t0001"), ran(3.0, "t0002"), ran(0.0, "t0003")
+    first = replace(made, base="")
+    assert "t0002" in told(first, *repeated)
+    assert "t000" not in told(first, *repeated[:2])  # either may be the one that was disturbed
+    far = replace(made, predicted_states=made.predicted_states + 2.0)  # the plan itself leaves
+    tried = Tried(step, (ran(1.4, "t0005"),), (-1.0,), True)
+    assert "t0005" not in objections(task, far, spread(task, [tried], made.model))[0]
+
+
+def test_who_coasts_out_of_safety_after_a_run_is_found(made):
+    task, run = cart_task(latency=np.array([0.1])), made.predicted_run
+    states = np.array(run.states)
+    states[-1] = 1.0, 2.0
+    run = replace(run, states=states)
+    moved = coasting(task, run, np.zeros(1))
+    assert (moved[0] == states[-1]).all()
+    assert np.all(np.diff(moved[:, 0]) > 0)  # it keeps rolling
+    pushed = coasting(cart_task(), run, np.zeros(1))
+    assert run.inputs[-1] != 0 and moved[2, 1] != pushed[2, 1]  # commands under way still arrive
+    bound = np.array([moved[10, 0], np.inf])
+    tight = cart_task(safety_low=-np.full(2, np.inf), safety_high=bound)
+    assert coasts_out(tight, task, run, np.zeros(1)) != ""
+    wide = cart_task(safety_low=-np.full(2, np.inf), safety_high=np.array([99.0, np.inf]))
+    assert coasts_out(wide, task, run, np.zeros(1)) == ""
+    assert coasts_out(cart_task(), task, run, np.zeros(1)) == ""

@@ -118,3 +118,13 @@ def test_noise_that_gains_carry_is_told_from_a_limit_cycle(cycle):
     shaken = np.convolve(rng.normal(0, 0.12, T + 2), [0.3, 0.5, 0.3], "valid")
     moves = 0.2 * np.sin(0.7 * np.arange(T)) + 0.3 * shaken if cycle else 1.6 * shaken
     assert periodic(moves) == cycle
+
+
+def test_only_stronger_feedback_is_a_risk(told):
+    history = told.ran((-1.0, -9.0), (0.3, -20.0))
+    found = quiet_gains(told.task, history)
+    loud, gentle = (tried.candidate for tried in history)
+    assert found.risk(gentle) == ""
+    policy = replace(loud.policy, gain=1.5 * loud.policy.gain)
+    assert found.risk(loud) and found.risk(replace(loud, id="c0003", policy=policy))
+    assert quiet_gains(told.task, history, "another model") is None
