@@ -453,18 +453,6 @@ def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
     assert found["pitch_rate"].path.endswith("tilt_rate")
 
 
-def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
-    model = tmp_path / "cart.py"
-    model.write_text(workspaces.MODEL)
-    found = begin(tmp_path / "w", swung("aa,cart_vel,force"), model=model)
-    assert [g.path for g in found.states] == ["/csv.aa", "/csv.cart_vel"]
-    assert (
-        not begin(tmp_path / "n", swung("aa,cart_vel,force", linked=False), model=model)
-        .states[0]
-        .path
-    )
-
-
 # targets
 
 

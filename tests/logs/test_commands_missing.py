@@ -70,17 +70,6 @@ def test_ingest_refuses_an_input_on_the_path_of_a_state(tmp_path, model):
         Workspace(tmp_path / "w").ingest(log, data=True)
 
 
-def test_a_renamed_topic_names_all_that_is_read_from_it(tmp_path, model):
-    begin(tmp_path / "w", excavator(tmp_path / "bag"), model=model)
-    renamed = excavator(tmp_path / "renamed", topic="/arm/joint_states")
-    with pytest.raises(GroundedError) as refused:
-        Workspace(tmp_path / "w").ingest(renamed, data=True)
-    told = str(refused.value)
-    assert "boom, stick, boom_rate and stick_rate are read from /joint_states" in told
-    assert "renamed to /arm/joint_states, edit their paths in [log]" in told
-    assert refused.value.then.verb == "inspect"
-
-
 def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
     begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
     assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}

@@ -114,43 +114,6 @@ def test_the_foxglove_sdk(tmp_path: Path) -> None:
     assert gridded.reports[0].skew_s == pytest.approx(-0.005)
 
 
-def test_rosbags_bags_with_a_message_of_ones_own(tmp_path: Path) -> None:
-    rosbag2 = pytest.importorskip("rosbags.rosbag2")
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    text = "std_msgs/Header header\nstring joint\nfloat32[] current\ngeometry_msgs/Vector3 force"
-    store.register(get_types_from_msg(text, "robot/msg/Motor"))
-    make = store.types
-    folder = tmp_path / "bag"
-    options = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
-    with rosbag2.Writer(folder, **options) as writer:
-        connection = writer.add_connection("/motor", "robot/msg/Motor", typestore=store)
-        for i in range(300):
-            stamp = make["builtin_interfaces/msg/Time"](sec=i // 100, nanosec=i % 100 * 10**7)
-            body = make["robot/msg/Motor"](
-                header=make["std_msgs/msg/Header"](stamp=stamp, frame_id="f" * (i % 7)),
-                joint="left" if i % 2 else "right",
-                current=np.arange(i % 5, dtype=np.float32) + i,
-                force=make["geometry_msgs/msg/Vector3"](x=3.0, y=4.0, z=float(i)),
-            )
-            writer.write(connection, i * 10**7 + 77, store.serialize_cdr(body, "robot/msg/Motor"))
-    found = read_signals(
-        folder,
-        {
-            "left": SignalSpec('/motor{joint=="left"}.force.z'),
-            "last": SignalSpec("/motor.current[-1]"),
-            "norm": SignalSpec("/motor.force.@norm"),
-        },
-    )
-    i = np.arange(300)
-    assert found["left"].values.tolist() == i[1::2].tolist()
-    assert found["left"].t.tolist() == (i[1::2] * 10**7).tolist()
-    wanted = [k + k % 5 - 1 for k in i.tolist() if k % 5]
-    assert found["last"].values.tolist() == wanted and found["last"].messages == 300
-    np.testing.assert_allclose(found["norm"].values, np.hypot(5, i))
-
-
 def test_ros1_in_mcap(tmp_path: Path) -> None:
     text = "Header header\nfloat64 v\n" + "=" * 80 + "\nMSG: std_msgs/Header\n"
     text += "uint32 seq\ntime stamp\nstring frame_id\n"

@@ -94,17 +94,6 @@ def test_promises_are_counted_for_each_model():
     assert adopted.broken and not original.broken and not Promises().broken
 
 
-def test_a_loss_that_scatter_may_explain_breaks_no_promise():
-    best = step("c1", "", "better", float("nan"), 0.0, runs=(-0.86, -0.72))
-    lost = step("c2", "c1", "better", 0.21, -0.87, accepted=False)
-    adopted, _ = promises((best, lost), "better")
-    assert adopted.share < 0 and not adopted.broken
-    sure = step("c1", "", "better", float("nan"), 0.0, runs=(-0.7901, -0.7899))
-    assert promises((sure, lost), "better")[0].broken
-    again = [step(f"c{k}", "c1", "better", 0.21, -0.95, accepted=False) for k in range(2, 7)]
-    assert promises((best, *again), "better")[0].broken  # five such losses are no bad luck
-
-
 def test_a_run_that_was_stopped_on_its_path_broke_no_promise():
     task, target = CASES["cart"]
     plant, options = Plant(other(task.model, 1.3)), SearchOptions()

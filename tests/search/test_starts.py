@@ -81,19 +81,6 @@ def test_a_worse_candidate_that_began_off_is_run_twice_and_loses(story):
     assert [c.id for c in losers_of(now.history, "c0001", PLANNER.fingerprint)] == ["c0002"]
 
 
-def test_starts_that_agree_and_models_that_cannot_tell_leave_the_papers_rule(story):
-    """Runs that all begin 0.1 m off are compared as they are."""
-    story.trials.clear()
-    story.run(0, OFF)
-    now = story.run(1, OFF, worse=3.0)
-    assert now.history[1].excused(now.history[0]) == 0.0
-    assert now.history[1].to_settle in ("", "c0001")
-    blind = standing(TASK, *story.both, story.options, PLANNER.fingerprint)
-    assert [t.verdict() for t in blind.history] == [t.verdict() for t in now.history]
-    again = Story(rerun_incumbent=False)
-    assert again.run(1, OFF).history[1].accepted is False
-
-
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
     policy = story.candidates[1].policy
     late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])

@@ -10,7 +10,6 @@ import pytest
 
 from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
-from grounded.search.candidate import Candidate
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker, begun_at
@@ -54,14 +53,6 @@ def noisy():
     now = standing(task, candidates, trials, OPTIONS, fingerprint)
     about = About(Maker(planner, now, "c0099", fingerprint), now.incumbent, OPTIONS, "")
     return SimpleNamespace(task=task, plant=plant, now=now, about=about, planner=planner)
-
-
-def test_a_candidate_says_that_it_may_well_lose():
-    fields = dict.fromkeys(("id", "policy", "base", "model", "predicted_states"), "")
-    fields |= {"iteration": 1, "alpha": 1.0, "predicted_inputs": "", "predicted_utility": -1.0}
-    made = Candidate(**fields, predicted_gain=0.1)
-    assert not made.doubtful and not replace(made, likely_off=0.05).doubtful
-    assert replace(made, likely_off=0.2).doubtful
 
 
 @pytest.mark.slow

@@ -128,34 +128,6 @@ def assert_same_runs(found, expected):
         np.testing.assert_allclose(one.inputs, other.inputs, atol=1e-8)
 
 
-def test_doubt_is_a_cost_with_the_derivatives_of_its_steps(grounded):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, others = turning(own, 3)
-    told = Told.by(others, own, problem)
-    law, R = told.law(0.1), told.doubt(0.1, worth(own, problem))
-    parts = (problem.system, law, own.x, own.u, own.before)
-    plain, cautious = Corrected(*parts), Corrected(*parts, R)
-    policy = best.candidate.policy
-    there = predicted(cautious.on(problem), policy)
-    assert there.utility == pytest.approx(predicted(plain.on(problem), policy).utility)
-    moved = replace(policy, feedforward=policy.feedforward + 0.1)
-    runs = [predicted(system.on(problem), moved) for system in (plain, cautious)]
-    d = np.hstack([runs[0].states[:-1, :2] - own.x, runs[0].inputs - own.u])
-    price = np.sum(np.einsum("tpq,tq->tp", R, d) ** 2)
-    assert runs[0].utility - runs[1].utility == pytest.approx(price)
-    assert price > 0
-
-    rng, dt = np.random.default_rng(1), problem.dt
-    x = 0.1 * rng.standard_normal((len(own.x), cautious.n))
-    u = own.u + 0.1 * rng.standard_normal(own.u.shape)
-    F, G = cautious.linearise(x, u, problem.p, dt)
-    dx, du = 1e-6 * rng.standard_normal(x.shape), 1e-6 * rng.standard_normal(u.shape)
-    change = cautious.step(x + dx, u + du, problem.p, dt) - cautious.step(x, u, problem.p, dt)
-    told_by = np.einsum("tij,tj->ti", F, dx) + np.einsum("tij,tj->ti", G, du)
-    np.testing.assert_allclose(change, told_by, atol=1e-9)
-
-
 def losing(search: Search, count: int, **changes: object) -> list[Tried]:
     """Return the history with steps from the best one that lost, their runs a little off."""
     now = search.standing

@@ -32,9 +32,3 @@ def test_failures_damp_first_and_halve_then():
         (MOST, 0.5),
         (MOST, 0.25),
     ]
-
-
-def test_a_damping_is_written_as_in_the_table_of_status():
-    """`propose`, the page and `status` show the same number, 100 rather than 1e+02."""
-    texts = [str(Step(damping)) for damping in (1.0, 33.3, 100.0, 1000.0)]
-    assert [text.partition("damping ")[2] for text in texts] == ["1.0", "33", "100", "1,000"]
