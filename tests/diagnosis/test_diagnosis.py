@@ -9,10 +9,13 @@ import pytest
 
 from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.report import Ranked
 from grounded.diagnosis.validation.blame import ENOUGH, fewest, loss, still
+from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from small_tasks import DT, plain_task, pushed_cart
@@ -233,3 +236,29 @@ def test_the_diagnosis_does_not_reach_the_simulated_truth():
         " 'grounded.experiments', 'grounded.challenge'))]; assert not bad, bad"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("most", "error", "more"),
+    [(3, 0.056, 5), (6, 0.056, 8), (11, 0.056, 12), (12, 0.056, 0), (2, 0.056, 0), (3, 0.033, 0)],
+)
+def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_for(
+    most, error, more
+):
+    claimed = [f"viscous_friction:{k}" for k in range(max(most, 3))]
+    rows = tuple(Ranked(name, {}, {}, 50.0, claimed=True) for name in claimed)
+    claims = SimpleNamespace(
+        known=SimpleNamespace(no_cause=False),
+        blamed=(),
+        moved=(),
+        names=claimed,
+        data=SimpleNamespace(model=pendulum),
+        with_rivals=dict,
+        one_clock=(),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        parameters=dict,
+    )
+    credit = (Credit("calibration", 1.0),)
+    left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
+    found = verdict(claims, rows, (), left, (), credit, most=most)
+    assert found.look_for == more and found.again is (most == MOST_EFFECTS)

@@ -13,7 +13,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Effect, Library, scales_of, wrapping_order
+from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.effects.medium import turning
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -278,3 +278,26 @@ def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]
     assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
+
+
+def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
+    model = adopted(CURRENT)
+    data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
+    found = Predictor(data).next(h, data.y[:-1])
+    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
+    for both in (adopted(CURRENT, DRAG), adopted(DRAG, CURRENT), joined(DRAG, model)):
+        want = both.system.step(x, u, both.values, DT)
+        np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+
+
+def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
+    """The model with one more effect."""
+    name, values = part
+    return wrap(Library().effect(name, model), values, DT)
+
+
+@pytest.mark.slow
+def test_none_is_claimed_in_still_water():
+    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(steps=100))
+    told = ("current", "push_world", "coriolis")
+    assert not {n for n in found.verdict.effects if n.startswith(told)}
