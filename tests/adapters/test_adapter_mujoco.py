@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,9 @@ from grounded.adapters import mujoco as adapter  # noqa: E402
 from grounded.adapters.beside import beside, recorded  # noqa: E402
 from grounded.adapters.mujoco_files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
-from grounded.adapters.tangent import Coordinates  # noqa: E402
-from grounded.diagnosis.diagnose import diagnose  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
 from grounded.model import Model  # noqa: E402
 from grounded.places import integrals  # noqa: E402
-from grounded.search.ask_tell import Search  # noqa: E402
-from grounded.solve.ddp import solve  # noqa: E402
-from grounded.task import Task  # noqa: E402
-from grounded.trial import Trial  # noqa: E402
-from grounded.utility import Reward  # noqa: E402
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -231,13 +223,6 @@ def test_free_body_turns_on_past_a_full_turn() -> None:
     assert x[0, index("box_z")] == 0.0
 
 
-def test_rotation_vectors_near_zero_and_pi() -> None:
-    r = np.array([[0, 0, 0], [1e-13, 0, 0], [3.0, 0, 0], [0, 0, 7.0]])
-    none = np.zeros(0, int)
-    ball = Coordinates(none, none, (0,), (0,), np.array([0.6, 0.0, 0.8, 0.0]))
-    np.testing.assert_allclose(ball.from_qpos(ball.to_qpos(r), r), r, atol=1e-12)
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
     model = adapter.model(ARM.format(**NOMINAL), threads=threads)
@@ -339,40 +324,6 @@ def test_a_joint_and_its_velocity_are_known_as_such() -> None:
     assert [r.c for r in found] == pytest.approx([1.0, 1.0])
 
 
-@pytest.mark.slow
-def test_a_diagnosis_of_an_adapted_model_finds_the_parameter_that_is_off() -> None:
-    model = adapter.model(PENDULUM, params={"hinge.damping": (0.02, 1.0)})
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.zeros((81, 2)),
-        reward=Reward(np.ones(2), np.zeros(2), np.full(1, 0.01), np.zeros(1)),
-        start=np.array([1.0, 0.0]),
-        past=np.zeros(1),
-        low=np.full(1, -2.0),
-        high=np.full(1, 2.0),
-    )
-    real, rng, trials = model.with_values({"hinge_damping": 0.3}), np.random.default_rng(5), []
-    for _ in range(2):
-        u = np.repeat(rng.uniform(-1, 1, 8), 10)[:, None]
-        x = [task.start]
-        for now in u:
-            x.append(step(real, x[-1], now)[0])
-        noisy = np.array(x) + rng.normal(0, [1e-3, 5e-3], (81, 2))
-        trials.append(
-            Trial(
-                dt=0.02,
-                states=noisy,
-                inputs=u,
-                state_names=model.state_names,
-                input_names=model.input_names,
-            )
-        )
-    found = diagnose(task, trials)
-    assert found.parameters["hinge_damping"].value == pytest.approx(0.3, abs=0.03)
-    assert all("hinge" in name for name in found.verdict.effects)
-
-
 def test_a_control_step_with_the_jitter_of_a_log_is_made_exactly() -> None:
     model, x, u = adapter.model(PENDULUM), [0.3, -0.2], [0.1]
     exact = step(model, x, u, dt=0.05)
@@ -408,49 +359,3 @@ def test_a_model_file_names_its_files_beside_it(
     assert {path for _, path in read} == {robot / "a.xml", robot / "parts" / "drives.xml"}
     (elsewhere / "a.xml").write_text(PENDULUM)
     assert adapter.model("a.xml").input_names == ("motor",), "else in the current folder"
-
-
-def _point_mass(fx: str, fy: str) -> Model:
-    """A mass on two slides, driven along two directions by motors of at most 1 N."""
-    slides = "".join(f'<joint name="{n}" type="slide" axis="{a}"/>' for n, a in AXES)
-    tendons = "".join(
-        f'<fixed name="t{n}"><joint joint="x" coef="{c.split()[0]}"/>'
-        f'<joint joint="y" coef="{c.split()[1]}"/></fixed>'
-        for n, c in (("x", fx), ("y", fy))
-    )
-    motors = "".join(f'<motor name="f{n}" tendon="t{n}" ctrlrange="-1 1"/>' for n, _ in AXES)
-    return adapter.model(
-        '<mujoco><option timestep="0.05" gravity="0 0 0"/><worldbody><body>'
-        f'{slides}<geom type="sphere" size="0.1" mass="1"/></body></worldbody>'
-        f"<tendon>{tendons}</tendon><actuator>{motors}</actuator></mujoco>"
-    )
-
-
-AXES = (("x", "1 0 0"), ("y", "0 1 0"))
-
-
-def _pushed(model: Model, seconds: float, push: float, weight: float) -> Task:
-    """Both axes along an acceleration beyond the motors' limit, for a while."""
-    target = np.full((61, 4), np.nan)
-    speed = 0.05 * np.cumsum(np.where(np.arange(61) * 0.05 < seconds, push, 0.0))
-    target[1:, :2] = (0.05 * np.cumsum(speed))[:-1, None]
-    target[0, :2] = 0.0
-    free, limit = np.zeros(4), np.ones(2)
-    reward = Reward(np.array([10.0, 10.0, 0.0, 0.0]), free, weight * limit, weight * limit)
-    return Task(model, 0.05, target, reward, free, np.zeros(2), -limit, limit)
-
-
-def test_a_plan_that_saturates_upwards_converges():
-    task = _pushed(_point_mass("1 0", "0 1"), 1.5, 1.2, 0.001)
-    found = solve(task.problem(), np.zeros((60, 2)))
-    assert found.status == "converged" and len(found.trace) <= 5
-    assert np.mean(found.u == 1.0) > 0.5 and np.abs(found.K).max() > 1.0
-
-
-def test_a_first_policy_at_the_limits_feeds_back_on_a_robot_with_mixed_axes():
-    task = _pushed(_point_mass("1 0", "0 1"), 0.4, 1.2, 0.001)
-    policy = Search(task).ask().policy
-    real = replace(task, model=_point_mass("0.995 0.0998", "-0.0998 0.995"))
-    problem = real.problem()
-    run = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
-    assert run.cost[0] < 0.2

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from grounded.compile import system_of
 from grounded.compile.run.differenced import RELATIVE_STEP
 from grounded.compile.run.traced import TracedSystem
-from grounded.compile.trace.derivative import carried, jacobian
 from grounded.compile.trace.tracing import Signature, trace
 from grounded.model import Model, Param
-from grounded.models import aircraft
 from problems import SPECS, system
 
 UNARY = {
@@ -179,8 +177,6 @@ def test_a_branch_not_taken_never_leaks_nan():
 
 @pytest.mark.parametrize("eps", [0.0, 0.05])
 def test_what_is_infinitely_steep_at_rest_has_a_slope_there(eps):
-    """A drag by np.hypot(vx, vy) from rest: its slope was 0/0, and the plan a free fall."""
-
     def drag(s, a, p):
         speed = np.hypot(s.x, s.v)
         return {
@@ -212,8 +208,6 @@ def test_smoothing_narrows_to_the_exact_branch():
 
 
 def test_what_depends_on_parameters_alone_is_never_smoothed():
-    """A guard of a time constant is no corner of the run: 40 ms had been planned as 52 ms."""
-
     def lag(s, a, p, dt):
         tau = np.maximum(p.tau, 1e-6)
         sign = np.where(p.tau > 0.03, 1.0, -1.0)
@@ -227,19 +221,3 @@ def test_what_depends_on_parameters_alone_is_never_smoothed():
     assert model.system.linearise(x, u, p, 0.02, 0.05)[1][0, 0, 0] == pytest.approx(
         1 - np.exp(-0.5)
     )
-
-
-def test_elimination_takes_fewer_operations_than_tangents():
-    """A third less on the aircraft, for derivatives in the same places."""
-    found = []
-    for derivatives in (jacobian, carried):
-        traced = trace(aircraft.model.system.signature, None, 1.0)
-        graph, leaves = (
-            traced.graph,
-            [*(("x", i) for i in range(12)), *(("u", j) for j in range(4))],
-        )
-        rows = derivatives(graph, traced.outputs, [graph.leaf(*leaf) for leaf in leaves])
-        nodes = [node for row in rows for node in row.values()]
-        found.append((len(graph.live([*traced.outputs, *nodes])), [sorted(row) for row in rows]))
-    (few, places), (many, same) = found
-    assert few < 0.8 * many and places == same

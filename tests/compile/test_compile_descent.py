@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from grounded.compile import DescentOptions, Problem, system_of
-from grounded.compile.run.arguments import MOST, _shelf, empty
 from grounded.solve.ddp import descended
 from problems import problem
 
@@ -68,20 +67,3 @@ def test_a_sweep_of_an_unstable_model_stays_symmetric_over_a_long_horizon():
     V = solve_discrete_are(A, B, np.eye(2), np.eye(1))
     K = -np.linalg.solve(np.eye(1) + B.T @ V @ B, B.T @ V @ A)
     assert np.allclose(found.K[0, :, :2], K, rtol=1e-7)
-
-
-def test_results_live_in_memory_that_nobody_else_holds():
-    task, other = problem("car", 3000), problem("car", 3000, start=np.full(6, 0.1))
-    u = np.tile([0.1, 0.5], (3000, 1))
-    first = task.system.rollout(task, u)
-    z, view = first.z.copy(), first.z[0, 5:]
-    del first  # the view keeps the memory
-    others = [other.system.rollout(other, u) for _ in range(3)]
-    assert np.array_equal(view, z[0, 5:])
-    assert len({id(run.z.base) for run in others}) == 3
-    del view, others
-    for _ in range(40):  # and what is kept for later is bounded
-        empty((2**20,))[0] = 1.0
-    kept = [empty((2**20,)) for _ in range(40)]
-    del kept
-    assert sum(size * len(blocks) for size, blocks in _shelf.items()) <= MOST

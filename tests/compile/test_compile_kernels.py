@@ -8,16 +8,13 @@ import pytest
 
 from grounded.compile import Problem, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
-from grounded.compile.run import jit
 from grounded.compile.run.compiled import Kernels
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.engine import Engine, each, running
-from grounded.search.planner import planner_with
 from grounded.solve.ddp import solve
 from problems import SPECS, problem
-from small_tasks import scara_task
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -34,9 +31,8 @@ def pair(name, horizon=37, **changes):
 
 def cases():
     for name in sorted(SPECS):
-        for delay in (0.0, 0.4, 1.0, 2.7):
-            for limit in (np.inf, 0.2):
-                yield name, delay, limit
+        for delay, limit in ((0.0, 0.2), (0.4, np.inf), (2.7, 0.2)):
+            yield name, delay, limit
 
 
 @pytest.mark.parametrize(("name", "delay", "limit"), list(cases()))
@@ -148,7 +144,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "m", "dense"),
-    [(1, 1, True), (3, 5, True), (7, 8, False), (16, 4, True), (26, 3, False), (6, 9, True)],
+    [(1, 1, True), (16, 4, True), (26, 3, False), (6, 9, True)],
 )
 def test_sizes_written_out_and_looped(n, m, dense):
     fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
@@ -222,52 +218,6 @@ def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypat
         np.testing.assert_allclose(mine, theirs, **TIGHT)
 
 
-def test_what_is_not_finite_reaches_no_other_derivative():
-    """At x = 0 the log of x has none; y's own, and that of a branch not taken, have theirs."""
-
-    def step(s, a, p, dt):
-        other = np.where(s.y > 0, s.y * s.y, np.log(s.x))
-        return {"x": np.log(s.x) + p.k * s.y, "y": np.maximum(a.u, s.y) + other}
-
-    names = {"states": ("x", "y"), "inputs": ("u",), "params": ("k",)}
-    system = traced(step, kind="step", **names)
-    at = (np.array([[0.0, 2.0]]), np.array([[1.0]]), np.array([3.0]), 0.1)
-    f_x, f_u, f_p = system.sensitivities(*at)
-    assert np.isinf(f_x[0, 0, 0]) and f_x[0, 0, 1] == 3.0 and f_p[0, 0, 0] == 2.0
-    assert f_x[0, 1].tolist() == [0.0, 5.0] and f_u[0].tolist() == [[0.0], [0.0]]
-
-
-def test_a_failed_sweep_names_the_same_step():
-    zero = np.zeros(1)
-    fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
-    weight = np.zeros((10, 2))
-    weight[6:] = 1.0  # nothing to be minimised before step 5 but the future
-    z, u = np.zeros((10, 3)), np.zeros((9, 1))
-    for task in (fast, slow):
-        task = replace(task, state_weight=np.zeros((10, 2)))
-        assert task.system.backward(task, z, u, zero).failed_at == 8
-        bad = z.copy()
-        bad[4] = np.nan
-        found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
-        assert found.failed_at >= 0
-
-
-def test_lanes_fit_the_machine():
-    assert jit.lanes() in (4, 8)
-
-
-@pytest.mark.slow
-def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
-    big = wide(100, 2, True)
-    assert big.system.how == "traced" and "100 states" in big.system.note
-    forty = wide(40, 4, True)
-    assert forty.system.how == "compiled"
-    u = np.zeros((12, 4))
-    with running(Engine(2), copied=False):
-        costs = each(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2)
-    assert costs[0] == costs[1] == solve(forty, u).cost
-
-
 def test_steps_one_after_the_other_are_those_steps():
     from grounded.models.pendulum import model
 
@@ -306,37 +256,16 @@ def test_functions_agree_with_numpy_where_they_branch():
         assert np.allclose(mine, theirs, rtol=1e-14, atol=1e-15)
 
 
-@pytest.mark.parametrize("delays", [(0.0,) * 5, (0.0, 0.4, 2.7, 1.0, 0.0)])
-def test_a_run_by_itself_is_the_run_beside_others(delays):
-    """Of a long model, whose entries are taken four at once, with and without some left over."""
-    for n in (8, 10):
-        fast, slow = (
-            replace(
-                wide(n, 5, True, make, np.inf), delay=np.array(delays), angles=np.arange(n) == 1
-            )
-            for make in (system_of, traced)
-        )
-        u = np.random.default_rng(n).normal(size=(12, 5))
-        start = slow.system.rollout(slow, u)
-        gains = slow.system.backward(slow, start.z[0], u, np.zeros(5))
-        policy = (u, gains.K, start.z[0], gains.k)
-        one = fast.system.rollout(fast, *policy, np.array([0.7]))
-        some = fast.system.rollout(fast, *policy, np.array([0.7, 0.2]))
-        reference = slow.system.rollout(slow, *policy, np.array([0.7]))
-        for a, b, c in zip(*(vars(run).values() for run in (one, some, reference)), strict=True):
-            assert np.allclose(a[0], b[0], **TIGHT) and np.allclose(a[0], c[0], **TIGHT)
-
-
-@pytest.mark.slow
-def test_an_arm_with_six_adopted_effects_is_compiled_with_its_derivatives():
-    """Those were 18,749 operations, more than 14,000: a proposal took 70 s instead of 12 s."""
-    effects = [
-        ("delay:tau1+tau2", {"d": 0.0149}),
-        ("joint_friction:tau1<-w1", {"c": 0.754, "b": 0.314}),
-        ("joint_friction:tau2<-w2", {"c": 0.235, "b": 0.078}),
-        ("added_inertia:tau2<-w2", {"J": 0.0281}),
-        ("input_gain:tau1+tau2", {"g": -0.407}),
-        ("rate_gain:w2", {"g": 0.068}),
-    ]
-    system = planner_with(scara_task(), effects).plan.model.system
-    assert (system.how, system.note) == ("compiled", "")
+def test_a_failed_sweep_names_the_same_step():
+    zero = np.zeros(1)
+    fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
+    weight = np.zeros((10, 2))
+    weight[6:] = 1.0  # nothing to be minimised before step 5 but the future
+    z, u = np.zeros((10, 3)), np.zeros((9, 1))
+    for task in (fast, slow):
+        task = replace(task, state_weight=np.zeros((10, 2)))
+        assert task.system.backward(task, z, u, zero).failed_at == 8
+        bad = z.copy()
+        bad[4] = np.nan
+        found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
+        assert found.failed_at >= 0

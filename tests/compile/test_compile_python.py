@@ -60,35 +60,6 @@ def test_values_unpacked_by_mistake_as_names(rate):
     assert make(sound).step(X, U, P, 0.1).shape == X.shape
 
 
-def test_unknown_name_says_which_line_and_what_was_meant():
-    def dynamics(s, a, p):
-        return {"x": s.velo, "v": a.f}
-
-    with pytest.raises(
-        GroundedError, match=r"test_compile_python.py:\d+.*'velo'.*valid names: x, v"
-    ):
-        make(dynamics).step(X, U, P, 0.1)
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda s, a, p: {"x": s.v}, "missing: v"),
-        (lambda s, a, p: {"x": s.v, "v": a.f, "vv": 0.0}, "'vv', which is not a state.*'v'"),
-        (lambda s, a, p: [s.v, a.f], "must return a dict.*got list"),
-        (lambda s, a, p: {"x": s.v + 1j, "v": a.f}, "one real number for state 'x'.*complex"),
-        (lambda s, a, p: {"x": s.v, "v": np.zeros(3)}, r"array of shape \(3,\)"),
-        (lambda s, a, p: {"x": s.v, "v": None}, "NoneType"),
-        (lambda s, a, p: {"x": s.v, "v": a.f + "1"}, "raised"),
-    ],
-)
-def test_bad_models_name_their_file_and_line(function, message):
-    for rows in (1, 2):
-        with pytest.raises(GroundedError, match=message) as caught:
-            make(function).step(X[:rows], U[:rows], P, 0.1)
-        assert "test_compile_python.py:" in str(caught.value)
-
-
 def test_function_that_does_not_broadcast_runs_sample_by_sample():
     def scalar(s, a, p):
         force = a.f if s.x > 0 else -math.sin(a.f)
@@ -118,14 +89,6 @@ def test_black_box_step_with_any_callable():
         assert np.allclose(make(function, kind="step").step(X, U, P, 0.1), expected)
 
 
-def test_what_leaves_the_finite_numbers_is_nan_not_raised():
-    def overflow(s, a, p):
-        return {"x": math.exp(1000 * s.x), "v": math.sqrt(a.f - 10.0)}
-
-    assert np.isnan(make(overflow).step(X[:1], U[:1], P, 0.1)).all()
-    assert np.isnan(make(overflow).step(np.full((1, 2), np.nan), U[:1], P, 0.1)).all()
-
-
 def test_rk4_is_fourth_order_and_euler_first():
     def rate(s, a, p):
         return {"x": s.v, "v": -s.x}
@@ -148,3 +111,27 @@ def test_derivatives_of_a_linear_model_are_exact():
     assert np.allclose(f_u[:, 1, 0], (1 - decay) / drag / mass, atol=1e-9)
     assert np.allclose(f_p[:, 1, 0], 0.0, atol=1e-9)
     assert not np.allclose(f_p[:, 1, 1], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda s, a, p: {"x": s.v + 1j, "v": a.f}, "one real number for state 'x'.*complex"),
+        (lambda s, a, p: {"x": s.v, "v": np.zeros(3)}, r"array of shape \(3,\)"),
+        (lambda s, a, p: {"x": s.v, "v": None}, "NoneType"),
+        (lambda s, a, p: {"x": s.v, "v": a.f + "1"}, "raised"),
+    ],
+)
+def test_bad_models_name_their_file_and_line(function, message):
+    for rows in (1, 2):
+        with pytest.raises(GroundedError, match=message) as caught:
+            make(function).step(X[:rows], U[:rows], P, 0.1)
+        assert "test_compile_python.py:" in str(caught.value)
+
+
+def test_what_leaves_the_finite_numbers_is_nan_not_raised():
+    def overflow(s, a, p):
+        return {"x": math.exp(1000 * s.x), "v": math.sqrt(a.f - 10.0)}
+
+    assert np.isnan(make(overflow).step(X[:1], U[:1], P, 0.1)).all()
+    assert np.isnan(make(overflow).step(np.full((1, 2), np.nan), U[:1], P, 0.1)).all()

@@ -188,12 +188,6 @@ def test_bad_models_are_errors_naming_file_and_line(values, message):
     assert "test_compile_trace.py:" in str(caught.value)
 
 
-def test_users_module_is_left_alone():
-    make(with_helper)
-    assert "max" not in globals() and "float" not in globals()
-    assert helper(1.0) == math.atan2(1.0, 2.0) + 1.0 + 0.2
-
-
 def test_without_llvmlite_the_graph_is_interpreted(monkeypatch):
     from grounded.compile.run import jit
 

@@ -63,12 +63,6 @@ def test_derivatives_agree_with_central_differences(model):
         assert np.abs((exact - difference) / scale).max() < 1e-6, name
 
 
-def test_the_compiled_model_is_the_users_function():
-    for model in (car.model, pendulum.model, aircraft.model):
-        x, u = samples(model, np.random.default_rng(1))
-        model.system.check(x, u, model.values, 0.02)
-
-
 def endless(s, a, p):
     total = a.u
     for _ in range(30_000):

@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,27 +33,38 @@ define i64 @run(ptr %words) {
 
 
 @pytest.fixture
-def code() -> bytes:
-    return jit._compiled(TEXT)
+def built(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], tuple[bytes, jit.Library]]:
+    """Compiles a text: its object file, and its function as LLVM's own loader has it."""
+
+    def both(text: str) -> tuple[bytes, jit.Library]:
+        seen: list[bytes] = []
+        with monkeypatch.context() as patch:
+            patch.setenv("GROUNDED_CACHE", "")
+            patch.setattr(jit, "load", seen.append)
+            library = jit.library("a test", lambda: text, ("run",))
+        return seen[0], library
+
+    return both
 
 
-def called(loaded: object, x: float) -> tuple[int, float]:
+def called(library: jit.Library, x: float) -> tuple[int, float]:
     words = np.array([x])
-    status = jit.Library(loaded, ("run",))["run"](words.ctypes.data)
+    status = library["run"](words.ctypes.data)
     return status, float(words[0])
 
 
 @here
 @pytest.mark.parametrize("x", [0.0, 1.0, 2.0])
-def test_code_constants_and_calls_of_the_c_library_are_found(code: bytes, x: float) -> None:
-    loaded = object_file.load(code)
-    assert loaded is not None
-    assert called(loaded, x) == called(jit._loaded(code), x)
-    assert called(loaded, x) == (7, pytest.approx(2.0 ** (x / 3) + 0.1, abs=1e-15))
+def test_code_constants_and_calls_of_the_c_library_are_found(built, x: float) -> None:
+    code, by_llvm = built(TEXT)
+    own = jit.Library(object_file.load(code), ("run",))
+    assert called(own, x) == called(by_llvm, x)
+    assert called(own, x) == (7, pytest.approx(2.0 ** (x / 3) + 0.1, abs=1e-15))
 
 
 @here
-def test_what_is_not_known_is_left_to_llvm(code: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_known_is_left_to_llvm(built, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, _ = built(TEXT)
     assert object_file.load(b"") is None
     assert object_file.load(b"\x7fELF" + bytes(100)) is None
     assert object_file.load(code.replace(b"cbrt", b"cbrq")) is None  # no such function
@@ -99,34 +111,8 @@ def test_a_warm_process_does_not_import_llvm(tmp_path: Path) -> None:
     assert [line.split() for line in said] == [["compiled", "True"], ["compiled", "False"]]
 
 
-def test_a_machine_is_asked_again_once_it_was_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("GROUNDED_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(jit, "BOOT", tmp_path / "boot")
-    asked = jit._host.__wrapped__
-    jit._here.cache_clear()
-    try:
-        assert jit._here() == "" and jit._remembered() is None  # no such file
-        (tmp_path / "boot").write_text("first")
-        jit._here.cache_clear()
-        assert jit._remembered() is None
-        if not jit._here():
-            pytest.skip("LLVM is not where llvmlite's wheels have it")
-        assert asked() == jit._remembered() == asked()
-        (file,) = (tmp_path / "cache").glob("*.machine")
-        file.write_bytes(file.read_bytes()[:-1])
-        assert jit._remembered() is None  # damaged
-        assert asked() == jit._remembered()
-        (tmp_path / "boot").write_text("second")
-        jit._here.cache_clear()
-        assert jit._remembered() is None
-    finally:
-        jit._here.cache_clear()
-
-
 @here
-def test_code_that_writes_to_its_own_memory_is_left_to_llvm() -> None:
+def test_code_that_writes_to_its_own_memory_is_left_to_llvm(built) -> None:
     text = """
 @calls = internal global i64 0
 define i64 @run(ptr %words) {
@@ -136,4 +122,4 @@ define i64 @run(ptr %words) {
   ret i64 %new
 }
 """
-    assert object_file.load(jit._compiled(text)) is None
+    assert object_file.load(built(text)[0]) is None

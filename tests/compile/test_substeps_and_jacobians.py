@@ -56,23 +56,6 @@ def test_the_derivatives_of_substeps_are_exact():
     np.testing.assert_allclose(f_u[:, :, 0], change, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_a_stiff_friction_holds_with_substeps():
-    def stiff(s, a, p):
-        return {"x": s.v, "v": a.u - p.c * np.tanh(s.v / 0.01)}
-
-    x, u = np.array([[0.0, 0.5]] * 2), np.array([[1.0]] * 2)
-    rough = Model(**NAMES, derivative=stiff).system
-    fine = Model(**NAMES, derivative=stiff, substeps=20).system
-    for _ in range(40):
-        x = fine.step(x, u, np.array([3.0]), 0.1)
-    assert abs(x[0, 1]) < 0.02  # it sticks
-    y = np.array([[0.0, 0.5]] * 2)
-    for _ in range(40):
-        y = rough.step(y, u, np.array([3.0]), 0.1)
-    assert abs(y[0, 1]) > 0.05  # one step a control step rattles
-
-
 def step_of(s, a, p, dt):
     return {"x": s.x + dt * s.v, "v": s.v + dt * (a.u - p.c * s.x)}
 
@@ -188,20 +171,3 @@ def test_differences_are_taken_inwards_at_the_limits_of_an_input():
     np.testing.assert_allclose(f_u[:, 1, 0], 0.1, rtol=1e-6)
     beyond = system.linearise(x, u + 2.0, model.values, 0.1, 0.0, limits)[1]
     assert np.isfinite(beyond).all()
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.05, 0.1, 0.2])
-def test_derivatives_at_a_kink_may_be_those_of_either_side(slope):
-    def step(s, a, p, dt):
-        return {"x": s.x, "v": s.v + dt * min(float(a.u), 1.0)}
-
-    def jacobian(s, a, p, dt):
-        return np.eye(2), np.array([[0.0], [slope]])
-
-    system = Model(**NAMES, step=step, jacobian=jacobian).system
-    given = (np.zeros((1, 2)), np.ones((1, 1)), np.array([3.0]), 0.1)
-    if slope <= 0.1:
-        system.check(*given)
-    else:
-        with pytest.raises(GroundedError, match="'v' by 'u'"):
-            system.check(*given)

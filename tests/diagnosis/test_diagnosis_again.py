@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Reward, Task, Trial
+from grounded import Model, Param, Trial
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import one_thing
@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
-from small_tasks import pushed_cart
+from small_tasks import plain_task
 
 worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
 
@@ -56,13 +56,7 @@ def runs(gain, trials=4, steps=200, wave=0.0, noise=1.0, alike=False):
 
 
 def task(model, steps=200):
-    zero = np.zeros(2)
-    reward = Reward(np.ones(2), zero, np.zeros(1), np.zeros(1))
-    limits = {"low": np.array([-2.0]), "high": np.array([2.0])}
-    target = np.zeros((steps + 1, 2))
-    return Task(
-        model=model, dt=0.05, target=target, reward=reward, start=zero, past=np.zeros(1), **limits
-    )
+    return plain_task(model, 0.05, np.zeros((steps + 1, 2)), 1.0, 2.0)
 
 
 @worse
@@ -106,7 +100,6 @@ def test_an_interval_is_as_wide_as_what_is_wrong_along_the_manoeuvre():
 
 
 def test_predictions_start_from_filtered_states_wherever_the_track_lies():
-    """Behind a kink a track may stay where it was measured, nearly as noisy as the sensors."""
     trials, quiet = runs(1.5, noise=20.0), runs(1.5, noise=0.0)
     data = prepare(axis(1.5), trials)
     predictor = Predictor(data)
@@ -121,14 +114,6 @@ def test_predictions_start_from_filtered_states_wherever_the_track_lies():
     assert off[1] == pytest.approx(off[2], rel=0.05)
     errors = [Ruler(predictor).errors(fit).rms[:-1] for fit in (held, risen)]
     np.testing.assert_allclose(errors[0], errors[1], rtol=0.02)
-
-
-def test_constants_that_data_chose_stay_when_the_values_move():
-    model, _ = pushed_cart(trials=1, steps=2)
-    effect = Library().effect("coulomb_friction:v", model)
-    width = 3 * effect.fixed["width"]
-    h = Hypothesis().plus(effect, {"c": 0.2, "width": width})
-    assert h.with_theta(h.theta).values[0]["width"] == width
 
 
 @pytest.mark.parametrize(("name", "same"), [("input_gain:u", True), ("viscous_friction:v", False)])

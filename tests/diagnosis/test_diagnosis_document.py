@@ -4,7 +4,6 @@ import json
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -102,23 +101,6 @@ def test_an_older_document_is_read_with_what_it_has():
     assert again(oldest) == oldest
 
 
-def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
-    """They were {}, which a script takes for an effect without quantities."""
-    found = Diagnosis.from_json(DIAGNOSIS)
-    with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
-        found.values("drag:v")
-    with pytest.raises(GroundedError, match="none of any effect"):
-        Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")
-
-
-def test_null_is_nan_and_what_is_missing_is_the_default():
-    value = {"value": None, "std": None, "interval": None, "unit": None}
-    read = Estimate.from_json(value)
-    assert math.isnan(read.value) and read.unit == "" and np.isnan(read.interval or ()).all()
-    assert Estimate.from_json({"value": 1}).interval is None
-    assert "interval" not in Estimate(1.0).to_json()
-
-
 @pytest.mark.parametrize(
     "document",
     [
@@ -137,3 +119,11 @@ def test_null_is_nan_and_what_is_missing_is_the_default():
 def test_what_is_no_diagnosis_is_refused(document):
     with pytest.raises(GroundedError, match="Diagnosis"):
         Diagnosis.from_json(document)
+
+
+def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
+    found = Diagnosis.from_json(DIAGNOSIS)
+    with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
+        found.values("drag:v")
+    with pytest.raises(GroundedError, match="none of any effect"):
+        Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")

@@ -60,7 +60,6 @@ def test_what_is_farthest_above_its_noise_is_left_over_first():
 
 
 def test_a_gap_in_one_second_of_one_log_is_told_with_its_time():
-    """A finger held a ball for half a second of 45; its gap was to be looked for everywhere."""
     total, count = np.full((1, 9, 1), 1e-6), np.full((1, 9, 1), 10.0)
     total[0, 6] = 1e-3  # the third second of the second run, which begins at 4 s of t2
     fake = SimpleNamespace(

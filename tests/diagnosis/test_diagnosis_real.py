@@ -1,9 +1,5 @@
-"""Real systems whose authors published what the model lacks (../shared/data, each SOURCE.md).
+"""Real systems whose authors published what the model lacks (../shared/data, each SOURCE.md)."""
 
-Their logs become MCAP trials, which are ingested and diagnosed by the commands that a user types.
-"""
-
-import numpy as np
 import pytest
 
 from cli import grounded
@@ -56,10 +52,7 @@ def values(document, effect):
 @pytest.mark.slow
 @needs_data
 def test_the_servo_has_a_speed_limit_and_a_delay():
-    """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up.
-
-    These runs, 11 of 32, do not tell what of the delay is in the log.
-    """
+    """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up."""
     found = diagnose(SERVO.model, SERVO.read()[:22:2])
     named = {row.effect: row.params for row in found.ranking if row.claimed}
     assert 1.0 < named["slew_limit:position"]["r"].value < 1.7
@@ -103,39 +96,3 @@ def test_the_friction_of_a_geared_servo_grows_with_its_load():
     half, whole = found.prediction_error[1], found.prediction_error[-1]
     assert half.horizon_s == 0.5 and half.with_effects["q"] < 0.095  # the best made by hand
     assert whole.whole_trial and whole.with_effects["q"] < 0.098
-
-
-def lagged(tau, way):
-    """Rms error of w = K v s on the DART's rows, its steering s lagged by a plain filter."""
-    dt, xs, ws = 0.1, [], []
-    a = np.exp(-dt / tau)
-    for trial in DART_STEERING.read():
-        s, y = trial.inputs[:, 0], trial.inputs[0, 0]
-        seen = np.empty(len(s))
-        for k, command in enumerate(s):
-            later = a * y + (1 - a) * command
-            mean = command + (y - command) * (1 - a) * tau / dt
-            seen[k], y = (later if way == "end" else mean), later
-        xs.append(trial.inputs[:, 1] * seen)
-        ws.append(trial.states[1:, 0])
-    x, w = np.concatenate(xs), np.concatenate(ws)
-    return float(np.sqrt(np.mean((w - x * (x @ w) / (x @ x)) ** 2)))
-
-
-@needs_data
-def test_the_published_lag_is_a_matter_of_convention():
-    """0.13 s where the filter's value at the end of a step counts, 0.085 s where its mean does."""
-    taus = np.linspace(0.04, 0.25, 106)
-    best = {way: taus[np.argmin([lagged(t, way) for t in taus])] for way in ("end", "mean")}
-    assert best["end"] == pytest.approx(0.129, abs=0.005)
-    assert best["mean"] == pytest.approx(0.085, abs=0.005)
-
-
-@needs_data
-def test_the_servo_rests_for_one_row_after_a_step():
-    """So its delay is between 20 and 40 ms, whatever the model."""
-    moved = []
-    for trial in SERVO.read()[1:11]:  # the steps
-        moved.append(np.abs(trial.states[:4, 0] - trial.states[0, 0]) * 2048)  # counts
-    rows = np.array(moved)
-    assert rows[:, 1].max() < 2 < 4 < rows[:, 2].min()

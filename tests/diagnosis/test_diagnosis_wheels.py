@@ -7,8 +7,6 @@ from scipy.ndimage import gaussian_filter1d
 from grounded import Model, Param
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.effects import Library
-from grounded.effects.family import Scales
 from grounded.trial import Trial
 
 DT, FINE = 0.05, 10  # [s] control step; steps of the simulation in one
@@ -69,32 +67,10 @@ def late(findings):
 
 
 def test_one_message_is_late_as_a_whole(trials):
-    """Only the heading was corrected, which its rate tells; side slip took the rest."""
     assert set(late(preflight(ROVER, trials).findings)) == {"psi"}
     found = preflight(ROVER, trials, one_message=POSE)
     assert late(found.findings) == pytest.approx(dict.fromkeys(POSE, LATE), abs=0.004)
     assert {f"sensor_delay:{name}" for name in POSE} <= found.settled
-
-
-def test_a_rate_that_differs_with_the_speed_is_no_bias(trials):
-    (pull,) = (f.finding for f in preflight(ROVER, trials).findings if f.kind == "offset")
-    assert "rad/s per m/s of v less than the rate of psi: wheels of unequal size" in pull
-    assert float(pull.split()[1]) == pytest.approx(PULL, rel=0.1)
-
-
-def test_a_speed_may_turn_a_heading_but_not_drive_a_position():
-    names = [e.name for e in Library().candidates(ROVER)]
-    assert "coupling:psi<-v" in names
-    assert not {"coupling:psi<-omega", "offset:psi", "trend:psi", "periodic:psi"} & {*names}
-
-
-def test_a_patch_lies_where_the_robot_was():
-    """One of 8.7 m radius, 3 m outside of the field, stood for wheels of unequal size."""
-    low, high = {"x": 0.0, "y": -2.0}, {"x": 8.0, "y": 2.0}
-    patch = Library().effect("patch:psi", ROVER, Scales(low, high))
-    ends = {q.name: (q.low, q.high) for q in patch.quantities}
-    assert ends["x0"] == (0.0, 8.0) and ends["y0"] == (-2.0, 2.0)
-    assert ends["radius"][1] < 0.5 * np.sqrt(8.0 * 4.0)
 
 
 def test_unequal_wheels_are_named_and_slip_is_not_given_the_delay(trials):

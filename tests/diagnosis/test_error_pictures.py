@@ -7,8 +7,6 @@ from grounded.figures.interactive import plotted
 
 
 def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
-    """It was drawn on the line, at the trial's length, as if it were the error 2 s ahead."""
-
     def row(seconds, error, whole=False):
         return RulerRow(seconds, whole, {"x": "m"}, crude={"x": error}, with_effects={"x": error})
 
@@ -25,23 +23,3 @@ def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
     assert drawn["layout"]["xaxis"]["ticklabeloverflow"] == "allow"  # it was hidden at the edge
     (bars,) = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows[2:])).panels
     assert bars.title == "x, whole trial"
-
-
-def test_noise_of_zero_is_in_the_caption_and_not_in_the_legend():
-    """A logarithmic axis cannot show it: the legend named a curve that was nowhere."""
-
-    def figure(noise):
-        rows = [
-            RulerRow(
-                s, False, {"x": "m"}, crude={"x": 1.0}, with_effects={"x": 0.1}, noise_floor=noise
-            )
-            for s in (0.5, 1.0)
-        ]
-        return accuracy_figure(Diagnosis(Verdict("none"), prediction_error=tuple(rows)))
-
-    exact, noisy, unknown = figure({"x": 0.0}), figure({"x": 0.01}), figure({})
-    for found in (exact, unknown):
-        assert [key.role for key in found.key] == ["model", "best"]
-    assert [key.role for key in noisy.key] == ["model", "best", "other"]
-    assert "noise is 0" in exact.caption
-    assert not any("noise is 0" in found.caption for found in (noisy, unknown))

@@ -11,7 +11,7 @@ from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.limits import knowable
-from grounded.effects import InputFamily, Library, MemoryFamily, Scales
+from grounded.effects import InputFamily, Library, MemoryFamily
 
 
 def only(*names):
@@ -58,18 +58,6 @@ def test_a_state_that_the_commands_alone_determine_is_an_exact_memory(step):
     np.testing.assert_allclose(data.states[1:21, 1], trials[0].inputs[:, 0])
 
 
-def test_what_is_measured_or_reads_it_or_moves_is_no_exact_memory():
-    def servo(s, a, p):
-        return {"q": s.w, "w": 4 * a.u - s.w, "d": 9 * (a.u - s.d), "e": s.q - s.e}
-
-    model = Model({"q": "rad", "w": "rad/s", "d": "1", "e": "rad"}, {"u": "1"}, derivative=servo)
-    x = np.random.default_rng(0).normal(size=(41, 4))
-    x[:, 1:] = np.nan
-    assert prepare(model, [logged(model, x, np.ones((40, 1)), 0.1)]).exact == (2,)
-    x[3, 2] = 0.1
-    assert prepare(model, [logged(model, x, np.ones((40, 1)), 0.1)]).exact == ()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("play", [0.0, 0.021])
 def test_a_play_before_a_models_own_memory_is_found(play):
@@ -97,19 +85,6 @@ def flushed(late, steps=260, dt=0.5):
         noisy = np.array(T)[:, None] + 0.02 * rng.normal(size=(steps + 1, 1))
         trials.append(logged(model, noisy, valve[:, None], dt))
     return model, trials
-
-
-@pytest.mark.parametrize(
-    ("slowest", "duration", "longest"), [(0, 40, 0.5), (9, 40, 9), (90, 40, 10)]
-)
-def test_times_are_scanned_as_far_as_the_model_is_slow_and_the_log_is_long(
-    slowest, duration, longest
-):
-    scales = Scales(dt=0.05, duration=duration, slowest=slowest)
-    model, _ = flushed(0, 8)
-    (late,) = Library().effect("delay:valve", model, scales).quantities
-    assert 0.8 * longest <= late.grid[-1] == late.high <= longest
-    assert late.grid[0] < scales.dt and (np.diff(late.grid) > 0).all()
 
 
 @pytest.mark.slow

@@ -9,10 +9,9 @@ import pytest
 
 import grounded as gr
 from grounded import Model, Param, Trial
-from grounded.challenge.truth import Truth, _Run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import linearise, sensitivities_of, step_jacobian
+from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.effects.medium import turning
@@ -20,8 +19,7 @@ from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.places import body_velocity
 from grounded.search.planner import planner_with
-from grounded.task import Task
-from grounded.utility import Reward
+from small_tasks import plain_task
 
 DT, FINE = 0.1, 20
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
@@ -32,10 +30,7 @@ DRAG = ("quadratic_drag:u", {"k": 0.3})
 def rates(
     s: Any, a: Any, p: Any, water=(0.0, 0.0), push=(0.0, 0.0), added=(0.0, 0.0, 0.0)
 ) -> dict[str, Any]:
-    """A boat over ground; of its drag only the velocity through the water makes one.
-
-    added: what added masses make of the products v r, u r and u v, in the rates of u, v and r.
-    """
+    """A boat over ground; of its drag only the velocity through the water makes one. added."""
     cos, sin = np.cos(s["psi"]), np.sin(s["psi"])
     ahead = s["u"] - water[0] * cos - water[1] * sin
     aside = s["v"] + water[0] * sin - water[1] * cos
@@ -116,17 +111,7 @@ def hypothesis(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Hyp
 
 def adopted(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Model:
     """The model that plans with these effects."""
-    one, two = np.ones(model.n), np.ones(model.m)
-    task = Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((11, model.n)),
-        reward=Reward(one, one, two, two),
-        start=np.zeros(model.n),
-        past=np.zeros(2),
-        low=-two,
-        high=two,
-    )
+    task = plain_task(model, DT, np.zeros((11, model.n)), 1.0, 1.0, terminal=1.0, effort=1.0)
     return planner_with(task, parts).plan.model
 
 
@@ -239,23 +224,6 @@ def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
     np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
 
 
-def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
-    """However they join: a hull's drag that was found later was taken for an offset over ground."""
-    model = adopted(CURRENT)
-    data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
-    found = Predictor(data).next(h, data.y[:-1])
-    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
-    for both in (adopted(CURRENT, DRAG), adopted(DRAG, CURRENT), joined(DRAG, model)):
-        want = both.system.step(x, u, both.values, DT)
-        np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
-
-
-def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
-    """The model with one more effect."""
-    name, values = part
-    return wrap(Library().effect(name, model), values, DT)
-
-
 @pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
 def test_its_slopes_are_those_of_its_steps(parts):
     """A current's exactly; where a rate's kick moves the model, to two per cent, as of any rate."""
@@ -279,38 +247,6 @@ def test_its_slopes_are_those_of_its_steps(parts):
         near(by_param[..., k], [predictor.advance(one, x, u, data.time) for one in moved])
 
 
-def test_a_black_box_is_linearised_about_what_the_medium_sees():
-    """Its steps are not asked again for each nudged value: slopes stand for them."""
-
-    def step(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
-        if s["u"] > 1e9:  # can't be traced
-            return dict(s)
-        moved = dict(s)
-        for _ in range(10):
-            half = {n: moved[n] + 0.05 * dt * v for n, v in rates(moved, a, p).items()}
-            moved = {n: moved[n] + 0.1 * dt * v for n, v in rates(half, a, p).items()}
-        return moved
-
-    box = Model(states=STATES, inputs=INPUTS, params=boat.params, angles=("psi",), step=step)
-    columns = []
-    for model in (box, boat):
-        data, h = prepare(model, TRIALS[:1]), hypothesis(CURRENT, model=model)
-        columns.append(linearise(Predictor(data), h, data.y))
-    for one, other in zip(*columns, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-3)
-    assert np.abs(columns[0][1][..., 1:]).max() > 0.01
-
-
-def test_the_challenges_truth_has_the_same_current():
-    """Integrated inside the derivative by other code."""
-    truth = Truth(boat, ((effect(CURRENT[0]), CURRENT[1]),))
-    run = _Run(truth, np.random.default_rng(0), np.zeros(6), np.zeros(2), DT)
-    for x, u in zip(TRIALS[0].states[10::30], TRIALS[0].inputs[10::30], strict=False):
-        s, a = dict(zip(STATES, x, strict=True)), dict(zip(INPUTS, u, strict=True))
-        want = rates(s, a, SIZES, water=(0.15, -0.08))
-        np.testing.assert_allclose(run.rates(x, u, 0.0), list(want.values()), atol=1e-5)
-
-
 SEA = [
     ({"water": (0.15, -0.08)}, "current:u+v"),
     ({"push": (0.12, 0.2)}, "push_world:u+v"),
@@ -330,21 +266,34 @@ def test_the_cause_is_found_with_its_size(truth, name):
 
 
 ADDED = [
-    ((1.5, 0.0, 0.0), "u", "v * r", "1"),  # this boat hardly slides
-    ((0.0, 0.5, 0.0), "v", "u * r", "1"),
-    ((0.0, 0.0, 0.5), "r", "u * v", "rad/m^2"),
+    ((0.0, 0.0, 0.5), "r", "rad/m^2"),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("added", "rate", "product", "unit"), ADDED)
-def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, product, unit):
+@pytest.mark.parametrize(("added", "rate", "unit"), ADDED)
+def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, unit):
     """A `rate_gain` would change the drag and the thrust as well."""
     found = gr.diagnose(boat, driven(added=added, steps=100))
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]
     assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
-    assert f"* {product} more (Coriolis" in found.sentence
+
+
+def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
+    model = adopted(CURRENT)
+    data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
+    found = Predictor(data).next(h, data.y[:-1])
+    x, u = data.y[:-1].reshape(-1, 6), Predictor(data).inputs(h).reshape(-1, 2)
+    for both in (adopted(CURRENT, DRAG), adopted(DRAG, CURRENT), joined(DRAG, model)):
+        want = both.system.step(x, u, both.values, DT)
+        np.testing.assert_allclose(found.reshape(want.shape), want, atol=1e-9)
+
+
+def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
+    """The model with one more effect."""
+    name, values = part
+    return wrap(Library().effect(name, model), values, DT)
 
 
 @pytest.mark.slow

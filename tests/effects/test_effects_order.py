@@ -1,25 +1,18 @@
 """Several effects together: diagnosis, probe and adopted model agree which of them acts first."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-import grounded.diagnosis.likelihood.predictor as predictor_module
 from grounded import Trial
 from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Estimate, Ranked, Verdict
-from grounded.diagnosis.writer import _in_action
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
 from grounded.effects.memory import shifted
 from grounded.models.car import model as car
-from grounded.task import Task
-from grounded.utility import Reward
-from grounded_trials.workspace.adoptable import joined
 from grounded_trials.workspace.adopted import in_order, planner_of
+from small_tasks import plain_task
 
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})
@@ -42,16 +35,9 @@ def commands():
 
 
 def task():
-    return Task(
-        model=car,
-        dt=DT,
-        target=np.zeros((STEPS + 1, car.n)),
-        reward=Reward(np.ones(car.n), np.ones(car.n), np.ones(2), np.ones(2)),
-        start=np.full(car.n, 0.1),
-        past=HELD,
-        low=np.array([-1.0, -1.0]),
-        high=np.array([1.0, 1.0]),
-    )
+    rest = {"start": np.full(car.n, 0.1), "past": HELD}
+    weights = dict.fromkeys(("terminal", "effort", "change"), 1.0)
+    return plain_task(car, DT, np.zeros((STEPS + 1, car.n)), 1.0, 1.0, **weights, **rest)
 
 
 def hypothesis(parts, model=car):
@@ -64,10 +50,7 @@ def hypothesis(parts, model=car):
 
 
 def predicted(parts, model=car, leads=False):
-    """The diagnosis' own prediction from the start, (STEPS + 1, n).
-
-    leads: with what arrives within a step, of which plans take the mean.
-    """
+    """The diagnosis' own prediction from the start, (STEPS + 1, n). leads."""
     names = (car.state_names, car.input_names)
     empty = np.full((STEPS + 1, car.n), 0.1)
     predictor = Predictor(prepare(model, [Trial(empty, commands(), DT, *names, start_inputs=HELD)]))
@@ -128,7 +111,6 @@ def test_one_order_everywhere(parts):
 
 @pytest.mark.parametrize("parts", [(LIMIT, PART), (PART, ZONE, LAG), (BIAS, ZONE, PART)])
 def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(parts):
-    """As a mean of two commands, what is bent was off by 0.06 rad/s."""
     off = np.abs(adopted(parts) - predicted(parts, leads=True)).max(axis=0)
     assert off[car.state_names.index("delta")] < 6e-4 and off.max() < 0.015
     near = np.abs(probed(parts) - predicted(parts, leads=True)).max(axis=0)
@@ -136,7 +118,6 @@ def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(pa
 
 
 def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
-    """A robot's rate limit and delay, adopted: 3.5 times the error that was diagnosed."""
     plan = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)]).plan
     j = car.input_names.index(PART[0].partition(":")[2])
     assert plan.latency[j] == pytest.approx(2 * DT)
@@ -149,8 +130,41 @@ def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
     assert off.max() < 0.015  # inputs that arrive at different times
 
 
+def test_a_delay_acts_last_whenever_it_was_claimed():
+    np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
+
+
+@pytest.mark.parametrize("new", [WEAKER, BIAS, LIMIT, LAG])
+def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
+    old = [{"name": ZONE[0], **ZONE[1]}]
+    model = planner_of(task(), old).plan.model
+    want = predicted((new,), model)
+    found = in_order(old, [{"name": new[0], **new[1]}])
+    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
+    np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
+
+
+def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
+    old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
+    model = planner_of(task(), old).plan.model
+    want = predicted((("rate_gain:delta", {"g": 0.3}),), model)
+    found = in_order(old, [{"name": "rate_gain:delta", "g": 0.3}])
+    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
+    by_name = dict(parts)
+    beside = adopted([(PULL[0], PULL[1]), *parts[1:]])
+    off, before = (np.abs(one - want).max() for one in (adopted(parts), beside))
+    assert off < 5e-3 < before / 4  # half a step's kick of the one or the other
+    assert by_name[PULL[0]] == {"c": pytest.approx(0.13)}
+    assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
+
+
+def test_what_is_wrapped_last_acts_first():
+    families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
+    assert acting_order(families) == [1, 3, 0]
+    assert wrapping_order(families) == [2, 0, 3, 1]
+
+
 def test_the_memory_of_a_trial_follows_what_arrives():
-    """A limit's memory behind a delay began pieces of a log as if nothing were late."""
     planner = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)])
     trial = Trial(
         predicted((LIMIT, PART)),
@@ -168,117 +182,3 @@ def test_the_memory_of_a_trial_follows_what_arrives():
     after = plan.model.system.step(states[:-1], received, plan.model.values, DT)
     np.testing.assert_allclose(after[:, car.n :], states[1:, car.n :], atol=1e-9)
     np.testing.assert_allclose(after, states[1:], atol=0.01)  # the model takes the limit's mean
-
-
-@pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])
-def test_what_was_held_before_went_through_all_effects(parts):
-    """An input that stays as it was held moves no memory."""
-    names = (car.state_names, car.input_names)
-    still = Trial(
-        np.full((STEPS + 1, car.n), 0.1),
-        np.tile(HELD, (STEPS, 1)),
-        DT,
-        *names,
-        start_inputs=HELD,
-    )
-    predictor = Predictor(prepare(car, [still], latency=np.full(2, 1.5 * DT)))
-    received = predictor.received(hypothesis(parts))[0]
-    np.testing.assert_allclose(received, np.tile(received[-1], (STEPS, 1)), atol=1e-12)
-    assert np.abs(received[0] - HELD).max() > 0.04
-
-
-def test_effects_on_inputs_do_not_commute():
-    one, other = predicted((LAG, LIMIT)), predicted((LIMIT, LAG))
-    assert np.abs(one - other).max() > 1e-3
-
-
-def test_a_delay_acts_last_whenever_it_was_claimed():
-    np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
-
-
-@pytest.mark.parametrize("new", [WEAKER, BIAS, LIMIT, LAG])
-def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
-    """What adopting writes is what was diagnosed: a gain was written behind the dead zone."""
-    old = [{"name": ZONE[0], **ZONE[1]}]
-    model = planner_of(task(), old).plan.model
-    want = predicted((new,), model)
-    found = in_order(old, [{"name": new[0], **new[1]}])
-    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
-    np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
-
-
-def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
-    """Found on the whole rate, it was written beside it: predictions were five times worse."""
-    old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
-    model = planner_of(task(), old).plan.model
-    want = predicted((("rate_gain:delta", {"g": 0.3}),), model)
-    found = in_order(old, [{"name": "rate_gain:delta", "g": 0.3}])
-    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
-    by_name = dict(parts)
-    beside = adopted([(PULL[0], PULL[1]), *parts[1:]])
-    off, before = (np.abs(one - want).max() for one in (adopted(parts), beside))
-    assert off < 5e-3 < before / 4  # half a step's kick of the one or the other
-    assert by_name[PULL[0]] == {"c": pytest.approx(0.13)}
-    assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
-
-
-def test_effects_are_adopted_in_the_order_in_which_they_were_fitted():
-    """By credit the gain comes first, as `next:` prints it; the dead zone acts first."""
-    fitted = (ZONE, WEAKER, DELAY)
-    by_credit = (DELAY, WEAKER, ZONE)
-    names = tuple(name for name, _ in by_credit)
-    ranking = tuple(
-        Ranked(name, claimed=True, params={q: Estimate(v) for q, v in values.items()})
-        for name, values in by_credit
-    )
-    order = _in_action(hypothesis(fitted), names)
-    assert order == (ZONE[0], WEAKER[0], DELAY[0])
-    found = Diagnosis(Verdict("several", effects=names), ranking=ranking, acting=order)
-    assert list(found.joining) == list(order)
-    _, effects = joined(found, names, [], {}, {})
-    np.testing.assert_allclose(
-        adopted([(e.pop("name"), e) for e in effects]), predicted(fitted), atol=1e-9
-    )
-    assert np.abs(predicted(by_credit) - predicted(fitted)).max() > 1e-3
-
-
-def test_what_is_wrapped_last_acts_first():
-    families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
-    assert acting_order(families) == [1, 3, 0]
-    assert wrapping_order(families) == [2, 0, 3, 1]
-
-
-def test_inputs_by_run_are_those_of_whole_trials():
-    """Each input is computed by itself, for the trials in use, and cut into runs."""
-    names, rng = (car.state_names, car.input_names), np.random.default_rng(3)
-    trials = [
-        Trial(rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, 2)), DT, *names)
-        for T in (230, 450, 60)
-    ]
-    data = prepare(car, trials, latency=np.array([0.4 * DT, 0.0]))
-    data = replace(data, **{k: getattr(data, k)[1:] for k in ("state_at", "step_at", "valid")})
-    data = replace(data, trial_of=data.trial_of[1:])  # its start still has to be filtered
-    predictor = Predictor(data)
-    for parts in ([], [LAG], [LIMIT, WEAK, PART], [BIAS, THROTTLE]):
-        h = hypothesis(parts)
-        whole = data.runs(predictor.received(h, leads=True))
-        np.testing.assert_array_equal(predictor.inputs(h), whole)
-    assert np.ptp(whole[..., 1]) > 0
-    at = int(data.trial_of[-1]), int(data.step_at[-1, 5] - data.lengths[:2].sum())
-    np.testing.assert_array_equal(whole[5, -1], predictor.received(h, leads=True)[at])
-
-
-def test_an_effect_on_one_input_leaves_the_cached_other(monkeypatch):
-    names = (car.state_names, car.input_names)
-    trial = Trial(np.full((STEPS + 1, car.n), 0.1), commands(), DT, *names, start_inputs=HELD)
-    made, own = [], predictor_module.arriving
-
-    def counted(acting, data, j):
-        made.append(j)
-        return own(acting, data, j)
-
-    monkeypatch.setattr(predictor_module, "arriving", counted)
-    predictor = Predictor(prepare(car, [trial]))
-    for parts in ([], [LAG], [ZONE], [LAG]):
-        predictor.inputs(hypothesis(parts))
-    assert sorted(made) == [0, 0, 0, 1]

@@ -63,7 +63,6 @@ def end(name, dt):
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_half_the_step_leaves_a_quarter_of_the_error(name):
-    """A drag was found 2.4 % too small at 0.1 s, 1.2 % at 0.05 s: half the step, half the error."""
     true = end(name, 0.0005)
     coarse, fine = (np.abs(end(name, dt) - true).max() for dt in (0.1, 0.05))
     assert fine < coarse / 3 and coarse < 2e-3

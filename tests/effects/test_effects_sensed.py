@@ -5,15 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import grounded as gr
-from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_of, wrap
-from grounded.effects.sensed import moved_model, seen_names
-from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
 
@@ -66,7 +62,6 @@ def offered(name, data):
 @pytest.mark.parametrize(("name", "values"), MOVES, ids=lambda v: v if isinstance(v, str) else "")
 @pytest.mark.parametrize("late", LATE.values(), ids=[*LATE])
 def test_what_moves_a_model_with_late_logs_steps_as_the_model_that_adopts_it(late, name, values):
-    """A friction was looked for in the log of the speed, which moves nothing, and never found."""
     model = built(late)
     data = late_data(model)
     effect, predictor = offered(name, data), Predictor(data)
@@ -99,90 +94,3 @@ def test_its_slopes_are_those_of_its_steps(late, name, values):
         ends = [predictor.advance(h, x + s * nudge, u, data.time) for s in (1, -1)]
         error = np.abs(F[..., j] - (ends[0] - ends[1]) / (2 * size))
         assert np.quantile(error.max(axis=-1), 0.9) < 0.02
-
-
-@pytest.mark.parametrize("late", [LATE["both"], LATE["part of a step"]], ids=["both", "part"])
-def test_a_limit_of_a_rate_takes_its_parts_of_a_step_of_what_moves(late):
-    test_what_moves_a_model_with_late_logs_steps_as_the_model_that_adopts_it(
-        late, "slew_limit:delta", {"r": 0.5}
-    )
-
-
-def test_names_say_which_value_moves():
-    model = built(LATE["both"])
-    names = dict(zip(seen_names(model), model.state_names, strict=True))
-    assert names["v"] == "v_true" and names["v_logged"] == "v"
-    assert moved_model(model).state_names == car.state_names
-    assert seen_names(car) == car.state_names and moved_model(car) is car
-
-
-cart = Model(
-    states={"x": "m", "v": "m/s"},
-    inputs={"u": "N"},
-    params={"mass": Param(1.0, "kg", 0.5, 2.0)},
-    derivative=lambda s, a, p: {"x": s.v, "v": a.u / p.mass},
-)
-
-
-@pytest.mark.slow
-def test_a_friction_is_found_behind_a_late_log():
-    """A ball in a tube whose sensor is 45 ms late: its height was off by 7.8 cm, now by 0.8."""
-    rng, dt, delay, real = np.random.default_rng(3), 0.025, 0.045, []
-    for _ in range(3):
-        t = dt * np.arange(241)
-        force = 1.2 * np.sign(np.sin(rng.uniform(1, 2) * t + rng.uniform(0, 6)))
-        x, fine = np.zeros(2), [np.zeros(2)]
-        for u in force[:-1]:
-            for _ in range(25):
-                push = u - 0.4 * np.tanh(x[1] / 1e-3)
-                x = x + dt / 25 * np.array([x[1], push])
-            fine.append(x + 0.0)
-        true = np.array(fine)
-        late = np.column_stack([np.interp(t - delay, t, true[:, k]) for k in (0, 1)])
-        seen = late + np.array([2e-3, 0.01]) * rng.standard_normal(late.shape)
-        real.append(Trial(seen, force[:-1, None], dt, ("x", "v"), ("u",)))
-    model = cart
-    for name in ("x", "v"):
-        model = wrap(Library().effect(f"sensor_delay:{name}", model), {"d": delay}, dt)
-    lifted = [
-        replace(
-            t,
-            states=np.hstack([t.states, memory_of(model, cart, t)]),
-            state_names=model.state_names,
-        )
-        for t in real
-    ]
-    hidden = model.state_names[cart.n :]
-    options = DiagnosisOptions(
-        hidden=hidden, but={"sensor_delay:x", "sensor_delay:v"}, max_effects=1
-    )
-    found = gr.diagnose(model, lifted, options)
-    assert found.verdict.effects == ("coulomb_friction:v",)
-    assert found.ranking[0].params["c"].value == pytest.approx(0.4, abs=0.03)
-
-
-@pytest.mark.parametrize(
-    ("state", "name", "values"),
-    [("psi", "sensor_delay:psi", {"d": 0.12}), ("v", "sensor_lag:v", {"tau": 0.1})],
-)
-def test_true_values_behind_a_late_log_do_not_drift_away_from_it(state, name, values):
-    """An aircraft's roll was estimated 0.12 rad beside its log after 12 s, and every step lost."""
-    model = Model(
-        states={state: "rad" if state == "psi" else "m/s"},
-        inputs={"u": "1"},
-        params={"g": Param(1.0, "1", 0.5, 2.0)},
-        derivative=lambda s, a, p: {state: p.g * a.u},
-    )
-    rng, steps = np.random.default_rng(0), 400
-    u = np.repeat(rng.uniform(-1, 1, steps // 10), 10)
-    late = [(name, values)]
-    real = built(late, model.with_values({"g": 1.2}))
-    z = [np.zeros(real.n)]
-    for value in u:
-        z.append(real.system.step(z[-1][None], np.array([[value]]), real.values, DT)[0])
-    log = np.array(z)[:, :1] + 0.004 * rng.standard_normal((steps + 1, 1))
-    trial = Trial(log, u[:, None], DT, (state,), ("u",), start_inputs=np.zeros(1))
-    true = real.state_names.index(f"{state}_true")
-    off = memory_of(built(late, model), model, trial)[:, true - 1] - np.array(z)[:, true]
-    alone = 0.2 * DT * np.cumsum(u)  # what the model misses
-    assert np.abs(off).max() < 0.3 * np.abs(alone).max()

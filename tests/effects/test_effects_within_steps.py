@@ -1,7 +1,5 @@
 """What arrives early within a step moves positions farther (`MemoryFamily.lead`)."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,9 @@ from grounded import Model, Trial
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ahead import missed
-from grounded.effects import Library, wrap
+from grounded.effects import Library
 from grounded.effects.actuator import first_order_lag, rate_limit
 from grounded.effects.memory import Sent, shifted_within
-from grounded.models.car import model as car
 
 DT, FINE = 0.02, 200
 LIBRARY = Library()
@@ -88,7 +83,6 @@ def test_a_lead_is_the_first_moment_of_what_arrives_in_a_step(name, value):
 
 @pytest.mark.parametrize(("name", "value"), CASES)
 def test_a_delay_of_a_part_of_a_step_is_estimated_from_encoders(name, value):
-    """Seen: 8.3 ms of a MuJoCo arm were called 10.9 ms, and a lag was likelier than the delay."""
     data = prepare(joint, [trial(name, value, seed) for seed in (1, 2)], np.zeros(1))
     effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
     (q,) = effect.free
@@ -96,84 +90,3 @@ def test_a_delay_of_a_part_of_a_step_is_estimated_from_encoders(name, value):
     start = search.fresh(Hypothesis().plus(effect, {q.name: 1.2 * value}))
     (fit,) = search.refined([start], 25)
     assert fit.hypothesis.values[0][q.name] == pytest.approx(value, rel=0.02)
-
-
-engine = Model(
-    states={"v": "m/s"},
-    inputs={"thrust": "N"},
-    params={},
-    derivative=lambda s, a, p: {"v": 2.0 * a.thrust - 0.5 * s.v},
-    name="engine",
-)
-
-
-@pytest.mark.parametrize(("dt", "tau", "late"), [(0.1, 0.28, 0.14), (0.1, 0.03, 0.16)])
-def test_a_lag_and_a_delay_that_ends_within_a_step_are_told_apart(dt, tau, late):
-    """A walker's log: 0.274 +- 0.001 s after 0.145 +- 0.0006 s were found for 0.28 s after 0.14."""
-    rng, h, count = np.random.default_rng(1), dt / FINE, 240
-    u = np.repeat(rng.uniform(-1, 1, count // 4), 4) + 0.2 * rng.standard_normal(count)
-    sent = np.concatenate([np.full(round(late / h), u[0]), np.repeat(u, FINE)])
-    z, v, log = u[0], 0.0, [0.0]
-    for k, command in enumerate(sent[: count * FINE]):
-        z = command + (z - command) * np.exp(-h / tau)
-        v += h * (2.0 * z - 0.5 * v)
-        log += [v] if k % FINE == FINE - 1 else []
-    y = np.array(log)[:, None] + 1e-4 * rng.standard_normal((count + 1, 1))
-    one = Trial(y, u[:, None], dt, ("v",), ("thrust",), start_inputs=u[:1])
-    data = prepare(engine, [one], np.zeros(1))
-    lag, delay = (
-        LIBRARY.effect(f"{name}:thrust", engine, data.scales)
-        for name in ("first_order_lag", "delay")
-    )
-    search = HypothesisSearch(data, (lag, delay))
-    h = Hypothesis().plus(lag, {"tau": 1.1 * tau}).plus(delay, {"d": 1.05 * late})
-    (fit,) = search.refined([search.fresh(h)], 40)
-    assert fit.hypothesis.values[0]["tau"] == pytest.approx(tau, abs=0.001)
-    assert fit.hypothesis.values[1]["d"] == pytest.approx(late, abs=0.001)
-
-
-def test_an_input_that_stalls_acts_after_its_delay_and_not_by_its_mean():
-    """A car's throttle, 30 ms late, that does nothing below a threshold: from rest to driving."""
-    u = np.zeros((8, 2))
-    u[2:], u[5:] = 0.3, 0.5  # the mean of the first such step, 0.12, is below the threshold
-    x, states = np.zeros((1, car.n)), [np.zeros(car.n)]
-    for before, now in itertools.pairwise([np.zeros(2), *u]):
-        first = np.array([[now[0], before[1]]])  # the steering is in time
-        x = car.system.step(x, first, car.values, 0.03)
-        x = car.system.step(x, now[None], car.values, 0.02)
-        states.append(x[0])
-    trial = Trial(np.array(states), u, 0.05, car.state_names, car.input_names, start_inputs=u[0])
-    data = prepare(car, [trial], np.zeros(2))
-    late = LIBRARY.effect("delay:throttle", car, data.scales)
-    h = Hypothesis().plus(late, {"d": 0.03})
-    moments, one = np.arange(8), np.zeros(8, int)
-    off = missed(Predictor(data), [h], one, data.y, moments, one, 1)[-1]
-    assert np.abs(off).max() < 1e-4
-    two = [h, Hypothesis().plus(late, {"d": 0.02})]  # of two folds, each row has its own
-    both = missed(Predictor(data), two, moments % 2, data.y, moments, one, 1)[-1]
-    assert np.abs(both[::2]).max() < 1e-4 and np.abs(both[1::2]).max() > 1e-3
-
-
-def test_an_adopted_lag_moves_positions_as_the_actuator_does():
-    name, value = CASES[2]
-    data = prepare(joint, [trial(name, value, 1)], np.zeros(1))
-    effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
-    wrapped = wrap(effect, {effect.free[0].name: value}, DT)
-    u, x = commands_of(1), np.array([0.0, 0.0, commands_of(1)[0]])
-    path = [x]
-    for torque in u:
-        x = wrapped.system.step(x[None], np.array([[torque]]), wrapped.values, DT)[0]
-        path.append(x)
-    off = np.diff(np.array(path)[:, 0] - data.y[:, 0, 0])
-    assert off.std() < 2.5e-5  # of which encoders make 1.4e-5
-
-
-def test_predictions_a_second_ahead_know_what_arrives_within_a_step():
-    name, value = CASES[1]
-    data = prepare(joint, [trial(name, value, 1, noise=0.0)], np.zeros(1))
-    effect = LIBRARY.effect(f"{name}:torque", joint, data.scales)
-    h = Hypothesis().plus(effect, {"d": value})
-    moments = np.arange(0, 90, 10)
-    one = np.zeros(len(moments), int)
-    off = missed(Predictor(data), [h], one, data.y, moments, one, 50)[-1]
-    assert np.abs(off[:, 0]).max() < 3e-5  # 3e-4 from means alone

@@ -1,17 +1,14 @@
 """Several rate effects adopted together are the ones that were diagnosed together."""
 
-import math
-
 import numpy as np
 import pytest
 from test_effects_order import DT, HELD, STEPS, commands, task
 
-from grounded import Model, Trial
+from grounded import Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, memory_start, wrap
-from grounded.effects.plain_step import plain_step
+from grounded.effects import Library, memory_start
 from grounded.models.car import model as car
 from grounded_trials.workspace.adopted import planner_of
 
@@ -32,7 +29,6 @@ PAIRS = [
     (GAIN, SLIP),
     (SLEW, FRICTION),
     (SLEW, GAIN),
-    (SLEW, ("slew_limit:v", {"r": 0.5})),
     (TREND, UNDERSTEER),
 ]
 BOTH_ORDERS = PAIRS + [(b, a) for a, b in PAIRS]
@@ -92,61 +88,3 @@ def test_the_carried_heading_rate_stays_the_headings(parts):
     rate = (ahead[:, 4] - x[:, 4]) / h
     drift = (x[:, 5] - rate) - (x[0, 5] - rate[0])
     assert np.abs(drift[[20, 60]]).max() < 0.01
-
-
-@pytest.mark.slow
-def test_pairs_wrapped_in_any_order_are_one_model():
-    one, models = trial(), []
-    for parts in ((SLEW, FRICTION, GAIN), (GAIN, SLEW, FRICTION)):
-        model = car
-        for name, values in parts:
-            model = wrap(Library().effect(name, model), values, DT)
-        models.append(model)
-    first, second = (drive(model, one) for model in models)
-    np.testing.assert_allclose(first, second, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "name, values, uncertain",
-    [
-        ("input_curve:throttle", {"a": 0.0, "b": -0.13, "U": 1.0}, {"b"}),
-        ("input_curve:throttle", {"a": 0.2, "b": -0.13, "U": 1.0}, {"a", "b"}),
-        ("input_gain:throttle", {"g": 0.0}, {"g"}),
-        ("coulomb_friction:v", {"c": 0.0}, {"c"}),
-    ],
-)
-def test_the_side_of_an_input_that_was_never_seen_stays_unknown(name, values, uncertain):
-    """The fan of a tube acted `0.4 % more to its positive side`: a fit had moved what was 0."""
-    model = wrap(Library().effect(name, car), values, DT)
-    stem = name.replace(":", "_") + "_"
-    free = {n.removeprefix(stem) for n, p in model.params.items() if p.uncertain}
-    assert free & set(values) == uncertain
-
-
-def test_a_heading_rate_carried_by_the_users_own_step_follows_too():
-    rk4 = plain_step(car)
-    own = Model(
-        states=car.states,
-        inputs=car.inputs,
-        params=car.params,
-        angles=car.angles,
-        roles=car.roles,
-        step=lambda s, a, p, dt: rk4(s, a, p, dt),
-    )
-    x = drive(wrap(Library().effect(FRICTION[0], own), FRICTION[1], DT), trial())
-    np.testing.assert_allclose(x[:, 5], x[:, 1] * np.sin(x[:, 0]) / 0.15, atol=2e-3)
-
-
-def test_pythons_own_math_is_compiled_through_two_effects():
-    swing = Model(
-        states={"angle": "rad", "rate": "rad/s"},
-        inputs={"torque": "1"},
-        derivative=lambda s, a, p: {
-            "angle": s.rate,
-            "rate": max(a.torque, 0.0) - math.sin(s.angle),
-        },
-    )
-    model = swing
-    for name, values in (("offset:rate", {"c": 0.1}), ("input_gain:torque", {"g": 0.1})):
-        model = wrap(Library().effect(name, model), values, DT)
-    assert not model.system.note

@@ -13,7 +13,6 @@ from grounded.errors import GroundedError
 from grounded.estimate import (
     NoiseStd,
     Tracker,
-    cut,
     noise_of,
     of_function,
     of_states,
@@ -269,13 +268,6 @@ def test_the_noise_is_recovered_and_the_filter_is_consistent():
     assert (after < 0.6 * raw).all()
 
 
-def test_a_measurement_noise_that_is_known_is_kept():
-    _, trials = simulated(SPRING, np.random.default_rng(5), SPRING_NOISE, B=6, T=150)
-    found = noise_of(SPRING, trials, known=SPRING_NOISE.measurement)
-    np.testing.assert_allclose(found.noise.measurement, SPRING_NOISE.measurement)
-    assert np.allclose(np.log(found.noise.process / SPRING_NOISE.process), 0, atol=0.35)
-
-
 def test_a_filter_with_the_wrong_noise_is_called_inconsistent():
     truth, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
     wrong = NoiseStd(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
@@ -360,16 +352,6 @@ def test_a_model_that_runs_away_is_a_status():
     found = filter_trials(explosive, trials, SPRING_NOISE)[0]
     assert found.loglik == -np.inf
     assert "finite" in found.status
-
-
-def test_pieces_of_a_record_keep_their_latency_and_cover_it():
-    _, trials = simulated(SPRING, np.random.default_rng(10), SPRING_NOISE, B=1, T=100)
-    whole = record_of(SPRING, trials[0])
-    pieces = cut(whole, 1.0)
-    assert len(pieces) == 5
-    latency = np.array([0.12])
-    joined = np.vstack([piece.received(latency)[0] for piece in pieces])
-    assert np.allclose(joined, whole.received(latency)[0])
 
 
 def test_misuse_says_what_to_do():

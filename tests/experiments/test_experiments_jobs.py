@@ -21,7 +21,7 @@ from grounded.trial import Trial
 from grounded_trials.workspace.user_files.model_file import load_module
 from shared_data import SUPPORT
 
-joblib = pytest.importorskip("joblib", reason="joblib is not installed")
+pytest.importorskip("joblib", reason="joblib is not installed")
 
 
 def draws(count, sleep=0.0):
@@ -60,12 +60,6 @@ def test_a_worker_with_another_version_is_refused(monkeypatch):
     monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
     with pytest.raises(GroundedError, match=holding("version", "grounded")):
         run_jobs(draws(2), Engine(jobs=2))
-
-
-def test_the_same_job_twice_is_run_once():
-    seen = []
-    found = run_jobs(draws(1) * 3, progress=lambda done, total: seen.append(done))
-    assert len(found) == 3 and seen == [0, 1]
 
 
 def test_a_lost_worker_costs_its_job_only(tmp_path):

@@ -81,23 +81,6 @@ def results():
     }
 
 
-def test_the_bounds_of_theorem1_are_drawn_in_both_panels():
-    """Only the second panel had one, with a K of its own for each point."""
-    result = results()["theorem1"]
-    for panel, bound in zip(
-        PICTURES["theorem1"](result).panels,
-        (lambda e, K: K * e, lambda e, K: 2 * (K * e) ** 2),
-        strict=True,
-    ):
-        curves = {curve.role: curve for curve in panel.curves}
-        for role, K in (("limit", 2.0), ("model", 41.0)):
-            drawn = 10.0 ** curves[role].y
-            np.testing.assert_allclose(drawn, [bound(e, K) for e in (0.01, 0.1)])
-            for dot in panel.dots:
-                at = np.interp(dot.x, curves[role].x, curves[role].y)
-                assert dot.y <= at + 1e-12
-
-
 def test_every_study_has_its_picture():
     assert set(PICTURES) == set(STUDIES) == set(results())
 
@@ -122,50 +105,6 @@ def test_the_picture_holds_its_figure(name, tmp_path):
             marks = [len(trace["x"]) for trace in traces if trace["mode"] == "markers"]
             assert len(traces) - len(marks) == len(panel.curves) > 0
             assert sum(marks) == len(panel.dots)
-
-
-def test_flight_enlarges_what_is_too_small_to_see():
-    figure = PICTURES["flight"](results()["flight"])
-    whole, large, *_ = figure.panels
-    model, learned, desired = large.curves
-    assert "5 times" in large.title  # 2 m beside a loop of 80 m
-    assert np.allclose(model.x - desired.x, 5 * (whole.curves[0].x - whole.curves[2].x))
-    assert np.allclose(learned.x, desired.x)
-
-
-def test_the_turn_shows_its_iterations_and_the_circle_its_ends():
-    turn, circle, figure8, _ = PICTURES["car"](results()["car"]).panels
-    assert "with scatter" in turn.title and "repeats itself" in circle.title
-    roles = [curve.role for curve in turn.curves]
-    assert roles == ["model", "step1", "step2", "step3", "step3", "best", "desired"]
-    key = [one.name for one in PICTURES["car"](results()["car"]).key]
-    assert "iteration 3 and later" in key
-    assert [curve.role for curve in circle.curves] == ["model", "best", "desired"]
-    assert [curve.role for curve in figure8.curves] == ["model", "desired"]  # nothing learned
-
-
-def test_one_flight_has_no_standard_error_and_no_others():
-    many = results()["flight"]
-    one = FlightResult(many.runs[:1], many.optimum, many.desired)
-    cells = [cell for table in one.tables() for row in table.rows for cell in row[:2]]
-    assert not [cell for cell in cells if "nan" in cell or "±" in cell]
-    assert any("±" in cell for table in many.tables() for row in table.rows for cell in row[:2])
-    assert "other" not in {key.role for key in PICTURES["flight"](one).key}
-
-
-def test_the_car_that_repeats_itself_and_the_one_with_scatter_have_a_table_each():
-    quiet, scattered = results()["car"].tables()
-    assert [row[0] for row in quiet.rows] == ["circle"]
-    assert [row[0] for row in scattered.rows] == ["turn", "figure8"]
-    assert all(len(name) < 22 for table in (quiet, scattered) for name in table.head)
-
-
-def test_methods_that_need_too_many_trials_are_cut_and_say_so():
-    (panel,) = PICTURES["baselines"](results()["baselines"]).panels
-    grounded, refit, differences = panel.bars
-    assert (grounded.value, grounded.text, grounded.role) == (3, "3", "best")
-    assert refit.text == "not reached: ends at 90.0%" and refit.role == "model"
-    assert differences.value == 40 and differences.text == "600"
 
 
 @pytest.mark.extra("png")

@@ -1,4 +1,4 @@
-"""Budgets of time and memory, stamps, ids: what 0.1 read for minutes, or wrongly."""
+"""Budgets of time and memory, stamps, ids of channels."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bombs import BOMBS, OTHERS, explode, idl, log, ros
+from bombs import BOMBS, OTHERS, explode, log, ros
 from facts import holding
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_walk import DamagedFile, read_records
+from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
@@ -29,49 +29,21 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.within import MEMORY, SECONDS, OverBudget, within
 from pace import slowness
 
-QUICK = ("JSON, nested lists",)
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
-def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
-    """Fails on 0.1: 12 kB of JSON took 3.1 GB, a packed list 1.7 GB (FACTS 9)."""
-    told = {what: cost.wrong for what, cost in explode(name, tmp_path).items()}
-    assert not any(told.values()), told
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in BOMBS | OTHERS if name not in QUICK])
+@pytest.mark.parametrize("name", BOMBS | OTHERS)
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
-    """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9).
-
-    A budget of 1 s in place of 3 s, so that these take less of a CI's time.
-    """
     told = {what: cost.wrong for what, cost in explode(name, tmp_path, budget_s=1.0).items()}
     assert not any(told.values()), told
 
 
 def test_a_trial_in_many_small_chunks_is_read_in_linear_time() -> None:
-    """Fails on 0.1: time grew with the square of the steps, 19 s for 400,000 (FACTS 9)."""
     steps = 20_000
     trial = Trial(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), 1.0, ("x",), ("u",))
     data = trial_bytes(trial, {})
     began = time.process_time()
     assert read_trial(data)[0].steps == steps
-    assert time.process_time() - began < 2.0 * slowness()  # 0.15 here; 0.1 took 30 s
-
-
-def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) -> None:
-    """Fails on 0.1: each use of a constant read its text again, and of a typedef its chain."""
-    long = "1" + "0" * 2000
-    members = "".join(f"long m{i}[C];" for i in range(20_000))
-    text = f"const long C = {long};\nmodule a {{ struct M {{ {members} }}; }};"
-    path = tmp_path / "log.mcap"
-    path.write_bytes(idl(text))
-    began = time.process_time()
-    with pytest.raises(GroundedError) as refused:
-        read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
-    assert time.process_time() - began < slowness() and len(str(refused.value)) < 2000
+    assert time.process_time() - began < 2.0 * slowness()
 
 
 def endless() -> None:
@@ -127,23 +99,6 @@ def test_a_reader_ends_at_each_limit_which_is_named(
     assert set(Path(tempfile.gettempdir()).glob("grounded-*")) <= room
 
 
-def test_memory_and_time_are_limited_where_a_child_is_no_copy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setenv(SECONDS, "2")
-    for function, setting in ((endless, SECONDS), (slowly_hungry, MEMORY)):
-        with pytest.raises(OverBudget, match=holding("a.log", setting)):
-            within("a.log", 0, function)
-
-
-def slowly_hungry() -> None:
-    held = []
-    while True:
-        held.append(np.ones(10**6))
-        time.sleep(0.01)
-
-
 def test_results_and_errors_come_back(either: str) -> None:
     assert within("a.log", 10**8, echo, np.arange(5), b=[1]).tolist() == [1, 2, 3, 4, 5]
     with pytest.raises(DamagedFile, match="a hole") as damaged:
@@ -194,12 +149,6 @@ def note_and_wait(path: Path) -> None:
     endless()
 
 
-def test_a_setting_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(SECONDS, "much")
-    with pytest.raises(GroundedError, match="'much'"):
-        within("a.log", 0, divided)
-
-
 def two_channels() -> bytes:
     """Channel 1 is /a, then /b: 1.0 goes to /a, 2.0 to /b by the file's order."""
     stream = io.BytesIO()
@@ -227,7 +176,6 @@ def two_channels() -> bytes:
 
 
 def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
-    """Fails on 0.1: the numbers of /b were read as /a's (FACTS 9)."""
     path = tmp_path / "log.mcap"
     path.write_bytes(two_channels())
     with pytest.raises(DamagedFile, match=holding("channel 1", "'/a'", "'/b'")):
@@ -258,7 +206,6 @@ def test_negative_stamps_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stamp", ['{"sec": 1e30, "nanosec": 0}', '{"sec": null, "nanosec": 0}'])
 def test_stamps_outside_the_calendar_are_refused(stamp: str, tmp_path: Path) -> None:
-    """Fails on 0.1: a stamp of 1e30 s or of no number became some other time (FACTS 9)."""
     path = tmp_path / "log.mcap"
     good = '{"x": 1, "header": {"stamp": {"sec": 5, "nanosec": 0}}}'
     bad = f'{{"x": 1, "header": {{"stamp": {stamp}}}}}'
@@ -269,7 +216,6 @@ def test_stamps_outside_the_calendar_are_refused(stamp: str, tmp_path: Path) -> 
 
 
 def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path) -> None:
-    """Fails on 0.1: it wrapped around to 1677 (FACTS 9)."""
     path = tmp_path / "log.mcap"
     stream = io.BytesIO()
     writer = Writer(stream)
@@ -286,20 +232,7 @@ def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path
     assert saved.messages == {"/t": 2} and not saved.complete
 
 
-def test_a_trial_may_start_before_zero() -> None:
-    """Fails on 0.1: a start before 0, as in simulation time, was a traceback (FACTS 9)."""
-    trial = Trial(np.arange(6.0)[:, None], np.ones((5, 1)), 0.5, ("x",), ("u",))
-    back, meta, _ = read_trial(trial_bytes(trial, {}, start_ns=-3 * 10**9))
-    assert np.array_equal(back.states, trial.states) and meta["start_ns"] == "-3000000000"
-
-
-def test_small_chunks_are_handed_on_together(tmp_path: Path) -> None:
-    data = ros("float64 x", (b"\0\1\0\0" + bytes(8) for _ in range(1000)), chunk=1)
-    batches = [r for r in read_records(io.BytesIO(data), "f") if hasattr(r, "starts")]
-    assert len(batches) == 1 and len(batches[0]) == 1000
-    assert batches[0].log_times.tolist() == [i * 10**7 for i in range(1000)]
-
-
-def test_a_message_lists_few_names() -> None:
-    text = nearest("x", (f"name{i}" for i in range(100_000)))
-    assert len(text) < 1000 and "99960 more" in text
+def test_a_setting_that_is_no_number_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SECONDS, "much")
+    with pytest.raises(GroundedError, match="'much'"):
+        within("a.log", 0, divided)

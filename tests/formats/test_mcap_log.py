@@ -77,11 +77,6 @@ def names(trial: Trial) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return trial.state_names, trial.input_names
 
 
-def test_equal_trials_are_equal_files() -> None:
-    assert trial_bytes(a_trial(), {"a": "b"}, b"p") == trial_bytes(a_trial(), {"a": "b"}, b"p")
-    assert trial_bytes(a_trial(), {}) != trial_bytes(a_trial(seed=1), {})
-
-
 @pytest.mark.parametrize("feedback", [True, False])
 def test_a_candidate_comes_back_exactly(feedback: bool, tmp_path: Path) -> None:
     policy, rng = a_policy(feedback=feedback), np.random.default_rng(2)
@@ -114,22 +109,6 @@ def test_other_tools_read_named_fields() -> None:
     assert (summary.statistics.metadata_count, summary.statistics.attachment_count) == (1, 1)
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-def test_a_schema_is_what_the_protobuf_package_writes(repeated: bool) -> None:
-    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-
-    names = [f"größe_{i}" * (1 + i % 40) for i in range(300)]
-    files = FileDescriptorSet()
-    file = files.file.add(name="grounded/State.proto", package="grounded", syntax="proto3")
-    message = file.message_type.add(name="State")
-    label = Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
-    for number, name in enumerate(names, start=1):
-        message.field.add(name=name, number=number, label=label, type=Field.TYPE_DOUBLE)
-    mine = file_descriptor_set("State", names, repeated=repeated)
-    assert mine == files.SerializeToString(deterministic=True)
-
-
 def test_a_live_trial_that_is_cut_off_keeps_all_but_its_last_second(tmp_path: Path) -> None:
     path = tmp_path / "live.mcap"
     writer = TrialWriter(path, 0.02, {"x": "m"}, {"u": "1"}, {})
@@ -159,21 +138,6 @@ def test_a_live_trial_with_jitter_is_on_the_grid_and_one_with_a_gap_is_not() -> 
         else:
             with pytest.raises(GroundedError, match=r"\bsample 2[01]\b"):
                 read_trial(stream.getvalue())
-
-
-def test_a_live_trial_on_a_full_disk_says_so() -> None:
-    class Full(io.BytesIO):
-        def write(self, data: object) -> int:
-            if self.tell() > 3000:
-                raise OSError(28, "ENOSPC, full disk")
-            return super().write(data)  # type: ignore[arg-type]
-
-    writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
-    with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
-        for k in range(1000):
-            writer.append(k * 0.1, np.zeros(1), np.zeros(1))
-    with pytest.raises(GroundedError, match="expected 1 numbers"):
-        writer.append(0.0, np.zeros(2), None)
 
 
 def test_a_writer_never_overwrites(tmp_path: Path) -> None:
@@ -222,9 +186,46 @@ def test_reading_needs_no_mcap_and_no_protobuf() -> None:
     subprocess.run([sys.executable, "-c", code], input=source, check=True)
 
 
+def test_a_file_without_its_checksum_is_refused() -> None:
+    from mcap.writer import Writer
+
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.add_metadata("grounded", {"format": "grounded trial 1"})
+    writer.finish()
+    with pytest.raises(GroundedError, match=holding("checksum")):
+        read_trial(stream.getvalue())
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("names", [[], ["x"], ["n" * 10, "k" * 33, "w" * 127], ["ü"], ["w" * 130]])
+def test_our_own_definitions_are_known_without_the_library(
+    names: list[str], repeated: bool
+) -> None:
+    data = file_descriptor_set("State", names, repeated=repeated)
+    wanted = parse_protobuf(data, "grounded.State")
+    found = struct_of(Schema(1, "grounded.State", "protobuf", data))
+    assert found.name == wanted.name
+    assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]
+
+
+def test_a_live_trial_on_a_full_disk_says_so() -> None:
+    class Full(io.BytesIO):
+        def write(self, data: object) -> int:
+            if self.tell() > 3000:
+                raise OSError(28, "ENOSPC, full disk")
+            return super().write(data)  # type: ignore[arg-type]
+
+    writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
+    with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
+        for k in range(1000):
+            writer.append(k * 0.1, np.zeros(1), np.zeros(1))
+    with pytest.raises(GroundedError, match="expected 1 numbers"):
+        writer.append(0.0, np.zeros(2), None)
+
+
 NASTY = ["", "x", "-1", "0", "1e999", "nan", "inf", "null", "[]", "{}", "[[[1]]]", "[1e999, 2]"]
-NASTY += ['{"a": 1}', "[" * 10_000, '["a", "b"]', "[NaN, NaN]", "9" * 30, "\u0663", "-0.0", "0.05"]
-NASTY += ['{"v": "m/s", "x": "m", "psi": 3}', '{"depths": [1e300, -1], "low": 3}']
 
 
 @pytest.mark.parametrize("value", [None, *NASTY])
@@ -256,31 +257,7 @@ def test_a_strangers_metadata_is_read_or_refused_with_a_message(value: str | Non
             assert policy.horizon == 20 and np.isfinite(policy.feedforward).all()
 
 
-def test_a_file_without_its_checksum_is_refused() -> None:
-    from mcap.writer import Writer
-
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    writer.add_metadata("grounded", {"format": "grounded trial 1"})
-    writer.finish()
-    with pytest.raises(GroundedError, match=holding("checksum")):
-        read_trial(stream.getvalue())
-
-
 def test_a_candidate_that_lost_its_end_is_refused() -> None:
     candidate = encoded_candidate(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})[0]
     with pytest.raises(GroundedError, match=holding("21 steps", "21 messages")):
         read_candidate(with_metadata(candidate, "steps", "21"))
-
-
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("names", [[], ["x"], ["n" * 10, "k" * 33, "w" * 127], ["ü"], ["w" * 130]])
-def test_our_own_definitions_are_known_without_the_library(
-    names: list[str], repeated: bool
-) -> None:
-    data = file_descriptor_set("State", names, repeated=repeated)
-    wanted = parse_protobuf(data, "grounded.State")
-    found = struct_of(Schema(1, "grounded.State", "protobuf", data))
-    assert found.name == wanted.name
-    assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]

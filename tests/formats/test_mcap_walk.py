@@ -263,18 +263,3 @@ def test_messages_whose_lengths_repeat_are_found_as_if_followed_one_by_one(monke
                 mcap_walk.message_positions(data, 0, len(data))
             continue
         assert mcap_walk.message_positions(data, 0, len(data)) == expected
-
-
-def test_a_file_without_a_message_promises_no_rescue() -> None:
-    """A node crashed at once: `recover` saves what can be saved, said 70 bytes with nothing."""
-    stream = io.BytesIO()
-    Writer(stream).start()
-    begun = stream.getvalue()
-    for cut in (begun, begun[:-5]):
-        with pytest.raises(DamagedFile, match="holds no message") as caught:
-            plain(cut)
-        assert caught.value.then is None and "recover" not in str(caught.value)
-    whole = written()
-    with pytest.raises(DamagedFile) as caught:
-        plain(whole[: len(whole) // 2])
-    assert caught.value.then is not None

@@ -3,8 +3,6 @@
 import json
 import math
 import re
-import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,23 +10,17 @@ from rosbags.rosbag2 import StoragePlugin
 
 import workspaces
 from cli import grounded
-from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
 from grounded.places import integrals
 from grounded_trials import Workspace
-from grounded_trials.logs.inspection.inspect_pairs import velocities
 from grounded_trials.logs.inspection.joint_names import from_base
-from grounded_trials.report.gathering import gather
-from grounded_trials.starting.begin import _start, begin
-from grounded_trials.starting.first_toml import _inline, _span, held_first
+from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.candidates.exporting import void_exports
-from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import to_plan
-from grounded_trials.workspace.off_target import logged_target, rates_beside
+from grounded_trials.workspace.off_target import rates_beside
 from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
 from ros_bags import (
     arm_bag,
@@ -66,7 +58,6 @@ def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
 
 @pytest.mark.parametrize("seen", ["/car/pose", "/goal_pose"])
 def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
-    """Motion capture was passed over for the sum of the wheels' own speed."""
     found = begin(tmp_path / "w", car_bag(tmp_path / "bag", seen=seen))
     guesses = {one.name: one for one in found.states}
     assert guesses["v"].path == "/odom.twist.twist.linear.x"
@@ -79,23 +70,12 @@ def test_a_pose_that_is_measured_comes_before_wheel_odometry_s(tmp_path, seen):
         assert any("/odom" in reason for reason in guesses[name].reasons)
 
 
-@pytest.mark.parametrize("names", ["speed turn", "linear angular"])
-def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path, names):
-    """It was an arm of two wheels, and nothing was mapped to what it is commanded."""
-    log, w, model = rover_bag(tmp_path / "bag"), tmp_path / "w", None
-    if names != "speed turn":
-        begin(tmp_path / "first", log)
-        text = (tmp_path / "first/model.py").read_text()
-        model = tmp_path / "model.py"
-        for old, new in zip(("speed", "turn"), names.split(), strict=True):
-            text = text.replace(f"a.{old}", f"a.{new}").replace(f'"{old}": "', f'"{new}": "')
-        model.write_text(text)
-    found = begin(w, log, model=model)
-    assert (found.kind == "rover") is (model is None)
+def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path):
+    log, w = rover_bag(tmp_path / "bag"), tmp_path / "w"
+    found = begin(w, log)
     paths = {guess.name: guess.path for guess in found.inputs}
-    assert paths == dict(
-        zip(names.split(), ("/cmd_vel.linear.x", "/cmd_vel.angular.z"), strict=True)
-    )
+    assert found.kind == "rover"
+    assert paths == {"speed": "/cmd_vel.linear.x", "turn": "/cmd_vel.angular.z"}
     assert not found.unsure and found.dt == 0.05
     assert grounded("-C", w, "ingest", "--data", log).code == 0
 
@@ -119,40 +99,6 @@ def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(
     assert not found.unsure
     roles = Workspace(tmp_path / "arm").base_model.roles
     assert roles["level"] == ("shoulder_position", "elbow_position")  # from the base
-
-
-def test_torques_that_motion_does_not_tell_apart_are_unsure_and_both_are_named(tmp_path):
-    found = begin(tmp_path / "arm", commanded_arm_bag(tmp_path / "bag", goals=False))
-    inputs = {guess.name: guess for guess in found.inputs}
-    both = [f"/effort_controller/commands.data[{i}]" for i in range(2)]
-    assert [inputs[f"{joint}_effort"].path for joint in ("shoulder", "elbow")] == both
-    assert inputs["shoulder_effort"].others == (both[1],)
-    assert inputs["elbow_effort"].others == (both[0],)
-    assert {guess.name for guess in found.unsure} >= {"shoulder_effort", "elbow_effort"}
-
-
-def test_an_array_of_commands_comes_before_the_torques_that_were_measured(tmp_path):
-    """Efforts are what came out, after the drive's delay, at the rate of the encoders."""
-    log = commanded_arm_bag(tmp_path / "bag", measured_torques=True)
-    found = begin(tmp_path / "arm", log, kind="arm")
-    paths = ["/effort_controller/commands.data[0]", "/effort_controller/commands.data[1]"]
-    assert [guess.path for guess in found.inputs] == paths
-    assert found.dt == 0.02
-
-
-@pytest.mark.parametrize("goals", [True, False])
-def test_an_array_s_order_is_told_by_the_torques_that_were_measured(tmp_path, goals):
-    """An effort has its joint's name; a command that is another joint's does not go with it."""
-    order = ("elbow", "shoulder")  # not from the base
-    log = commanded_arm_bag(tmp_path / "bag", order, goals, measured_torques=goals)
-    found = begin(tmp_path / "arm", log, kind="arm")
-    inputs = {guess.name: guess for guess in found.inputs}
-    if not goals:  # nothing tells it; it is said what does
-        assert any("controller" in why for why in inputs["elbow_effort"].reasons)
-        return
-    for i, joint in enumerate(order):
-        assert inputs[f"{joint}_effort"].path == f"/effort_controller/commands.data[{i}]"
-    assert not found.unsure
 
 
 @pytest.mark.parametrize(
@@ -204,42 +150,6 @@ def test_degrees_and_signs_are_noticed(tmp_path, mine, scale, expected):
     assert any(s == pytest.approx(expected) for s in scales), scales
 
 
-def steered(tmp_path, scale=1.0, turned=1.0, name="steer"):
-    """A workspace of a car whose steering is `scale` times 0.4 rad in the log."""
-    (tmp_path / "car.py").write_text(
-        "from grounded import Model\n"
-        "import numpy as np\n"
-        "model = Model(states={'v': 'm/s', 'psi': 'rad'},\n"
-        f"    inputs={{'{name}': 'rad', 'a': 'm/s^2'}},\n"
-        f"    derivative=lambda s, a, p: {{'v': a.a, 'psi': s.v * np.tan(a.{name})}})\n"
-    )
-    t = np.arange(200) * 0.05
-    columns = [t, 1 + np.sin(t), turned * np.sin(t), scale * 0.4 * np.sin(2 * t), np.cos(t)]
-    header = f"t,v,psi,{name},a"
-    log = tmp_path / "r.csv"
-    np.savetxt(log, np.column_stack(columns), "%.5f", ",", header=header, comments="")
-    found = begin(tmp_path / "w", log, model=tmp_path / "car.py")
-    return next(g for g in found.inputs if g.name == name)
-
-
-@pytest.mark.parametrize(
-    ("scale", "turned", "name", "doubted"),
-    [
-        (1.0, 1.0, "steer", False),
-        (57.3, 1.0, "steer", True),
-        (57.3, 30.0, "steer", True),  # a steering does not follow the turns of the car
-        (57.3, 30.0, "joint", False),  # of several turns, as the state that follows it
-    ],
-)
-def test_a_steering_in_degrees_where_the_model_has_radians_is_unsure(
-    tmp_path, scale, turned, name, doubted
-):
-    """[limits] were written as +-22.9 rad without a doubt."""
-    guess = steered(tmp_path, scale, turned, name)
-    said = any("0.017453293" in why and "22.9" in why for why in guess.reasons)
-    assert said == doubted and (not guess.sure or not doubted)
-
-
 def test_a_person_is_asked_for_what_is_unsure(tmp_path, mine):
     asked = []
 
@@ -280,40 +190,6 @@ def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
     assert own == 0 and refused.code == 1 and "c0001.mcap" in refused.err
 
 
-def test_rates_are_found_in_any_model(mine, tmp_path):
-    begin(tmp_path / "w", arm_bag(tmp_path / "bag"), model=mine)
-    assert velocities(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
-
-
-TURNING = """
-from grounded import Model
-model = Model(
-    states={"psi": "rad", "w": "rad/s"}, inputs={"u": "N"}, angles=("psi",),
-    derivative=lambda s, a, p: {"psi": s.w, "w": a.u - s.w}, name="turning",
-)
-"""
-
-
-@pytest.mark.parametrize("named", [0.0, 1.0])
-def test_a_rate_that_a_name_gives_and_the_numbers_refute_is_sought_among_the_others(
-    tmp_path, named
-):
-    """A quaternion and a twist have a w, too: `w` was read from a number that is always 0."""
-    (tmp_path / "turning.py").write_text(TURNING)
-    rng, t = np.random.default_rng(0), 0.02 * np.arange(1500)
-    psi, gyro = 0.6 * np.sin(1.3 * t) + 0.3 * np.sin(3 * t), 0.78 * np.cos(1.3 * t)
-    gyro += 0.9 * np.cos(3 * t)
-    rows = np.column_stack([t, psi, named * np.sin(7 * t), gyro, np.cos(2 * t), np.sin(5 * t)])
-    rows[:, 1:3] += 1e-4 * rng.standard_normal((len(t), 2)) * [1, named]
-    head = "t,psi,w,imu.rate_z,u,battery"
-    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
-    found = begin(tmp_path / "w", tmp_path / "log.csv", model=tmp_path / "turning.py")
-    by = {g.name: g for g in (*found.states, *found.inputs)}
-    assert (by["w"].path, by["w"].sure) == ("/csv.imu_rate_z", False)
-    assert "/csv.w" in by["w"].others
-    assert by["psi"].path == "/csv.psi" and by["u"].path == "/csv.u"
-
-
 def test_the_real_car_of_a_laboratory(tmp_path):
     """DART: the speed has no name, and is found; what two topics hold is asked."""
     folder = data("dart_small_car")
@@ -326,30 +202,14 @@ def test_the_real_car_of_a_laboratory(tmp_path):
     assert not by["steering"].sure and len(by["steering"].others) == 1
 
 
-def test_an_input_that_is_held_at_its_largest_value_is_not_rounded_beyond_it():
-    """DART's throttle of 0.359677 was held at 0.3597, so that no command opened the workspace."""
-    held, (low, high) = _inline({"u": 0.3596774}), json.loads(_span((0.0, 0.3596774)))
-    assert low <= float(held.partition("= ")[2].removesuffix(" }")) <= high
-
-
-@pytest.mark.parametrize("name", ["flybag", "pitch-45bag", "roll2bag", "yx3bag"])
-def test_a_real_drone_s_commands_are_asked_for(tmp_path, name):
+def test_a_real_drone_s_commands_are_asked_for(tmp_path):
     """A Pose is abused for torques: no name says which, all that is commanded is offered."""
-    found = begin(tmp_path / "w", data("crazyflie_p4_ros2_mcap") / f"{name}.mcap")
+    found = begin(tmp_path / "w", data("crazyflie_p4_ros2_mcap") / "flybag.mcap")
     assert found.kind == "drone" and not any(g.path for g in found.inputs)
     assert all("/cf_controll.position.x" in g.others for g in found.inputs)
     by = {g.name: g for g in found.states}
     assert by["x"].path.startswith("/vicon/") and not by["x"].sure
     assert not any(by[name].path or by[name].sure for name in ("vx", "vy", "vz"))
-    assert gather(Folder(tmp_path / "w")).then.verb == "inspect"  # was `target` in the report
-
-
-def test_a_robot_in_the_plane_without_commands(tmp_path):
-    bag = data("mcap_format_fixtures") / "evo" / "nav2_turtlebot_SIM.mcap"
-    found = begin(tmp_path / "w", bag)
-    assert found.kind == "rover" and all(g.sure for g in found.states)
-    assert found.states[1].path == "/odom.twist.twist.angular.z"
-    assert not any(g.path for g in found.inputs)
 
 
 def test_what_only_the_log_names_is_never_sure(tmp_path):
@@ -414,7 +274,7 @@ def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn):
     assert "your model" in (tmp_path / "w/grounded.toml").read_text().splitlines()[0]
 
 
-@pytest.mark.parametrize("names", ["left,right", "u_left,u_right", "port,starboard"])
+@pytest.mark.parametrize("names", ["u_left,u_right", "port,starboard"])
 def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names):
     found = begin(tmp_path / "w", wheels(names))
     assert [guess.name for guess in found.inputs] == names.split(",")
@@ -428,7 +288,6 @@ def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names
 
 @pytest.mark.parametrize("names", ["left,right", "motor_right,motor_left"])
 def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp_path, names):
-    """It was "generic": six numbers that follow left and right with a lag."""
     found = begin(tmp_path / "w", wheels(names))
     assert found.kind == "differential" and not found.unsure
     model = Workspace(tmp_path / "w").base_model
@@ -441,38 +300,10 @@ def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp
     assert {"gain", "track", "tau_v", "tau_w"} == set(model.params)
 
 
-WHEEL = """
-from grounded import Model
-
-def f(s, a, p):
-    return {"angle": s.angle_rate, "angle_rate": -s.angle - a.pwm, "wheel_speed": 100 * a.pwm}
-
-model = Model(states={"angle": "rad", "angle_rate": "rad/s", "wheel_speed": "rad/s"},
-              inputs={"pwm": "1"}, angles=("angle",), derivative=f)
-"""
-
-
-def test_a_speed_in_rpm_is_the_state_its_name_begins_with(tmp_path):
-    """wheel_rpm was not found for wheel_speed, and offered for angle_rate instead."""
-    t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
-    rows = np.column_stack([t, 10 * np.sin(t), 300 * np.cos(2 * t), np.sin(3 * t)])
-    np.savetxt(log, rows, "%.5f", ",", header="t,angle_deg,wheel_rpm,pwm", comments="")
-    (tmp_path / "wheel.py").write_text(WHEEL)
-    done = grounded("init", tmp_path / "w", "--from", log, "--model", tmp_path / "wheel.py")
-    text = (tmp_path / "w/grounded.toml").read_text()
-    table = tomllib.loads(text)["log"]["state"]
-    assert table["wheel_speed"]["path"] == "/csv.wheel_rpm"
-    assert table["wheel_speed"]["scale"] == pytest.approx(np.pi / 30)
-    assert "angle_rate" not in table
-    said = " ".join(done.out.split())
-    assert holds(said.partition("angle_rate")[2], "estimate", "angle and wheel_speed")
-
-
 @pytest.mark.parametrize(
     ("left", "right"),
     [
         ("/thruster/left", "/thruster/right"),
-        ("/wamv/thrusters/left/thrust", "/wamv/thrusters/right/thrust"),
         ("/thruster_left", "/thruster_right"),
     ],
 )
@@ -491,7 +322,6 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_path, swapped):
-    """The kind was unknown, and neither thruster was found: exchanged, both push ahead alike."""
     found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag", swapped))
     assert found.kind == "boat" and not found.unsure
     order = [f"/thrusters/cmd.data[{k}]" for k in ((1, 0) if swapped else (0, 1))]
@@ -499,59 +329,15 @@ def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_p
     assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
 
 
-def test_a_number_offered_in_a_comment_comes_with_its_clock(tmp_path):
-    """A Float64MultiArray has no stamp: ingest refused the table after its # were removed."""
-    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="car")
-    assert not any(guess.path for guess in found.inputs)
-    path = tmp_path / "w/grounded.toml"
-    text = path.read_text()
-    assert '# clock = "log"' in text and "remove all 3 #" in text
-    used = {"steering": 0, "speed": 1}
-    for name, k in used.items():
-        head, _, rest = text.partition(f"# [log.input.{name}]")
-        block, _, after = rest.partition("\n\n")
-        lines = [line.removeprefix("# ") for line in f"[log.input.{name}]{block}".splitlines()]
-        lines[1] = lines[1].replace("data[0]", f"data[{k}]")
-        text = head + "\n".join(lines) + "\n\n" + after
-    path.write_text(text)
-    assert grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "bag").code == 0
-
-
-def test_a_generic_model_has_each_of_its_numbers_once(tmp_path):
-    """Its states were w and z, parts of the quaternion, read from a speed that is constant."""
-    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"), kind="generic")
-    paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
-    assert len(set(paths.values())) == len(paths) and "" not in paths.values()
-    assert paths["x"].endswith("position.x") and paths["linear_x"].endswith("linear.x")
-    assert paths["angular_z"].endswith("angular.z") and paths["data_1"].endswith("data[1]")
-    assert not any(".orientation." in path and "@" not in path for path in paths.values())
-
-
-def test_a_measured_rate_is_no_input(tmp_path):
-    """A boat's log taken for a drone's gave its odometry's turn rate as the command of the yaw."""
-    log = boat_bag(tmp_path / "bag", "/thruster/left", "/thruster/right")
-    found = begin(tmp_path / "w", log, kind="drone")
-    (rate,) = [guess for guess in found.inputs if guess.name == "yaw_rate"]
-    assert not rate.path and not rate.sure
-
-
-def test_speeds_measured_on_both_sides_are_no_commands(tmp_path):
-    left, right = "/wheel/left/speed", "/wheel/right/speed"
-    found = begin(tmp_path / "w", boat_bag(tmp_path / "bag", left, right))
-    assert found.kind not in ("differential", "boat")
-
-
 @pytest.mark.parametrize(
     ("names", "kind"),
     [
         ("x,v,pitch,pitch_rate,voltage [V]", "balance"),
         ("wheel_position,speed,tilt,tilt_rate,pwm", "balance"),
-        ("x,v,pitch,roll,thrust", "drone"),
         ("x,v,pitch,pitch_rate,battery", "generic"),  # no command
     ],
 )
 def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
-    """It was "generic": numbers that follow the voltage with a lag."""
     t, log = 0.01 * np.arange(600), tmp_path / "log.csv"
     pitch, x = 0.1 * np.sin(2 * t), 0.5 * np.sin(0.7 * t)
     rows = np.column_stack([t, x, np.gradient(x, t), pitch, np.gradient(pitch, t), np.cos(3 * t)])
@@ -572,7 +358,6 @@ def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
 
 
 def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
-    """Its position was a turn rate that is always 0, though the wheels' angles were in the log."""
     found = begin(tmp_path / "w", balancer_bag(tmp_path / "bag"))
     guesses = {g.name: g for g in (*found.states, *found.inputs)}
     assert found.kind == "balance" and guesses["motor_voltage"].path == "/motor_voltage.data"
@@ -595,11 +380,6 @@ def test_a_robot_that_balances_is_known_by_its_encoders(tmp_path):
     assert by_wheels[:2] == pytest.approx(by_ground[:2] - 0.035 * by_ground[2:], rel=1e-4)
 
 
-@pytest.mark.parametrize("names", ["left_encoder,right_encoder", "port,right"])
-def test_what_is_measured_on_both_sides_drives_nothing(wheels, tmp_path, names):
-    assert begin(tmp_path / "w", wheels(names)).kind == "generic"
-
-
 def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     log = wheels("aa,bb")
     rows = np.loadtxt(log, delimiter=",", skiprows=1)
@@ -614,25 +394,6 @@ def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     assert len(done["notes"]) == 1 and "model.py" in done["notes"][0]  # its equations are missing
     wrong = grounded("init", tmp_path / "u", "--from", log, "--inputs", "aa,cc")
     assert wrong.code == 1 and "cc" in wrong.err and not (tmp_path / "u").exists()
-
-
-def test_a_person_has_the_numbers_of_the_log_to_choose_from(wheels, tmp_path):
-    offered = {}
-    begin(
-        tmp_path / "w",
-        wheels("port,starboard"),
-        kind="rover",
-        ask=lambda guess: offered.setdefault(guess.name, guess.others) and "",
-    )
-    assert "/csv.port" in offered["turn"]
-
-
-def test_inspect_goes_on_as_init_does(wheels, tmp_path):
-    (tmp_path / "model.py").write_text(TWO_WHEELS)
-    found = begin(tmp_path / "w", wheels(), model=tmp_path / "model.py")
-    w = Workspace(tmp_path / "w")
-    assert w.inspect(wheels()).then == found.then
-    assert "unsure" not in grounded("-C", w.folder, "inspect", wheels()).out
 
 
 @pytest.fixture
@@ -657,16 +418,9 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert found.kind == "pendulum" and len(found.unsure) == 3
     paths = [g.path for g in (*found.states, *found.inputs)]
     assert paths == ["/csv.q", "/csv.w", "/csv.u"]
-    status = Workspace(tmp_path / "w").status()
-    assert status.then.verb == found.then.verb == "ingest" and not status.notes
-    assert Path(status.then.arguments[-1]).samefile(found.then.arguments[-1])
-    config = tmp_path / "w/grounded.toml"
-    config.write_text(re.sub("(?m)^seen_in.*", "", config.read_text()))
-    (note,) = Workspace(tmp_path / "w").status().notes
-    assert holds(note, "no log is stored", "`ingest --data LOG`", "`propose`")
+    assert Workspace(tmp_path / "w").status().then.verb == found.then.verb == "ingest"
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
-    assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
 
 
 def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung, tmp_path):
@@ -686,7 +440,6 @@ def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung,
 
 
 def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
-    """A balancer's pitch was the constant 0 of an Odometry, its measured tilt not even a rival."""
     t = 0.02 * np.arange(500)
     tilt, still = 0.1 * np.sin(2 * t), np.zeros_like(t)
     drive = 0.3 * np.sin(0.7 * t)
@@ -698,43 +451,6 @@ def test_a_number_that_never_changes_gives_way_to_one_that_does(tmp_path):
     assert found["pitch"].path.endswith("tilt") and not found["pitch"].sure
     assert "never changes" in found["pitch"].reasons[0]
     assert found["pitch_rate"].path.endswith("tilt_rate")
-
-
-def test_names_with_other_letters_and_times_in_an_unsaid_unit(tmp_path):
-    log, t = tmp_path / "log.csv", 10.0 * np.arange(400)
-    rows = np.column_stack([t, np.sin(t / 300), np.sign(np.cos(t / 300))])
-    head = "Zeit;Winkel;Stellgröße"
-    np.savetxt(log, rows, "%.4f", ";", header=head, comments="", encoding="utf-8")
-    found = begin(tmp_path / "w", log)
-    assert [g.name for g in found.inputs] == ["Stellgröße"]
-    assert any("_ms" in note for note in found.notes)
-    assert Workspace(tmp_path / "w").task.model.input_names == ("Stellgröße",)
-
-
-def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
-    model = tmp_path / "cart.py"
-    model.write_text(workspaces.MODEL)
-    found = begin(tmp_path / "w", swung("aa,cart_vel,force"), model=model)
-    assert [g.path for g in found.states] == ["/csv.aa", "/csv.cart_vel"]
-    assert (
-        not begin(tmp_path / "n", swung("aa,cart_vel,force", linked=False), model=model)
-        .states[0]
-        .path
-    )
-
-
-def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):
-    found = begin(tmp_path / "w", swung(linked=False))
-    assert found.kind == "generic" and "pendulum" in found.why
-    assert [g.name for g in found.inputs] == ["u"]
-    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
-
-
-def test_an_interval_that_nothing_says_is_called_a_guess(swung, tmp_path):
-    found = begin(tmp_path / "w", swung("aa,bb,cc"), kind="car")
-    text = (tmp_path / "w/grounded.toml").read_text()
-    assert found.dt == 0.05 and "a guess" in text and "commands" not in text.split("[limits]")[0]
-    assert found.then == found.look
 
 
 # targets
@@ -768,7 +484,6 @@ def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_pa
 
 
 def test_a_column_that_stays_has_the_range_of_its_unit():
-    """Seen: 100 each for a sway, a speed and a rate that were to stay zero."""
     t = np.linspace(0, 1, 21)
     units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s"}
     columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
@@ -791,23 +506,8 @@ def test_a_column_that_stays_has_the_range_of_its_unit():
     assert without_range(nearly, units) == ["psi", "v"]
 
 
-def test_of_a_target_that_stays_at_a_sensors_offset_the_weight_is_to_be_chosen(tmp_path):
-    grounded("init", tmp_path / "w", "--example", "pendulum")
-    w = Workspace(tmp_path / "w")
-    angle, rate = w.base_model.state_names
-    text = w.config.file.read_text()
-    held = re.sub(r"(?m)^start = .*$", f"start = {{ {angle} = 0.01738 }}", text)
-    assert held != text
-    w.config.file.write_text(held)
-    done = grounded(
-        "-C", w.folder, "target", "line", "--to", f"{angle}=0.01738", "--to", f"{rate}=1"
-    )
-    assert holds(done.err, f"{angle} stays at 0.01738", "choose the weight"), done.err
-
-
 @pytest.mark.parametrize("more", [(), ("--to", "psi=0")])
 def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
-    """It was held at 0 all along, against the position that moved."""
     w = tmp_path / "w"
     grounded("init", w, "--example", "car-circle")
     done = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=0", *more, "--json")
@@ -820,33 +520,6 @@ def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
     assert moving.code == 1 and "--to v=0" in moving.err
     nowhere = grounded("-C", w, "target", "line", "--to", "v=0")
     assert nowhere.code == 1 and "--to x=" in nowhere.err
-
-
-def test_a_velocity_ends_at_rest_on_a_path_with_hold():
-    """Also of a robot whose velocities are those of its coordinates, without roles."""
-    point = Model(
-        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
-        inputs={"ax": "m/s^2", "ay": "m/s^2"},
-        roles={"position": ("x", "y")},
-        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
-    )
-    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
-    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
-    for place, rate in (("x", "vx"), ("y", "vy")):
-        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
-        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
-    assert (columns["side"] == 0).all()  # moves nothing
-    with pytest.raises(GroundedError, match="--hold"):
-        path_target("circle", Drive(), point, 0.02, to)
-
-
-def test_a_swing_up_does_not_hold_the_rate_of_its_angle():
-    from grounded.models.pendulum import model
-
-    angle, rate = model.state_names
-    assert swing_up(model, 0.02, 2.0, {angle: math.pi})
-    with pytest.raises(GroundedError, match=rate):
-        swing_up(model, 0.02, 2.0, {rate: 0.0})
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
@@ -875,7 +548,6 @@ def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
     ],
 )
 def test_a_line_takes_the_seconds_that_are_given(tmp_path, paces, most):
-    """They were left aside without a word: 4 s had become 2.8 s."""
     made = workspaces.make(tmp_path / "w")
     words = ("target", "line", "--to", "x=2", "--seconds", "4", *paces)
     done = grounded("-C", made.folder, *words, "--json").json
@@ -905,7 +577,6 @@ def test_seconds_that_a_target_can_t_take_are_refused(tmp_path, words, said):
 
 
 def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
-    """A boom was told to have a role 'position' of two states; a step began at 0."""
     cart = workspaces.MODEL.replace(', "speed": "v"', "").replace('"position": ("x",)', "")
     config = workspaces.CONFIG.replace('"target.csv"\n', '"target.csv"\nstart = { x = 0.5 }\n', 1)
     made = workspaces.make(tmp_path / "w", model=cart, config=config)
@@ -915,25 +586,12 @@ def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
     x, v = rows[:, names.index("x")], rows[:, names.index("v")]
     assert x[0] == 0.5 and v[0] == v[-1] == 0 and len(rows) == done.json["horizon"] + 1
     np.testing.assert_allclose(np.diff(x) / 0.05, (v[1:] + v[:-1]) / 2, atol=0.02)
-    held = grounded("-C", made.folder, "target", "line", "--to", "x=-1", "--hold", "1", "--json")
-    names, rows = read_target(made.folder / "target.csv")
-    assert len(rows) == held.json["horizon"] + 1 and (rows[-20:, 1:] == [-1, 0]).all()
-    assert grounded("-C", made.folder, "target", "line", "--hold", "-1").code == 1
     further = grounded("-C", made.folder, "target", "line", "--size", "2", "--json").json
     assert further["columns"]["x"] == [0.5, 2.5]
     step = grounded("-C", made.folder, "target", "step", "--to", "x=1", "--json").json
     assert step["columns"] == {"x": [0.5, 1.0]}
-    for shape, to, said in (("circle", (), "--to STATE"), ("line", ("--to", "x=0.5"), "x = 0.5")):
-        refused = grounded("-C", made.folder, "target", shape, *to)
-        assert refused.code == 1 and said in refused.err
-    free = "def f(s, a, p):\n    return {'b': a.u, 'c': s.b * a.u}\n"
-    (made.folder / "model.py").write_text(
-        f"from grounded import Model\n{free}\n"
-        "model = Model(states={'b': '1', 'c': '1'}, inputs={'u': '1'}, params={}, derivative=f)\n"
-    )
-    (made.folder / "grounded.toml").write_text(config.replace("x = ", "b = ").replace("force", "u"))
-    refused = grounded("-C", made.folder, "target", "line")
-    assert refused.code == 1 and "--to b=1.0" in refused.err
+    for words in (("circle",), ("line", "--to", "x=0.5")):
+        assert grounded("-C", made.folder, "target", *words).code == 1
 
 
 def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):
@@ -957,7 +615,6 @@ def furuta(s, a, p):
 
 
 def test_a_swing_up_is_of_the_angle_that_hangs(tmp_path):
-    """The arm of a Furuta pendulum came first and was sent to pi, where the run also began."""
     model = Model(
         states={"arm": "rad", "hung": "rad", "w": "rad/s", "v": "rad/s"},
         inputs={"volts": "V"},
@@ -993,10 +650,7 @@ def test_a_csv_of_states_is_a_target_where_logs_are_csv_too(swung, tmp_path):
     assert done["columns"] == {"q": [0.0, 2.0], "w": [1.0, 1.0]}
     done = grounded("-C", w, "target", swung(), "--json").json  # a log is read through [log]
     assert done["horizon"] > 100 and set(done["columns"]) == {"q", "w"}
-    wrong = grounded("-C", w, "ingest", "--data", tmp_path / "run.csv")
-    said = " ".join(wrong.err.split())
-    assert wrong.code == 1 and "'u' is read from '/csv.u'" in said and "'q' is" not in said
-    assert said.count("csv, time in") == 1
+    assert grounded("-C", w, "ingest", "--data", tmp_path / "run.csv").code == 1
 
 
 def test_logs_are_fitted_and_diagnosed_without_a_task(tmp_path):
@@ -1045,36 +699,7 @@ def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path
     assert void_exports(w, made) == ()
 
 
-def test_a_target_on_another_grid_is_brought_to_it_by_the_command_that_the_error_names(tmp_path):
-    """`[task] dt` was changed below a target.csv that `init` had written."""
-    made = workspaces.make(tmp_path / "w")
-    file = made.folder / "grounded.toml"
-    before = read_target(made.folder / "target.csv")[1]
-    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
-    refused = grounded("-C", made.folder, "propose")
-    assert refused.code == 1 and "dt = 0.025 s, but" in refused.err
-    named = refused.err.replace("\\\n", "").split("next: grounded ")[1].split()
-    assert grounded(*named).code == 0
-    after = read_target(made.folder / "target.csv")[1]
-    np.testing.assert_allclose(after[::2], before, atol=1e-9)
-    assert grounded("-C", made.folder, "propose").code == 0
-
-
-def test_the_weights_of_an_end_that_a_comment_offers_follow_the_target(tmp_path):
-    """A user's own remark was overwritten, too."""
-    made = begin(tmp_path / "w", car_bag(tmp_path / "bag"))
-    file, mine = Path(made.workspace) / "grounded.toml", "# terminal = { psi = 7 }"
-    file.write_text(file.read_text().replace("[reward]", f"{mine}\n[reward]"))
-    assert grounded("-C", made.workspace, "target", "line", "--to", "x=2").code == 0
-    (own, offered) = re.findall(r"(?m)^# terminal = .*$", file.read_text())
-    weights = tomllib.loads(f"{offered.removeprefix('# ')}\n{file.read_text()}")
-    assert own == mine and weights["terminal"].keys() == weights["reward"]["state"].keys()
-    for name, weight in weights["reward"]["state"].items():
-        assert weights["terminal"][name] == pytest.approx(10 * weight)
-
-
 def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):
-    """It had all four numbers follow an input `u`, which the log did not have, with lags."""
     rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
     servo = 10 * np.sign(np.sin(2 * t)) + rng.normal(0, 1, len(t))
     ball, speed = 80 * np.sin(1.3 * t), 104 * np.cos(1.3 * t) + rng.normal(0, 2, len(t))
@@ -1091,22 +716,8 @@ def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_
     assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
 
 
-def test_a_number_of_noise_alone_is_no_state_of_a_generic_skeleton(tmp_path):
-    """A car's roll rate was one, and a weight of 100 was put on it."""
-    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
-    columns = [t, np.sin(t), rng.normal(0, 0.005, len(t)), np.sign(np.sin(2 * t))]
-    header = "t,pose,roll_rate,servo"
-    table = np.column_stack(columns)
-    np.savetxt(tmp_path / "a.csv", table, "%.5f", ",", header=header, comments="")
-    command = ("init", tmp_path / "w", "--from", tmp_path / "a.csv", "--inputs", "servo")
-    made = grounded(*command)
-    assert made.code == 0 and "left out of model.py: roll_rate" in made.err
-    assert Workspace(tmp_path / "w").base_model.state_names == ("pose",)
-
-
 @pytest.mark.parametrize("name", ["force", "grip [N]"])
 def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
-    """A cart's force became a state, beside an input `u` that the log did not have."""
     t = 0.02 * np.arange(500)
     table = np.column_stack([t, np.sin(t), np.cos(t), 3 * np.sin(2.2 * t)])
     header = f"t,x,v,{name}"
@@ -1117,18 +728,48 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
 
 
-def test_an_input_that_never_changes_is_reported_as_constant(tmp_path):
-    """It was "no number of the log", though the log has that column."""
-    t = 0.02 * np.arange(500)
-    table = np.column_stack([t, np.sin(t), np.cos(t), 0.1 + 0 * t])
-    np.savetxt(tmp_path / "c.csv", table, "%.5f", ",", header="t,x,v,steering", comments="")
-    words = ("--from", tmp_path / "c.csv", "--inputs", "steering")
-    made = grounded("init", tmp_path / "w", *words)
-    assert made.code == 1 and holds(made.err, "'steering' is constant (0.1)")
+def test_a_robot_in_the_plane_without_commands(tmp_path):
+    bag = data("mcap_format_fixtures") / "evo" / "nav2_turtlebot_SIM.mcap"
+    found = begin(tmp_path / "w", bag)
+    assert found.kind == "rover" and all(g.sure for g in found.states)
+    assert found.states[1].path == "/odom.twist.twist.angular.z"
+    assert not any(g.path for g in found.inputs)
+
+
+def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):
+    found = begin(tmp_path / "w", swung(linked=False))
+    assert found.kind == "generic" and "pendulum" in found.why
+    assert [g.name for g in found.inputs] == ["u"]
+    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
+
+
+def test_a_velocity_ends_at_rest_on_a_path_with_hold():
+    point = Model(
+        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
+        inputs={"ax": "m/s^2", "ay": "m/s^2"},
+        roles={"position": ("x", "y")},
+        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
+    )
+    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
+    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
+    for place, rate in (("x", "vx"), ("y", "vy")):
+        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
+        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
+    assert (columns["side"] == 0).all()  # moves nothing
+    with pytest.raises(GroundedError, match="--hold"):
+        path_target("circle", Drive(), point, 0.02, to)
+
+
+def test_a_swing_up_does_not_hold_the_rate_of_its_angle():
+    from grounded.models.pendulum import model
+
+    angle, rate = model.state_names
+    assert swing_up(model, 0.02, 2.0, {angle: math.pi})
+    with pytest.raises(GroundedError, match=rate):
+        swing_up(model, 0.02, 2.0, {rate: 0.0})
 
 
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
-    """A step to 60 m, of 60 cm, was drawn without a word."""
     made = workspaces.make(tmp_path / "w")
     file = made.folder / "grounded.toml"
     file.write_text(re.sub(r"(?m)^\[safety\]\n(?:\w.*\n)*", "", file.read_text()))
@@ -1139,57 +780,26 @@ def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
     assert "[safety]" not in near.err and "[safety]" in far.err and "60" in far.err
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_a_hover_that_trembles_within_its_noise_is_a_rest(seed):
-    """Two of four hovers gave no start: commands scattered by a twentieth of their range."""
-    rng, t = np.random.default_rng(seed), 0.02 * np.arange(500)
-    moves = np.clip(t - 1, 0, None)
-    columns = {
-        "z": 0.8 + 0.3 * np.sin(moves) + rng.normal(0, 1e-3, 500),
-        "vz": 0.3 * np.cos(moves) * (t > 1) + rng.normal(0, 0.012, 500),
-    }
-    sent = {"thrust": 5.33 + 1.5 * np.sin(2 * moves) + rng.normal(0, 0.07, 500)}
-
-    def v(s, a, p):
-        return {"z": s.vz, "vz": a.thrust - 5.33}
-
-    model = Model({"z": "m", "vz": "m/s"}, {"thrust": "N"}, {}, derivative=v)
-    ranges = {n: (x.min(), x.max()) for n, x in {**columns, **sent}.items()}
-    found = held_first(model, columns, sent, 0.02, ranges)
-    assert found["z"] == pytest.approx(0.8, abs=0.002)
-    assert found["thrust"] == pytest.approx(5.33, abs=0.1)
-    ramp = {"thrust": sent["thrust"] + np.clip(1 - 2 * t, 0, None)}  # it is still settling
-    assert not held_first(model, columns, ramp, 0.02, ranges)
-    sinks = {**columns, "z": columns["z"] - 0.3 * t}
-    assert held_first(model, sinks, sent, 0.02, ranges) is None
-    low = {**columns, "z": columns["z"] - 0.8}
-    idle = {"thrust": np.where(t > 1, sent["thrust"] - 5.33, 0.0)}
-    spans = {n: (x.min(), x.max()) for n, x in {**low, **idle}.items()}
-    assert held_first(model, low, idle, 0.02, spans) == {}  # an arm hung at 0: "shows no rest"
-    assert _start(model, {}, ()).startswith("empty, that is 0, where it stood")
-    assert _start(model, None, ()).startswith("empty, the log shows no rest")
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [("0.1,1.5", ()), ("{sine:.4f},1.5", ("--inputs", "force"))],
+    ids=["nothing changes", "the input is constant"],
+)
+def test_a_log_in_which_nothing_to_learn_from_changes_is_refused(tmp_path, rows, words):
+    lines = [f"{0.05 * k:.2f},{rows.format(sine=math.sin(k))}" for k in range(100)]
+    (tmp_path / "off.csv").write_text("\n".join(["t,x,force", *lines]) + "\n")
+    done = grounded("init", tmp_path / "w", "--from", tmp_path / "off.csv", *words)
+    assert done.code == 1 and not (tmp_path / "w").exists()
 
 
-SLED = """from grounded import Model, Param
-
-def f(s, a, p):
-    return {"x": s.v, "v": (a.force - 2 * s.v) / p.m}
-
-model = Model(states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
-              params={"m": Param(1.0, "kg", 0.5, 2.0)}, derivative=f)
-"""
-
-
-def test_a_log_whose_first_row_is_off_the_grid_is_known_again_in_its_target(tmp_path):
-    """After `ingest --data`, which starts at a step of the commands, no `target` was asked for."""
-    (tmp_path / "model.py").write_text(SLED)
-    t = np.r_[0.0083, 0.04 * np.arange(1, 200)]
-    force = np.sin(2 * t) + np.sin(5.3 * t)
-    x, v = np.cumsum(np.cumsum(force)) * 0.04**2, np.cumsum(force) * 0.04
-    table = np.column_stack([t, x + 1e-3 * np.sin(99 * t), v + 0.01 * np.cos(77 * t), force])
-    np.savetxt(tmp_path / "hand.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
-    begin(tmp_path / "w", tmp_path / "hand.csv", model=tmp_path / "model.py")
-    taken = Workspace(tmp_path / "w").ingest(tmp_path / "hand.csv", data=True)
-    assert any("is used from 0.032 s on" in note for note in taken.notes)
-    assert logged_target(Workspace(tmp_path / "w")) == "t0001"
-    assert to_plan(Workspace(tmp_path / "w")).verb == "target"
+def test_a_target_on_another_grid_leads_to_the_command_that_resamples_it(tmp_path):
+    made = workspaces.make(tmp_path / "w")
+    file = made.folder / "grounded.toml"
+    before = read_target(made.folder / "target.csv")[1]
+    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
+    with pytest.raises(GroundedError) as refused:
+        Workspace(made.folder).propose()
+    then = refused.value.then
+    assert grounded("-C", made.folder, then.verb, *then.arguments).code == 0
+    np.testing.assert_allclose(read_target(made.folder / "target.csv")[1][::2], before, atol=1e-9)
+    assert grounded("-C", made.folder, "propose").code == 0

@@ -47,7 +47,6 @@ def log(tmp_path_factory):
 
 @pytest.mark.parametrize("xml", ["arm.xml", "model.py"])
 def test_an_mjcf_file_is_a_model_and_comes_along(tmp_path, monkeypatch, log, xml):
-    """It was read as Python, or left behind, or sought in whatever folder a command came from."""
     robot, w = tmp_path / "robot", tmp_path / "w"
     robot.mkdir()
     (robot / "arm.xml").write_text(MJCF)
@@ -82,15 +81,6 @@ def test_limits_of_a_model_file_are_taken_without_a_log_and_told_beside_those_of
         if "file says" in line
     ]
     assert len(told) == 1 and told[0].startswith("shoulder =") and "[-9, 8]" in told[0]
-
-
-def test_an_mjcf_s_steps_are_as_long_as_its_own_allow(tmp_path):
-    """Steps of 0.05 s told inputs apart; of 4 ms there are twelve and a half in it."""
-    (tmp_path / "arm.xml").write_text(MJCF)
-    log = commanded_arm_bag(tmp_path / "bag")
-    found = begin(tmp_path / "w", log, model=tmp_path / "arm.xml")
-    paths = [guess.path for guess in found.inputs]
-    assert paths == [f"/effort_controller/commands.data[{i}]" for i in range(2)]
 
 
 @pytest.mark.parametrize("inside", [True, False])

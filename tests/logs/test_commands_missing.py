@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from cli import grounded, plain
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
@@ -71,37 +70,9 @@ def test_ingest_refuses_an_input_on_the_path_of_a_state(tmp_path, model):
         Workspace(tmp_path / "w").ingest(log, data=True)
 
 
-def test_a_renamed_topic_names_all_that_is_read_from_it(tmp_path, model):
-    begin(tmp_path / "w", excavator(tmp_path / "bag"), model=model)
-    renamed = excavator(tmp_path / "renamed", topic="/arm/joint_states")
-    with pytest.raises(GroundedError) as refused:
-        Workspace(tmp_path / "w").ingest(renamed, data=True)
-    told = str(refused.value)
-    assert "boom, stick, boom_rate and stick_rate are read from /joint_states" in told
-    assert "renamed to /arm/joint_states, edit their paths in [log]" in told
-    assert refused.value.then.verb == "inspect"
-
-
 def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
-    """`target line --to` began at 0, 0, where the arm never was."""
     begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
     assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}
     moving = tmp_path / "moving"
     begin(moving, excavator(tmp_path / "bag2"), model=model)
     assert Workspace(moving).config.task.start == {}
-
-
-def test_a_recovered_log_that_log_can_read_is_to_be_ingested(tmp_path, model):
-    """After `recover` of a manual log, `next:` was `inspect`."""
-    log = excavator(tmp_path / "bag", still=100, storage=StoragePlugin.MCAP)
-    begin(tmp_path / "w", log, model=model)
-    cut = tmp_path / "cut.mcap"
-    whole = next(log.glob("*.mcap")).read_bytes()
-    cut.write_bytes(whole[: len(whole) * 2 // 3])
-    refused = grounded("-C", tmp_path / "w", "ingest", "--data", cut)
-    assert f"(at byte {cut.stat().st_size})" in refused.err
-    done = grounded("-C", tmp_path / "w", "recover", cut)
-    saved = tmp_path / "cut-recovered.mcap"
-    assert plain(done.out).rstrip().endswith(f"ingest --data {saved}") and done.code == 3
-    elsewhere = grounded("-C", tmp_path, "recover", cut, "-o", tmp_path / "again.mcap")
-    assert "inspect" in plain(elsewhere.out).splitlines()[-1]

@@ -185,12 +185,6 @@ def test_fit_gives_intervals_and_errors_on_held_out_time_that_shrink(fitted):
 
 
 @pytest.mark.slow
-def test_fit_says_so_in_words(dart, fitted):
-    text = grounded("-C", dart[0], "fit", "--params", "gain,steer")
-    assert text.code == 0 and holds(text.out, "95 %", "held-out")
-
-
-@pytest.mark.slow
 def test_a_circle_for_that_car_inside_its_limits(dart, fitted):
     folder = dart[0]
     done = grounded("-C", folder, "propose", "--json")
@@ -213,20 +207,3 @@ def test_without_estimates_what_is_missing_is_named(dart, tmp_path):
     (tmp_path / "grounded.toml").write_text(bare)
     done = grounded("-C", tmp_path, "ingest", log, "--data")
     assert done.code == 1 and holds(done.err, "[log]", "'v'", "[estimate]")
-
-
-@pytest.mark.slow
-def test_a_wrong_path_names_what_the_message_has(dart, tmp_path):
-    folder, log, _ = dart
-    for name in ("model.py", "target.csv"):
-        (tmp_path / name).write_text((folder / name).read_text())
-    for old, new, part in (
-        ("pose.pose.position.x", "pose.pose.positon.x", "position"),
-        ("/steering_1.data", "/steering_1.date", "data"),
-        ("/steering_1.data", "/steerin_1.data", "/steering_1"),
-        ('"/safety_value.data", above = 0.5', '"/safety_value.data", above = 99', "safety_value"),
-    ):
-        (tmp_path / "grounded.toml").write_text(CONFIG.replace(old, new, 1))
-        done = grounded("-C", tmp_path, "ingest", log, "--data")
-        assert done.code == 1 and part in done.err and "Traceback" not in done.err, done.err
-        assert not (tmp_path / "trials").exists() or not list((tmp_path / "trials").glob("*.mcap"))

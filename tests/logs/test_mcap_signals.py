@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, read_log
-from grounded_trials.logs.resample import Crossing, Span
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from shared_data import data, files, needs_data
 
@@ -79,14 +77,6 @@ def test_a_folder_of_split_files_is_one_log(tmp_path: Path) -> None:
         log_files([tmp_path / "bag_0.mcap", tmp_path / "no.mcap"])
 
 
-@needs_data
-def test_split_bags_of_rosbag2() -> None:
-    parts = files("mcap_format_fixtures/rosbag2/*multiple_files_[012].mcap")
-    assert len(parts) == 3
-    with pytest.raises(GroundedError, match=holding("/chatter.data", "string")):
-        read_signals(parts, {"c": SignalSpec("/chatter.data", "log")})
-
-
 def test_the_foxglove_sdk(tmp_path: Path) -> None:
     foxglove = pytest.importorskip("foxglove")
     from foxglove.channels import PoseInFrameChannel
@@ -124,43 +114,6 @@ def test_the_foxglove_sdk(tmp_path: Path) -> None:
     assert gridded.reports[0].skew_s == pytest.approx(-0.005)
 
 
-def test_rosbags_bags_with_a_message_of_ones_own(tmp_path: Path) -> None:
-    rosbag2 = pytest.importorskip("rosbags.rosbag2")
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    text = "std_msgs/Header header\nstring joint\nfloat32[] current\ngeometry_msgs/Vector3 force"
-    store.register(get_types_from_msg(text, "robot/msg/Motor"))
-    make = store.types
-    folder = tmp_path / "bag"
-    options = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
-    with rosbag2.Writer(folder, **options) as writer:
-        connection = writer.add_connection("/motor", "robot/msg/Motor", typestore=store)
-        for i in range(300):
-            stamp = make["builtin_interfaces/msg/Time"](sec=i // 100, nanosec=i % 100 * 10**7)
-            body = make["robot/msg/Motor"](
-                header=make["std_msgs/msg/Header"](stamp=stamp, frame_id="f" * (i % 7)),
-                joint="left" if i % 2 else "right",
-                current=np.arange(i % 5, dtype=np.float32) + i,
-                force=make["geometry_msgs/msg/Vector3"](x=3.0, y=4.0, z=float(i)),
-            )
-            writer.write(connection, i * 10**7 + 77, store.serialize_cdr(body, "robot/msg/Motor"))
-    found = read_signals(
-        folder,
-        {
-            "left": SignalSpec('/motor{joint=="left"}.force.z'),
-            "last": SignalSpec("/motor.current[-1]"),
-            "norm": SignalSpec("/motor.force.@norm"),
-        },
-    )
-    i = np.arange(300)
-    assert found["left"].values.tolist() == i[1::2].tolist()
-    assert found["left"].t.tolist() == (i[1::2] * 10**7).tolist()
-    wanted = [k + k % 5 - 1 for k in i.tolist() if k % 5]
-    assert found["last"].values.tolist() == wanted and found["last"].messages == 300
-    np.testing.assert_allclose(found["norm"].values, np.hypot(5, i))
-
-
 def test_ros1_in_mcap(tmp_path: Path) -> None:
     text = "Header header\nfloat64 v\n" + "=" * 80 + "\nMSG: std_msgs/Header\n"
     text += "uint32 seq\ntime stamp\nstring frame_id\n"
@@ -183,54 +136,6 @@ def refused(path: Any, spec: SignalSpec, says: str) -> None:
     with pytest.raises(GroundedError) as caught:
         read_signals(path, {"steering": spec})
     assert says in str(caught.value), str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "asked, header, meant",
-    [
-        ("x", "t,x_mm,vx,theta", "x_mm"),
-        ("theta_deg", "t,x,theta,header", "theta"),
-        ("theta_deg", "t,theta2_deg,theta_rad", "theta_rad"),
-        ("speed_kmh", "t,speed_kmx,speed_mps", "speed_mps"),
-        ("thta", "t,x,theta_rad,theta", "theta"),  # no unit, and no such word
-    ],
-)
-def test_the_same_word_with_another_unit_is_what_was_meant(
-    tmp_path: Path, asked: str, header: str, meant: str
-) -> None:
-    """`x` beside `x_mm` was asked for as 'vx', `theta_deg` as 'header'."""
-    path = tmp_path / "a.csv"
-    row = ",".join(["0.1"] * (header.count(",") + 1))
-    path.write_text(f"{header}\n{row}\n{row.replace('0.1', '0.2')}\n")
-    refused(path, SignalSpec(f"/csv.{asked}"), f"did you mean '{meant}'?")
-
-
-def test_what_a_person_is_told(tmp_path: Path) -> None:
-    path = floats(tmp_path / "a.mcap", 0, 10)
-    refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")
-    refused(path, SignalSpec("/u.datum"), "has no field 'datum': did you mean 'data'?")
-    refused(path, SignalSpec("/u.data"), 'no header stamp; set clock = "log"')
-    refused(path, SignalSpec("/u"), "it ends at a std_msgs/Float32; add one of its fields: data")
-    refused(path, SignalSpec("/u.data.@jaw", "log"), "no function '@jaw'")
-    refused(tmp_path / "no.mcap", U, "does not exist")
-    refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u': none is defined")
-    (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
-    refused(tmp_path / "c.mcap", U, "`recover` saves")
-
-
-def test_a_log_that_is_missing_is_none_of_the_candidates_beside_it(tmp_path):
-    """`valid names: c0001.npz, ...`: those are to be run, and no logs."""
-    for name in ("c0001.npz", "c0002.mcap", "target.csv"):
-        (tmp_path / name).touch()
-    with pytest.raises(GroundedError, match="does not exist") as missing:
-        log_files(tmp_path / "s1.csv")
-    assert "c000" not in str(missing.value) and "target" not in str(missing.value)
-    (tmp_path / "s2.csv").touch()
-    with pytest.raises(GroundedError, match=r"did you mean 's2\.csv'"):
-        log_files(tmp_path / "s1.csv")
-    with pytest.raises(GroundedError, match=r"the folder has s2\.csv") as unlike:
-        log_files(tmp_path / "monday_afternoon.mcap")
-    assert "valid names" not in str(unlike.value)
 
 
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:
@@ -328,21 +233,6 @@ def test_a_transform_is_picked_by_its_frame_and_stamped_by_its_own_header() -> N
     assert list(zip(found.t.tolist(), found.values.tolist(), strict=True)) == wanted
 
 
-@needs_data
-def test_dart_span_and_delay() -> None:
-    path = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
-    mapping = LogMapping(
-        {"x": SignalSpec("/vicon/jetracer1.pose.pose.position.x")},
-        {"u": SignalSpec("/throttle_1.data", "log")},
-        Span(Crossing("/safety_value.data", above=0.0), 62.0),
-    )
-    found = read_log(path, mapping, 0.05)
-    assert found.late_s == 0.0 and found.start_inputs is not None
-    assert found.reports[0].skew_s == pytest.approx(-0.006, abs=0.002)
-    assert found.reports[0].rate_hz == pytest.approx(100, abs=0.1)
-    assert json.dumps([list(r.__dict__) for r in found.reports])  # plain data
-
-
 def test_reading_takes_memory_for_what_is_mapped_only(tmp_path: Path) -> None:
     import tracemalloc
 
@@ -362,3 +252,16 @@ def test_reading_takes_memory_for_what_is_mapped_only(tmp_path: Path) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found["u"].t) == 200 and peak < 20e6  # of a file of 200 MB
+
+
+def test_what_a_person_is_told(tmp_path: Path) -> None:
+    path = floats(tmp_path / "a.mcap", 0, 10)
+    refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")
+    refused(path, SignalSpec("/u.datum"), "has no field 'datum': did you mean 'data'?")
+    refused(path, SignalSpec("/u.data"), 'no header stamp; set clock = "log"')
+    refused(path, SignalSpec("/u"), "it ends at a std_msgs/Float32; add one of its fields: data")
+    refused(path, SignalSpec("/u.data.@jaw", "log"), "no function '@jaw'")
+    refused(tmp_path / "no.mcap", U, "does not exist")
+    refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u': none is defined")
+    (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
+    refused(tmp_path / "c.mcap", U, "`recover` saves")

@@ -78,8 +78,6 @@ def noisy(f: Callable[[np.ndarray], np.ndarray], seed: int, **spec: object) -> S
 
 
 def test_where_a_run_began_is_told_by_the_samples_before_it() -> None:
-    """A boat that was held read -0.088 m, its start was -0.029 m: 'more than the noise'."""
-
     def left(t: np.ndarray) -> np.ndarray:
         return 0.3 + 0.8 * np.maximum(t, 0.0) ** 2
 
@@ -100,25 +98,6 @@ def test_a_start_in_motion_or_after_few_samples_is_the_first_row() -> None:
     assert not grid(noisy(np.ones_like, 1), command(-0.3)).start_states  # 4 samples before
     slow = grid(noisy(lambda t: 0.2 * t, 3), command(0.7)).start_states  # drifts at one speed
     assert slow["x"] == pytest.approx(0.14, abs=0.02)
-
-
-def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
-    """A robot reset from y = 8 m to 0 a quarter of a second before its run "began" at 0.51 m."""
-    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
-    assert not grid(reset, command(0.5)).start_states  # seven samples after it
-    told = grid(reset, command(0.9)).start_states
-    assert told["x"] == pytest.approx(0.0, abs=0.03)
-
-
-def test_a_start_is_no_mean_while_a_speed_is_off_zero() -> None:
-    """A slow drift hides in the noise of a position, but not in that of its speed."""
-    speeds = {"x": noisy(lambda t: 0.05 * t, 4), "v": noisy(lambda t: 0.05 + 0 * t, 5)}
-    log = {**speeds, "u": command(0.7)}
-    drifts = to_grid(log, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
-    assert drifts["x"] == pytest.approx(0.035, abs=0.02) and drifts["v"] != pytest.approx(0.0)
-    rests = {**log, "v": noisy(np.zeros_like, 5)}
-    held = to_grid(rests, 0.05, ["x", "v"], ["u"], rates=["v"]).start_states
-    assert held["x"] < drifts["x"]  # the mean, of half a second before
 
 
 def test_scale_offset_and_unwrapping() -> None:
@@ -153,28 +132,6 @@ def test_held_inputs_grow_old() -> None:
     strict = replace(u, spec=replace(u.spec, max_age_s=0.5))
     with pytest.raises(GroundedError, match=r"\bgap .*\b0.5\d* s .*\b0.100 s"):
         grid(pose(np.sin), strict)
-
-
-def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
-    x = pose(np.sin)
-    for count, refused in ((2, False), (8, True)):  # 5 intervals of 0.05 s may be bridged
-        u = command()
-        u.values[10 : 10 + count] = np.nan
-        if refused:
-            with pytest.raises(GroundedError, match="has a gap of"):
-                grid(x, u)
-        else:
-            assert grid(x, u).inputs[10:13, 0].tolist() == [9, 9, 12]
-    assert len(grid(x, u, span=Span(end=0.9)).inputs) == 8  # outside the span it does not matter
-
-
-def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
-    def slow(s: Series) -> Series:
-        t = EPOCH + 1000 * (s.t - EPOCH)
-        return replace(s, t=t, log_times=t)
-
-    with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
-        grid(slow(pose(np.sin)), slow(command()))
 
 
 def test_one_shot_topics() -> None:
@@ -228,14 +185,6 @@ def test_clocks_that_jump_or_differ_are_refused() -> None:
     assert grid(replace(x, t=some)).reports[0].unstamped == 3
 
 
-def test_a_skew_that_matters_is_said() -> None:
-    x = pose(np.sin)
-    skewed = replace(x, log_times=x.log_times + 300_000_000)
-    found = grid(skewed)
-    assert found.reports[0].skew_s == pytest.approx(-0.3)
-    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
-
-
 def test_the_span() -> None:
     x, u = pose(np.sin), command()
     assert grid(x, u, span=Span(start=1.0)).start_ns == EPOCH + 500_000_000  # 1 s after x began
@@ -272,15 +221,6 @@ def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
     assert grid(pose(np.sin), u).moved_s == 0  # a candidate's run begins with its first command
 
 
-def test_data_whose_commands_do_not_change_in_steps_stay_where_they_are() -> None:
-    for change in (0.005, 0.035):
-        found = grid(pose(np.sin), held(change, 0.0), rest=np.zeros(1))
-        assert found.moved_s == 0 and found.warnings == ()
-        t = np.arange(0.0, 2.0, 0.005).reshape(-1, 10)  # the rows of each step
-        mean = np.floor(t / change + 1e-9).mean(axis=1)
-        np.testing.assert_allclose(found.inputs[:40, 0], mean, atol=1e-9)
-
-
 def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
     """A command that a driver changes at any row, at least so many seconds apart, at 100 Hz."""
     rng, t = np.random.default_rng(2), np.arange(0.0, 20.0, 0.025)
@@ -289,7 +229,6 @@ def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
 
 
 def test_a_driver_s_commands_are_neither_early_nor_late() -> None:
-    """A boat's delay of 0.12 s was 0.152: rows of half a step, commands at any of them."""
     x = pose(np.sin)
     x = series(np.arange(-0.5, 21.0, 0.025), np.zeros(860), x.spec)
     u = driven(np.array([7, 8, 9]), 0.025)
@@ -322,12 +261,28 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
     np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)
 
 
-@pytest.mark.parametrize("topic, late", [("/x", 0.02), ("/u", 0.0)])
-def test_only_rows_of_states_show_a_command_late(topic: str, late: float) -> None:
-    """`its rows come every 0.1 s` was said of messages that are stamped when they are sent."""
-    t = np.arange(0, 2, 0.02)
-    sent = series(t, np.floor(t / 0.1 + 1e-6), SignalSpec(f"{topic}.force", "log"))
-    assert grid(pose(np.sin), sent).row_s == pytest.approx(late)
+def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
+    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
+    assert not grid(reset, command(0.5)).start_states  # seven samples after it
+    told = grid(reset, command(0.9)).start_states
+    assert told["x"] == pytest.approx(0.0, abs=0.03)
+
+
+def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
+    def slow(s: Series) -> Series:
+        t = EPOCH + 1000 * (s.t - EPOCH)
+        return replace(s, t=t, log_times=t)
+
+    with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
+        grid(slow(pose(np.sin)), slow(command()))
+
+
+def test_a_skew_that_matters_is_said() -> None:
+    x = pose(np.sin)
+    skewed = replace(x, log_times=x.log_times + 300_000_000)
+    found = grid(skewed)
+    assert found.reports[0].skew_s == pytest.approx(-0.3)
+    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
 
 
 def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
@@ -337,36 +292,6 @@ def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
     assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
     with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
         grid(later, command())
-
-
-def test_slow_sensors_in_rows_of_a_faster_one_are_named_once_with_their_rate() -> None:
-    """A camera of 25 Hz in rows at 62.5 Hz, 2 or 3 a sample, was said to have 31.2 Hz, twice."""
-    t = np.arange(-0.5, 3.0, 0.016)
-    seen = np.floor(t / 0.04 + 1e-9) * 0.04
-    x, y = series(t, np.sin(3 * seen)), series(t, np.cos(2 * seen))
-    fast = series(t, np.sin(t))
-    found = to_grid({"x": x, "y": y, "z": fast, "u": command()}, 0.05, ["x", "y", "z"], ["u"])
-    (told,) = (w for w in found.warnings if "Hz" in w)
-    assert re.match(r"'x' and 'y' change at 25(\.\d)? Hz", told) and "62.5 Hz" in told
-    assert "0.012 s late" in told and "'z'" not in told
-
-
-def test_what_holds_of_a_whole_message_is_said_once_and_one_sorted_stamp_not_at_all() -> None:
-    """A car's pose: 'x', 'y' and 'psi' each had "1 stamp out of order", in every log."""
-
-    def of_pose(order: np.ndarray):  # type: ignore[no-untyped-def]
-        x = pose(np.sin)
-        one = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])
-        names = ["x", "y", "psi"]
-        return to_grid({**dict.fromkeys(names, one), "u": command()}, 0.05, names, ["u"])
-
-    order = np.arange(len(pose(np.sin).t))
-    order[10:12] = 11, 10
-    found = of_pose(order)
-    assert found.reports[0].out_of_order == 1 and not found.warnings
-    order[10:20] = np.arange(20, 10, -1) - 1
-    (said,) = of_pose(order).warnings
-    assert said == "'x', 'y' and 'psi': 9 stamps out of order"
 
 
 def test_a_sample_far_outside_everything_else_is_told() -> None:

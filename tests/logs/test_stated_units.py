@@ -8,10 +8,7 @@ import pytest
 from cli import grounded
 from facts import holds
 from grounded_trials.logs.stated_units import (
-    bare_command,
     factor_between,
-    in_english,
-    same_unit,
     unit_in_name,
     without_unit,
 )
@@ -42,11 +39,6 @@ model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"
 )
 def test_the_factor_between_two_units(said, wanted, factor):
     assert factor_between(said, wanted) == (factor and pytest.approx(factor))
-
-
-def test_a_unit_is_the_same_whoever_writes_it():
-    assert same_unit("N·m", "N m") and same_unit("m/s²", "m / s^2") and same_unit("Nm", "N m")
-    assert not any(same_unit(one, "m/s") for one in ("mm/s", "m", "rad/s", "m/s^2"))
 
 
 def test_units_in_a_table_s_first_row_become_scales(tmp_path):
@@ -100,54 +92,8 @@ def test_the_end_of_a_name_says_a_unit(path, unit, bare):
     assert without_unit(path) == bare
 
 
-@pytest.mark.parametrize(
-    ("path", "unit", "bare"),
-    [
-        ("/mcu.steering_deg_cmd", "deg", "/mcu.steering"),
-        ("/mcu.steering_cmd_deg", "deg", "/mcu.steering"),
-        ("/mcu.speed_setpoint", "", "/mcu.speed"),
-        ("/mcu._cmd", "", "/mcu._cmd"),
-        ("/mcu.ref", "", "/mcu.ref"),
-    ],
-)
-def test_a_command_s_role_stands_before_its_unit_or_after(path, unit, bare):
-    assert (unit_in_name(path), bare_command(path)) == (unit, bare)
-
-
-@pytest.mark.parametrize(
-    ("named", "inputs", "scales"),
-    [
-        ("steering_pct,throttle_pct", ("steering", "throttle"), (0.01, 0.01)),
-        ("steering_percent,throttle_percent", ("steering", "throttle"), (0.01, 0.01)),
-        ("steer_cmd,throttle_cmd", ("steering", "throttle"), (1, 1)),
-        ("steering_deg,throttle_ref", ("steering", "throttle"), (np.pi / 180, 1)),
-        ("steering_pct,speed_cmd", ("steering", "speed"), (0.01, 1)),
-        ("steering_cmd_rad,speed_setpoint_mps", ("steering", "speed"), (1, 1)),
-    ],
-)
-def test_a_car_s_commands_are_found_whatever_unit_or_role_their_names_end_with(
-    tmp_path, named, inputs, scales
-):
-    """`steering_pct` named a steering, and then nothing in the log fitted the steering."""
-    t = np.arange(0, 8, 0.02)
-    held = 0.05 * np.floor(t / 0.05 + 1e-9)
-    v, psi = 1 + 0.3 * np.sin(t), 0.5 * np.sin(0.7 * t)
-    x, y = 0.02 * np.cumsum(v * np.cos(psi)), 0.02 * np.cumsum(v * np.sin(psi))
-    sent = np.column_stack([np.cos(0.7 * held), 1 + 0.3 * np.sin(held)]) / scales
-    table = np.column_stack([t, x, y, psi, v, sent])
-    head = f"t,x,y,psi,v,{named}"
-    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=head, comments="")
-    made = grounded("init", tmp_path / "w", "--from", tmp_path / "log.csv", "--yes", "--json")
-    found = {one["name"]: one for one in made.json["signals"]}
-    assert made.json["kind"] == "car" and made.json["dt"] == 0.05
-    for name, path, scale in zip(inputs, named.split(","), scales, strict=True):
-        assert found[name]["path"] == f"/csv.{path}"
-        assert found[name]["scale"] == pytest.approx(scale)
-
-
 @pytest.mark.parametrize("unit, size", [("%", 100.0), ("1", 1.0)])
 def test_the_weight_of_changes_is_that_of_their_range(tmp_path, unit, size):
-    """At 0.01 a change by 1 % cost as much as 0.1 m: a car was planned to stop before its line."""
     t = np.arange(0, 8, 0.02)
     table = np.column_stack([t, np.sin(t), np.cos(t), size * np.sin(np.floor(3 * t))])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
@@ -198,8 +144,6 @@ def begun(tmp_path, head: str, factors: dict[str, float]) -> dict:
     "head",
     [
         "t,r_mm,rd,th_deg,thd_deg,volt",
-        "t,r_mm,rd_m_s,th_deg,thd_deg_s,volt_V",
-        "t,r [mm],rd,th [deg],thd [deg/s],volt",
         "t,r [mm],rd [m/s],th [deg],thd,volt",
     ],
 )
@@ -210,28 +154,6 @@ def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path,
         n: pytest.approx(factors.get(n, 1.0)) for n in found
     }
     assert all(one["sure"] for one in found.values())
-    assert holds(" ".join(found["r"]["reasons"]), "says mm", "the model m")
-
-
-def test_a_rate_without_a_unit_that_is_as_large_as_its_position_says_is_asked_for(tmp_path):
-    """Two columns in mm, of which one says so, or a name that ends like a unit and is none."""
-    found = begun(tmp_path, "t,r_cm,rd,th,thd,volt", {"r": 0.01, "rd": 0.01})
-    assert found["r"]["scale"] == found["rd"]["scale"] == pytest.approx(0.01)
-    assert not found["rd"]["sure"]
-
-
-def test_a_name_in_degrees_that_the_position_contradicts_is_unsure(tmp_path):
-    found = begun(tmp_path, "t,r,rd,th,thd_deg,volt", {})
-    assert not found["thd"]["sure"] and found["thd"]["scale"] == 1
-    assert holds(" ".join(found["thd"]["reasons"]), "deg", "rad/s")
-
-
-def test_ingest_warns_of_a_name_whose_unit_no_scale_makes_up_for(tmp_path):
-    begun(tmp_path, "t,r_mm,rd,th,thd,volt", {"r": MM})
-    file = tmp_path / "w" / "grounded.toml"
-    file.write_text(file.read_text().replace("scale = 0.001\n", ""))
-    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "log.csv", "--json")
-    assert holds(done.json["trials"][0]["warnings"][0], "r", "mm", "scale = 0.001")
 
 
 ROLLING = """from grounded import Model, Param
@@ -265,7 +187,6 @@ def helicopter(folder, names, linked=True):
     ],
 )
 def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
-    """All six were UNSURE, though `Zeit` is read as the time."""
     names = names.split()
     out, text = helicopter(tmp_path, names)
     assert "UNSURE" not in out
@@ -273,32 +194,6 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
     signals = {**log["state"], **log["input"]}
     assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
     assert [one["scale"] for one in log["state"].values()] == [pytest.approx(np.pi / 180)] * 4
-
-
-def test_a_path_that_is_only_offered_has_its_scale_beside_it(tmp_path):
-    """With the # removed as it said, degrees were stored as radians."""
-    names = ["a_deg", "b_deg", "c_deg", "d_dps", "e_dps", "f_dps"]
-    out, text = helicopter(tmp_path, names, linked=False)
-    assert "UNSURE" in out
-    table = text[text.index("[log]") :]
-    assert "remove all 3 #" in table
-    log = tomllib.loads(
-        table.replace("# [", "[").replace("# path", "path").replace("# scale", "scale")
-    )
-    for one in log["log"]["state"].values():
-        assert one["scale"] == pytest.approx(np.pi / 180)
-
-
-def test_states_of_one_s_own_model_are_found_by_their_derivatives_if_no_name_fits(tmp_path):
-    """With --model nothing was mapped, though a skeleton's states were."""
-    names = ["a_deg", "b_deg", "c_dps", "d_dps", "e", "f"]
-    out, text = helicopter(tmp_path, names)
-    log = tomllib.loads(text)["log"]
-    signals = {**log["state"], **log["input"]}
-    assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
-    assert out.count("UNSURE") == 7 and "or /csv.f" in out  # 6, and a sentence that says so
-    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "a.csv")
-    assert done.code == 0, done.err  # a model without parameters brought a traceback
 
 
 FURUTA = """from grounded import Model
@@ -333,15 +228,12 @@ def furuta(folder, names):
 @pytest.mark.parametrize(
     "names, sure, volt",
     [
-        (("arm_deg", "pend_deg", "volt"), True, "/csv.volt"),
         (("arm_deg", "pend_deg", "motor_cmd"), True, "/csv.motor_cmd"),
-        (("armAngle", "pendAngle", "volt"), True, "/csv.volt"),
         (("theta_deg", "alpha_deg", "volt"), False, "/csv.volt"),
         (("arm_deg", "pend_deg", "u", "battery"), True, None),
     ],
 )
 def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, names, sure, volt):
-    """A voltage was taken for the rate that it drives, and two angles were not taken at all."""
     found, notes, text = furuta(tmp_path, names)
     for name, column in zip(("arm", "pend"), names, strict=False):
         assert found[name]["path"] == f"/csv.{column}" and found[name]["sure"] == sure
@@ -351,37 +243,3 @@ def test_states_without_a_column_are_estimated_beside_those_found(tmp_path, name
     assert set(tomllib.loads(text)["estimate"]["measured"]) == {"arm", "pend"}
     unused = [f"/csv.{name}" for name in names if name in ("u", "battery")]
     assert all(path in " ".join(notes) for path in unused)
-
-
-def test_a_log_in_which_nothing_is_found_says_what_need_not_be_in_it(tmp_path):
-    found, notes, text = furuta(tmp_path, ("enc1", "enc2", "pwm"))
-    assert not any(one["path"] for one in found.values())
-    assert any("[estimate]" in note and "arm_rate" in note for note in notes)
-    assert any("/csv.enc1" in note for note in notes)
-    mapped = text.replace("# [estimate]", "[estimate]").replace("# measured", "measured")
-    assert set(tomllib.loads(mapped)["estimate"]["measured"]) == {"arm", "pend"}
-
-
-def test_words_are_translated_only_if_all_parts_are_known():
-    assert in_english("Gierwinkelgeschwindigkeit") == "yaw_rate"
-    assert in_english("U_Nick") == "u_pitch" and in_english("Lenkwinkel") == "steering_angle"
-    for name in ("nickname", "village", "Kraftwerk", "pitch_motor", "strombus", "x_soll_x1"):
-        assert in_english(name) == name.replace("soll", "target").lower()
-
-
-def test_the_last_column_with_the_unit_of_the_last_state_is_it(tmp_path):
-    t = np.arange(0, 400, 2.0)
-    heat = 50.0 * (t > 20)
-    warm = 23 + 20 * (1 - np.exp(-np.maximum(t - 20, 0) / 90))
-    rows = np.column_stack([1000 * t, warm, heat])
-    head = "millis,temp_C,heater_pct"
-    np.savetxt(tmp_path / "a.csv", rows, "%.4f", ",", header=head, comments="")
-    (tmp_path / "m.py").write_text(
-        'from grounded import Model\nmodel = Model(states={"T": "degC"}, inputs={"heater": "%"}, '
-        'params={}, derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20)})\n'
-    )
-    files = ("--from", tmp_path / "a.csv", "--model", tmp_path / "m.py")
-    made = grounded("init", tmp_path / "w", *files)
-    assert "UNSURE" not in made.out
-    log = tomllib.loads((tmp_path / "w" / "grounded.toml").read_text())["log"]
-    assert log["state"]["T"] == {"path": "/csv.temp_C"}

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.logs.log_table import LogMapping, mapped_signals, read_log
-from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.starting.begin import begin
 
 
@@ -38,7 +35,6 @@ def test_times_in_ms_are_asked_about_and_next_is_to_begin_again(tmp_path):
     [("millis", 1e-3), ("time_millis", 1e-3), ("micros", 1e-6), ("t_us", 1e-6), ("Time_s", 1.0)],
 )
 def test_an_arduino_s_times_are_known_by_their_name(tmp_path, column, unit):
-    """A column `millis` was refused: no column of times."""
     log = table(tmp_path / "a.csv", column, unit)
     found = begin(tmp_path / "w", log, kind="generic", inputs=["force"])
     assert found.then.verb == "ingest" and found.dt < 2
@@ -53,18 +49,3 @@ def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path)
     rows[:, 0] += 1.764e12
     np.savetxt(tmp_path / "b.csv", rows, "%.1f", ",", header="time_s,v,force", comments="")
     assert begin(tmp_path / "w", tmp_path / "b.csv", kind="generic", inputs=["force"]).dt < 2
-
-
-def test_the_first_row_at_0_of_a_slow_log_is_kept(tmp_path):
-    log = table(tmp_path / "a.csv")
-    specs = SignalSpec("/csv.v"), SignalSpec("/csv.force")
-    mapping = LogMapping({"v": specs[0]}, {"force": specs[1]})
-    found = read_log(log, mapping, 10.0)
-    assert [one.unstamped for one in found.reports] == [0, 0]
-
-
-def test_a_log_table_without_inputs_says_so(tmp_path):
-    mapping = LogMapping({"v": SignalSpec("/csv.v")}, {})
-    with pytest.raises(GroundedError, match=r"maps no input;.*\[log\.input\.NAME\]") as refused:
-        mapped_signals(table(tmp_path / "a.csv"), mapping, ["v"], [])
-    assert "no state" not in str(refused.value)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import grounded as gr
-from facts import holding, holds
+from facts import holding
 from grounded.plant import Plant
 from grounded.search.improve import propose
 from small_tasks import drive, other, rover_task
@@ -66,9 +66,8 @@ def test_learning_stops_at_a_first_trial_whose_heading_is_in_degrees():
         states[:, heading] = np.rad2deg(states[:, heading])
         return replace(trial, states=states)
 
-    with pytest.raises(gr.GroundedError) as told:
+    with pytest.raises(gr.GroundedError):
         gr.learn(TASK, in_degrees, OPTIONS)
-    assert holds(str(told.value), "in degrees", "check=False", "c0001")
     assert gr.learn(TASK, in_degrees, gr.SearchOptions(max_trials=2), check=False).trials
 
 
@@ -121,18 +120,6 @@ def test_a_trial_that_is_none_of_this_search_is_refused(change, said):
     with pytest.raises(gr.GroundedError) as error:
         asked.tell(replace(trial, **change))
     assert all(word in str(error.value) for word in said) and asked.trials == (trial,)
-
-
-def test_results_are_one_line_a_table_and_a_document(search):
-    fitted = gr.fit(TASK, search.trials[:1], ["gain"])
-    found = [search.standing, search.best, search.best.candidate, search.proposal, fitted]
-    for result in found:
-        shown = repr(result)
-        assert "\n" not in shown and len(shown) < 120 and type(result).__name__ in shown
-        assert "<table>" in result._repr_html_()
-        assert json.loads(json.dumps(result.to_json(), allow_nan=False)) == result.to_json()
-    assert search.best.candidate.id in repr(search.standing)
-    assert len(repr(search)) < 80
 
 
 def test_the_documents_have_the_commands_keys(search):
@@ -230,3 +217,15 @@ def test_an_attribute_error_of_the_users_own_program_stays_what_it_is():
         gr.learn(TASK, lambda candidate: candidate.id.horizon)
     with pytest.raises(AttributeError, match="no attribute 'colour'"):
         gr.learn(TASK, lambda candidate: candidate.colour)
+
+
+def test_results_are_one_line_a_table_and_a_document(search):
+    fitted = gr.fit(TASK, search.trials[:1], ["gain"])
+    found = [search.standing, search.best, search.best.candidate, search.proposal, fitted]
+    for result in found:
+        shown = repr(result)
+        assert "\n" not in shown and len(shown) < 120 and type(result).__name__ in shown
+        assert "<table>" in result._repr_html_()
+        assert json.loads(json.dumps(result.to_json(), allow_nan=False)) == result.to_json()
+    assert search.best.candidate.id in repr(search.standing)
+    assert len(repr(search)) < 80

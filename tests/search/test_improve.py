@@ -25,11 +25,9 @@ from grounded.search.planner import model_fingerprint
 from grounded.search.step.directions import damped, direction
 from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
-from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import Reward
 from shared_data import SUPPORT
-from small_tasks import black_box, cart_task, drive, other, rover, rover_task
+from small_tasks import black_box, cart_task, drive, other, plain_task, rover, rover_task
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}  # section 5.2
 
@@ -219,16 +217,7 @@ def test_footnote_9_one_iteration_finds_the_optimum_whatever_the_bias(b):
         params={"b": Param(b)},
         step=lambda s, a, p, dt: {"s": a.a + p.b},
     )
-    task = Task(
-        model=crude,
-        dt=1.0,
-        target=np.zeros((2, 1)),
-        reward=Reward(np.ones(1), np.zeros(1), np.zeros(1), np.zeros(1)),
-        start=np.zeros(1),
-        past=np.zeros(1),
-        low=np.array([-100.0]),
-        high=np.array([100.0]),
-    )
+    task = plain_task(crude, 1.0, np.zeros((2, 1)), 1.0, 100.0)
     plant = Plant(crude.with_values({"b": 0.0}), substeps=1)
     now = learn(task, lambda c: drive(task, plant, c), SearchOptions(step="full")).standing
     assert now.utilities[0] == pytest.approx(-(b**2)) and now.utilities[1] > -1e-10 * b**2

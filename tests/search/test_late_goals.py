@@ -5,8 +5,7 @@ import pytest
 
 from grounded.model import Model
 from grounded.search.planner import Planner, planner_with, predicted
-from grounded.task import Task
-from grounded.utility import Reward
+from small_tasks import plain_task
 
 STEPS = 60
 
@@ -21,27 +20,13 @@ def cart(terminal: float, lag: float = 0.04, change: float = 1e-4, rests: int = 
     )
     way = np.clip(np.arange(STEPS + 1) / (STEPS - rests), 0.0, 1.0)
     x = 0.4 * way**2 * (3 - 2 * way)
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.column_stack([x, np.gradient(x, 0.02)]),
-        reward=Reward(
-            np.array([10.0, 0.5]),
-            terminal * np.array([500.0, 50.0]),
-            np.zeros(1),
-            np.array([change]),
-        ),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-10.0]),
-        high=np.array([10.0]),
-    )
+    target, ends = np.column_stack([x, np.gradient(x, 0.02)]), terminal * np.array([500.0, 50.0])
+    task = plain_task(model, 0.02, target, [10.0, 0.5], 10.0, terminal=ends, change=change)
     return planner_with(task, [("sensor_lag:v", {"tau": lag})] if lag else [])
 
 
 @pytest.mark.parametrize("terminal", [1.0, 10.0])
 def test_the_end_is_asked_of_the_true_speed(terminal):
-    """A cart was pushed in its last steps: its filter read 0.02 m/s at a speed of 0.3."""
     planner = cart(terminal)
     policy, _ = planner.first_policy()
     run = predicted(planner.plan.problem(exact=True), policy)
@@ -61,7 +46,6 @@ def test_what_is_judged_stays_what_is_logged():
 
 
 def test_cheaper_inputs_make_no_plan_worse_by_its_late_log():
-    """A crane braked in its last 30 ms, which its log had not seen: -0.6, then -2.9, then -6.1."""
     found = []
     for change in (3e-3, 1e-3, 1e-4, 1e-5):
         planner = cart(20.0, change=change, rests=0)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded.plant import Noise, Plant
+from grounded.plant import Plant
 from grounded.search.improve import propose
 from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
@@ -54,24 +54,6 @@ def test_an_effect_that_keeps_its_promises_makes_all_steps():
     assert not any(c.of_original for c in candidates)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_losses_by_noise_do_not_give_up_an_effect_that_the_runs_confirm(seed):
-    """A rover's true effects "broke their promises" once its runs were as good as noise allows."""
-    task, _ = CASES["cart"]
-    noise = Noise(process=dict.fromkeys("xv", 0.03), measurement=dict.fromkeys("xv", 0.01))
-    plant = Plant(other(task.model, 1.15), latency={"force": 0.1}, noise=noise)
-    late = replace(planner_with(task, [("delay:force", {"d": 0.1})]), task=task)
-    planner, candidates, trials = Planner(task, task), [], []
-    while len(trials) < 6:
-        made = propose(task, candidates, trials, SearchOptions(), planner=planner).candidate
-        if made is None:
-            break
-        candidates += [made] if made.id not in {c.id for c in candidates} else []
-        trials.append(drive(task, plant, made, 100 * seed + len(trials) + 1))
-        planner = late
-    assert len(candidates) > 2 and not any(c.of_original for c in candidates)
-
-
 def step(
     name,
     base,
@@ -112,28 +94,7 @@ def test_promises_are_counted_for_each_model():
     assert adopted.broken and not original.broken and not Promises().broken
 
 
-def test_a_loss_that_scatter_may_explain_breaks_no_promise():
-    """Right effects of a helicopter were given up after one loss that was called bad luck."""
-    best = step("c1", "", "better", float("nan"), 0.0, runs=(-0.86, -0.72))
-    lost = step("c2", "c1", "better", 0.21, -0.87, accepted=False)
-    adopted, _ = promises((best, lost), "better")
-    assert adopted.share < 0 and not adopted.broken
-    sure = step("c1", "", "better", float("nan"), 0.0, runs=(-0.7901, -0.7899))
-    assert promises((sure, lost), "better")[0].broken
-    again = [step(f"c{k}", "c1", "better", 0.21, -0.95, accepted=False) for k in range(2, 7)]
-    assert promises((best, *again), "better")[0].broken  # five such losses are no bad luck
-
-
-def test_a_step_made_from_a_discarded_trial_broke_no_promise():
-    best = step("c1", "", "better", float("nan"), -1.6)
-    wild = step("c2", "c1", "better", 1.2, -9.6, accepted=False)
-    assert promises((best, wild), "better")[0].broken
-    disowned = step("c2", "c1", "better", 1.2, -9.6, accepted=False, lost=False)
-    assert promises((best, disowned), "better")[0] == Promises()
-
-
 def test_a_run_that_was_stopped_on_its_path_broke_no_promise():
-    """It was stopped by hand after 59 of 90 steps: the adopted effects were given up for it."""
     task, target = CASES["cart"]
     plant, options = Plant(other(task.model, 1.3)), SearchOptions()
     candidates = [propose(task, [], [], options).candidate]

@@ -31,7 +31,6 @@ def from_aside(planner, policy):
 
 
 def test_a_model_with_less_latency_feeds_back_what_the_policy_does(late):
-    """A play splits a latency: the gains on the oldest input were dropped, and -0.028 was -11.9."""
     planner, policy = late
     play = with_play(1e-9)
     assert policy.depths == (1, 3) and play.plan.problem().depths == (1, 2)
@@ -54,7 +53,6 @@ def test_a_planner_remembers_what_earlier_policies_feed_back(late):
 
 @pytest.mark.parametrize("width", [0.05, 0.5])
 def test_gains_do_not_vanish_within_a_play(late, width):
-    """Steering gains on the heading fell from 2.9 to 0.09, with 69 at single steps."""
     planner, policy = late
     play = with_play(width)
     made, _ = play.first_policy()

@@ -1,13 +1,12 @@
 """The scatter between runs: two that agree by chance do not prove that there is none."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import t
 
-from grounded.frozen import calm, resampled_noise, white_noise
+from grounded.frozen import resampled_noise, white_noise
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
 from grounded.search.certainty import error_between, in_doubt
@@ -16,16 +15,12 @@ from grounded.search.scatter import (
     PIECES,
     Repeats,
     by_pieces,
-    explained_by_starts,
     noise_cost,
-    noise_missed,
     sensor_noise,
     with_errors,
 )
 from grounded.search.standing import standing
 from grounded.search.step.step_size import SearchOptions
-from grounded.trial import Trial
-from grounded.utility import Reward
 from small_tasks import cart_task, drive, other
 
 
@@ -37,7 +32,6 @@ def runs(pieces, cost=10.0):
 
 
 def test_intervals_from_two_repeats_hold_as_often_as_they_say():
-    """Two pairs that agree by chance gave +- 0.038; seven repeats give 0.09 for a single run."""
     rng = np.random.default_rng(0)
     inside, least, width = [], [], []
     for _ in range(2000):
@@ -95,7 +89,6 @@ def test_pieces_sum_to_the_utility():
 
 
 def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
-    """A run predicted at -0.14 gave -12.5 in the log, mostly from noise of weighted states."""
     task = cart_task()
     proposal = propose(task, [], [], SearchOptions())
     policy, noise = proposal.candidate.policy, np.array([0.1, 0.1])
@@ -120,93 +113,8 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert min(each) < more.noise_cost < max(each)
 
 
-def test_noise_that_a_prediction_replays_is_not_added_to_it_again():
-    """A ball's later plans were told without the 0.038 of noise of every log: a miss of the model.
-
-    The mean of four runs has a quarter of what each costs by noise; a single one has all of it.
-    """
-    task, size = cart_task(), {"x": 0.02, "v": 0.02}
-    noisy = Plant(other(task.model), noise=Noise(measurement=size))
-    for repeats, shares in ((1, (0.0, 0.1)), (4, (0.6, 0.9))):
-        options = SearchOptions(repeats=repeats)
-        first = propose(task, [], [], options).candidate
-        runs = [drive(task, noisy, first, 100 + seed) for seed in range(repeats)]
-        made = propose(task, [first], runs, options, identity="c0002").candidate
-        assert made.grounded
-        more = [drive(task, noisy, made, 1000 + seed) for seed in range(20)]
-        own = [replace(run, candidate="c0002", id=f"r{k}") for k, run in enumerate(more)]
-        now = standing(task, [first, made], [*runs, *own], SearchOptions(), made.model)
-        told = now.history[-1]
-        whole = noise_cost(task, made.policy, sensor_noise(runs, 2))
-        assert shares[0] <= told.noise_missed / whole < shares[1]
-        assert told.promised == made.predicted_utility - told.noise_missed
-        waits = standing(task, [first, made], runs, SearchOptions(), made.model).history[-1]
-        assert waits.promised == told.promised  # as it was told before the runs
-    missed = made.predicted_utility - told.utility
-    assert missed > 0.2 * -told.utility  # four logs of 41 rows tell the noise to a third or so
-    assert abs(told.promised - told.utility) < 0.6 * missed
-
-
-def test_no_plan_promises_to_remove_the_noise_of_a_log():
-    """-0.047 was promised of logs whose noise costs 0.064: a gain of 0.033 where 0.016 was left."""
-    task, noise = cart_task(), np.array([0.02, 0.02])
-    made = propose(task, [], [], SearchOptions()).candidate
-    whole = noise_cost(task, made.policy, noise)
-    cheap = replace(made, base="c0001", predicted_utility=-0.5 * whole)
-    rough = made.predicted_states + 0.02 * np.random.default_rng(0).standard_normal(
-        made.predicted_states.shape
-    )
-    shown = replace(cheap, predicted_states=rough)
-    assert shown.grounded
-    assert shown.predicted_utility - noise_missed(task, shown, noise) <= -whole + 1e-12
-    best = Tried(made, (), (-1.5 * whole,), True, noise_cost=whole)
-    assert cheap.promised_over(best) == pytest.approx(0.5 * whole)
-    assert cheap.promised_over(replace(best, noise_cost=0.0)) == pytest.approx(whole)
-    # noise that seems to cost more than the whole run tells nothing
-    assert cheap.promised_over(replace(best, noise_cost=2 * whole)) == pytest.approx(whole)
-
-
-def test_a_notebook_shows_the_candidates_and_the_phase():
-    """It showed the keys of the JSON document under the title "Standing"."""
-    task = cart_task()
-    first = propose(task, [], [], SearchOptions()).candidate
-    run = drive(task, Plant(task.model), first)
-    now = standing(task, [first], [run], SearchOptions(), first.model)
-    (row,), header = now.table()
-    assert len(row) == len(header) and row[0] == first.id and row[-1] == "first"
-    shown = now._repr_html_()
-    cells = [f"<td>{cell}</td>" for cell in row]
-    assert "".join(cells) in shown and shown.index(row[0]) < shown.index(now.sentence)
-    assert shown.index(now.sentence) < shown.index("<details>")
-
-
-def test_a_tenfold_error_of_a_state_that_makes_the_whole_loss_is_no_luck():
-    """Before any repeat: the scatter is unknown, but runs of one policy do not differ so much."""
-    reward = Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1))
-    task = cart_task(target=np.zeros((41, 2)), reward=reward)
-    made = propose(task, [], [], SearchOptions()).candidate
-
-    def off(identity, **errors):
-        states = np.array(task.target)
-        for name, error in errors.items():
-            states[:, "xv".index(name)] += error
-        trial = Trial(states, np.zeros((40, 1)), task.dt, ("x", "v"), ("force",))
-        one = replace(made, id=identity, base="c0001")
-        return Tried(one, (trial,), (task.utility(trial),), identity == "c0001")
-
-    best = off("c0001", x=0.01, v=0.10)
-    for errors, doubt in (
-        ({"x": 0.14, "v": 0.01}, False),  # 1.9 times the cost, and fourteen times as far off in x
-        ({"x": 0.01, "v": 0.14}, True),  # as much more cost, but of the same kind
-        ({"x": 0.11, "v": 0.01}, True),  # of another kind, but of nearly equal cost
-    ):
-        loser = off("c0002", **errors)
-        assert in_doubt(task, best, loser, (best, loser), 9) is doubt
-
-
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
 def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
-    """A boat's position had 16 mm on the grid, its promises counted 11 mm."""
     rng = np.random.default_rng(3)
     t = 0.05 * np.arange(401)
     seen = 0.02 * rng.standard_normal((401, 8))
@@ -218,71 +126,3 @@ def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
     gaps = np.where(np.arange(400)[:, None] % 9, log, np.nan)
     np.testing.assert_allclose(np.median(resampled_noise(gaps)), true, rtol=0.2)
     assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0
-
-
-def test_a_fast_motion_is_no_noise_of_an_interpolated_log():
-    """An aircraft's roll rate: 0.0065 rad/s at rest, 0.027 counted, which cost a promise 0.19."""
-    rng, dt, roll = np.random.default_rng(4), 0.01, 0.0
-    holds = [np.full(rng.integers(3, 12), rng.uniform(-0.6, 0.6)) for _ in range(90)]
-    rates = []
-    for aileron in np.concatenate(holds)[:600]:
-        rates.append(roll)
-        for _ in range(10):  # it settles within two steps of 0.1 s
-            roll += dt * (4.0 * aileron - 6.5 * roll)
-    log = (np.array(rates) + 0.0065 * rng.standard_normal(600))[:, None]
-    white = white_noise(log)[0]
-    assert resampled_noise(log)[0] == white < 0.012 < white_noise(log[::2])[0]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_drive_by_steps_shows_its_noise_once_it_has_settled(share):
-    """A rover's turn rate: 0.019 rad/s counted of a sensor with 0.010, a promise of 2.6 times."""
-    rng, dt, seen = np.random.default_rng(7), 0.05, []
-    noise = 0.01 * rng.standard_normal((1201, 20))
-    sent, rate = np.repeat(rng.uniform(-1.2, 1.2, 80), 15), 0.0
-    for k in range(1200):
-        seen.append(rate)
-        for i in range(10):
-            due = sent[max(0, k - (1 if i < 2 else 2))]  # 60 ms late
-            rate += dt / 10 * (0.9 * due - rate) / 0.12
-    log = np.array(seen)[:, None] + (1 - share) * noise[:-1] + share * noise[1:]
-    found = resampled_noise(log, calm(sent[:-1, None]))
-    true = 0.01 * np.hypot(1 - share, share)
-    assert 0.85 * true < np.median(found) < 1.25 * true
-    assert (found < 1.4 * true).all()
-    driven = resampled_noise(log)  # by all samples, as before
-    assert np.median(driven) > 1.2 * true and driven.max() > 1.8 * true
-    trial = Trial(log[:, :1], sent[:-1, None], dt, ("omega",), ("turn",))
-    np.testing.assert_array_equal(trial.noise(), found[:1])
-
-
-@pytest.mark.parametrize("gaps", [False, True])
-def test_the_noise_of_all_columns_is_that_of_each_alone(gaps):
-    log = np.random.default_rng(5).standard_normal((60, 4)).cumsum(axis=0)
-    if gaps:
-        log[20, 1] = np.nan
-        log[30:, 3] = np.inf
-    with np.errstate(invalid="ignore"):
-        alone = [resampled_noise(log[:, [j]])[0] for j in range(4)]
-        np.testing.assert_array_equal(resampled_noise(log), alone)
-
-
-def test_the_noise_of_a_trial_is_found_once():
-    log = np.random.default_rng(5).standard_normal((60, 2))
-    trial = Trial(log, np.zeros((59, 1)), 0.1, ("x", "v"), ("force",))
-    np.testing.assert_array_equal(trial.noise(), resampled_noise(log))
-    np.testing.assert_array_equal(trial.noise(20), resampled_noise(log[:20]))
-    assert trial.noise() is trial.noise(1000) is not trial.noise(20) is trial.noise(20)
-    other = replace(trial, states=2 * log)
-    np.testing.assert_array_equal(other.noise(), resampled_noise(2 * log))
-
-
-def test_runs_that_scatter_by_where_they_began_are_none_that_another_policy_steadies():
-    """ "More than 50 runs would show the gain", and the next was handed out: it may be steadier."""
-    worth, costs = (-2.1, -1.8, -4.2), np.array([0.3, 0.0, 2.6])
-    for explained, placed in ((costs, True), (0.1 * costs, False), (np.array([np.nan] * 3), False)):
-        starts = SimpleNamespace(costs=lambda _, e=explained: e)
-        made = SimpleNamespace(id="c0001", base="")
-        (one,) = with_errors([Tried(made, (None,) * 3, worth, True, starts=starts)])
-        assert one.placed == placed and explained_by_starts([one]) == placed
-        assert replace(one, deviation=2.0).is_unsteady == (not placed)

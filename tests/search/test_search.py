@@ -7,16 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facts import holding, holds
+from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
-from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
-from grounded.search.making import About, Maker
-from grounded.search.planner import Planner, fixed_draws, model_fingerprint
+from grounded.search.planner import fixed_draws, model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
-from grounded.search.step.step_size import OTHER_WAY, SearchOptions, Step, losers_of
+from grounded.search.step.step_size import OTHER_WAY, SearchOptions
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task
@@ -71,7 +69,6 @@ def test_a_candidate_without_a_trial_is_named_again():
     assert first.is_new and not again.is_new and again.candidate is first.candidate
     assert story.now.phase == "await-trial" and story.now.missing == 1
     assert story.now.outstanding is not None and story.now.outstanding.id == "c0001"
-    assert holds(story.now.sentence, "c0001", 1)
 
 
 def test_an_improvement_is_accepted_and_the_next_starts_from_it():
@@ -103,7 +100,6 @@ def test_trials_that_do_not_improve_shorten_the_step_then_end_the_search(options
     assert last.candidate is None and last.standing.phase == "converged"
     assert last.standing.incumbent is not None
     assert last.standing.incumbent.candidate.id == "c0001"
-    assert holds(last.standing.sentence, "c0001", f"alpha = {steps[-1][1]:g}")
 
 
 def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised():
@@ -121,144 +117,20 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     assert (ended.phase, ended.ending) == ("converged", "no step improved")
 
 
-def test_losses_before_and_after_a_change_of_the_model_end_a_search_that_says_so():
-    """An arm's search went on after five losses, because `adopt` began the count anew."""
-    story = Story().add().add(bad).add(bad)
-    story.candidates = [replace(c, model="before") for c in story.candidates]
-    story.add(bad)
-    assert "the model was changed" not in story.now.sentence  # three losses
-    story.trials.append(bad(replace(story.trials[-1], candidate="c0006", id="t9")))
-    lost = replace(story.candidates[-1], id="c0006")
-    ended = standing(TASK, [*story.candidates, lost], story.trials, story.options, lost.model)
-    assert (ended.phase, ended.ending) == ("converged", "no step improved")
-    assert holds(ended.sentence, "last 4")
-    again = standing(TASK, [*story.candidates, lost], story.trials, story.options, "after")
-    assert again.phase == "propose"
-    assert holds(again.sentence, "last 4", "the model was changed after c0006", "2 losses")
-
-
-def test_a_run_of_the_best_that_makes_an_ended_search_go_on_says_so():
-    """A car's search had ended; a run to verify its result brought a new candidate, unasked."""
-    story = Story(tolerance=0.2)
-    while story.propose().candidate is not None:
-        story.add()
-    best = story.now.incumbent.candidate.id
-    again = replace(story.now.incumbent.trials[0], id="t99")
-    for value, goes_on in ((0.3, "the best now"), (0.01, "replays")):
-        now = Story(tolerance=1e-3)
-        now.candidates, now.trials = [*story.candidates], [*story.trials, bad(again, value)]
-        (note,) = now.propose().notes
-        assert holds(note, best, "was run again", goes_on, "goes on")
-        now.candidates[:-1] = [replace(c, model="before") for c in now.candidates[:-1]]
-        changed = propose(TASK, now.candidates[:-1], now.trials, now.options)  # the reason then
-        assert not any("run again" in note for note in changed.notes)
-        now.add()
-        assert not any("run again" in note for note in now.propose().notes)
-
-
-@pytest.mark.parametrize(("share", "goes_on"), [(2.0, False), (0.5, True)])
-def test_after_two_losses_no_trial_is_spent_on_a_step_likelier_to_lose(monkeypatch, share, goes_on):
-    """A Cessna in wind flew two more steps that promised less than their likely errors."""
-    story = Story().add().add().add(bad).add(bad)
-
-    def told(about, made):
-        about.incumbent = replace(about.incumbent, utilities=(-1e3,))  # any promise is little
-        return replace(made, likely_off=share * made.predicted_gain)
-
-    monkeypatch.setattr(About, "_told", told)
-    proposal = story.propose()
-    assert (proposal.candidate is not None) == goes_on
-    if not goes_on:
-        ended = proposal.standing
-        assert (ended.phase, ended.ending) == ("converged", "no step improved")
-        assert holds(ended.sentence, 2, ended.incumbent.candidate.id)
-
-
 def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
-    """An arm with armature and a lag lost half its cost four times, and ended as converged."""
     story = Story().add()
     while story.propose().candidate is not None:
         story.add(bad)
     ended = story.propose().standing
     assert ended.ending == "no step improved" and ended.then == NextCommand("diagnose")
-    assert holds(ended.sentence, ended.incumbent.candidate.id, "diagnosis")
-    rows = {row[0]: row for row in ended.table()[0]}  # its numbers are those of `status`
-    lost = ended.sentence.partition(". But ")[2]
-    assert holds(
-        lost, f"{lost[:5]}, for which {rows[lost[:5]][4]} was predicted", rows[lost[:5]][5]
-    )
 
 
 @pytest.mark.parametrize(("off", "asks"), [(0.5, False), (50.0, True)])
 def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnosis(off, asks):
-    """A boat's step cost 4,021 for 23, as `adopt` had left out its thrust; half a step was next."""
     story = Story().add().add(lambda trial: bad(trial, off))
     now = story.now
     assert now.phase == "propose" and now.step is not None
     assert (now.then == NextCommand("diagnose")) is asks
-    lost = now.history[-1]
-    told = (lost.candidate.id, "was predicted", f"{lost.utility:.4g}", "diagnosis")
-    assert holds(now.sentence, *told) is asks
-
-
-def test_a_small_promise_that_is_not_kept_asks_for_nothing():
-    story = Story(tolerance=0.0).add().add().add().add()
-    while story.propose().candidate is not None:
-        story.add(worse(0.05))
-    ended = story.propose().standing
-    assert ended.phase == "converged" and ended.then is None
-
-
-@pytest.mark.parametrize(("scatter", "goes_on"), [(1e-6, True), (0.4, False), (1e3, True)])
-@pytest.mark.parametrize("lost", ["lost", "stopped", ""])
-def test_after_a_loss_no_trial_is_spent_on_a_gain_below_the_noise(
-    monkeypatch, scatter, goes_on, lost
-):
-    """An excavator at its noise went on for 9 trials, to no better policy.
-
-    It goes on if the best one's runs scatter by as much as they cost: another may be steadier.
-    """
-    story = Story().add().add()
-    story = story.add(bad if lost == "lost" else cut) if lost else story
-    noisy = lambda h: tuple(replace(one, deviation=scatter) for one in h)  # noqa: E731
-    monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
-    proposal = story.propose()
-    assert (proposal.candidate is not None) == (goes_on or lost != "lost")
-    if proposal.candidate is None:
-        ended = proposal.standing
-        assert (ended.phase, ended.ending) == ("converged", "below the noise")
-        assert holds(ended.sentence, ended.incumbent.candidate.id, "runs of each")
-
-
-def test_a_negative_promise_is_none(monkeypatch):
-    """A cart's search "promises -0.003610, less than the standard error of a trial's gain"."""
-    story = Story().add().add().add(bad)
-    noisy = lambda h: tuple(replace(one, deviation=1e3) for one in h)  # noqa: E731
-    monkeypatch.setattr("grounded.search.certainty.with_errors", noisy)
-    monkeypatch.setattr(Candidate, "promised_over", lambda *_: -0.00361)
-    ended = story.propose().standing
-    assert ended.ending == "below the noise" and "0.0036" not in ended.sentence
-    assert holds(ended.sentence, "promises no gain", ended.incumbent.candidate.id)
-
-
-def test_a_step_like_one_that_an_earlier_best_lost_by_is_as_doubtful():
-    """A belt drive ran two steps that both lost twice the best cost, one from each of two bests."""
-    story = Story().add().add(bad).add()
-    best, lost = story.now.incumbent, story.now.history[1]
-    assert best.candidate.id == "c0003" and lost.lost and lost.candidate.base == "c0001"
-    plain = Planner(TASK, TASK)
-    about = About(Maker(plain, story.now, "c0004", plain.fingerprint), best, story.options, "")
-    again = about._told(about.candidate(lost.candidate.policy, Step(), ""))
-    assert again.expected_gain <= lost.utility - best.utility + 1e-9
-    stay = about._told(about.candidate(best.candidate.policy, Step(), ""))
-    assert stay.likely_off < 1e-3 * again.likely_off  # another run is not concerned
-
-
-def test_after_one_loss_a_doubtful_step_is_tried(monkeypatch):
-    story = Story().add().add().add(bad)
-    doubled = lambda _, made: replace(made, likely_off=2 * made.predicted_gain)  # noqa: E731
-    monkeypatch.setattr(About, "_told", doubled)
-    assert story.propose().candidate is not None
 
 
 def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
@@ -277,29 +149,12 @@ def test_two_exact_repeats_are_as_good_as_many():
     assert story.now.history[0].accepted is True and story.now.phase == "propose"
 
 
-def test_a_copy_beside_repeats_that_differ_is_no_sign_of_a_deterministic_system():
-    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
-    story = Story(plant=noisy, repeats=3).add().add().add().add()
-    story.trials.append(story.trials[-1])
-    assert story.trials[-1].candidate == story.candidates[1].id
-    assert (story.now.phase, story.now.missing) == ("await-trial", 1)
-
-
-def test_an_equal_utility_is_no_improvement():
-    story = Story().add()
-    same = story.trials[0]
-    story.propose()
-    story.trials.append(replace(same, candidate="c0002"))
-    assert story.now.history[-1].accepted is False and story.now.iteration == 0
-
-
 def test_repeats_are_averaged_and_all_are_needed():
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
     story = Story(plant=noisy, repeats=3)
     for missing in (3, 2, 1):
         story.propose()
         assert story.now.missing == missing and story.now.phase == "await-trial"
-        assert holds(story.now.sentence, missing)
         story.add()
     story.add().add().add()
     tried = story.now.history[0]
@@ -310,14 +165,6 @@ def test_repeats_are_averaged_and_all_are_needed():
     mean = mean_trial(tried.trials, TASK.model.angle_mask)
     np.testing.assert_allclose(mean.states, np.mean([t.states for t in tried.trials], axis=0))
     np.testing.assert_allclose(mean.inputs, np.mean([t.inputs for t in tried.trials], axis=0))
-
-
-def test_a_candidate_run_more_often_is_averaged_too():
-    story = Story().add()
-    story.trials.append(bad(story.trials[0], 1.0))
-    each = [story.task.utility(t) for t in story.trials]
-    assert story.now.incumbent.utility == pytest.approx(np.mean(each))
-    assert story.now.trials == 2
 
 
 # a loss that may be luck
@@ -333,7 +180,6 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
     now = story.now
     assert now.phase == "await-trial" and now.outstanding.id == "c0001" and now.missing == 1
     assert now.history[-1].accepted is None and now.history[-1].in_doubt
-    assert holds(now.sentence, "c0002", "c0001") and "noise" not in now.sentence  # none is known
     story.add()  # the same result again, so it was not luck
     now = story.now
     assert now.history[-1].accepted is False and now.phase == "propose"
@@ -342,7 +188,6 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
 
 
 def test_a_lucky_winner_loses_its_luck():
-    """c0001's only trial was lucky; c0002 is truly better and wins once c0001 was run again."""
     story = Story(rerun_incumbent=True).add().add()
     honest = [story.task.utility(t) for t in story.trials]
     assert honest[1] > honest[0]
@@ -356,28 +201,6 @@ def test_a_lucky_winner_loses_its_luck():
         story.trials.append(bad(story.trials[1], 2.0))
         story.trials[-1] = replace(story.trials[-1], candidate="c0001")
     assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
-
-
-def test_a_doubt_ends_with_the_best_that_it_was_about():
-    """An excavator's third best ran 35 times because the second seemed unlucky beside the first.
-
-    c0002 wins, c0003 loses by little, so c0002 runs again, badly: now it is c0002 that lost to
-    c0001 by little, but c0003 has beaten both.
-    """
-    story = Story(rerun_incumbent=True, tolerance=0.0).add().add().add(worse(0.02))
-    first, second, third = (story.task.utility(t) for t in story.trials)
-    assert first < third < second and story.now.outstanding.id == "c0002"
-    again = replace(story.trials[1])
-    by = next(d for d in np.linspace(0.0, 1.0, 1000) if mean_of(story, bad(again, d)) < first)
-    story.trials.append(bad(again, by))
-    now = story.now
-    assert [t.accepted for t in now.history] == [True, False, True]
-    assert now.incumbent.candidate.id == "c0003" and now.phase == "propose"
-
-
-def mean_of(story, again):
-    """Return the mean utility of the second trial and another one of its candidate."""
-    return (story.task.utility(story.trials[1]) + story.task.utility(again)) / 2
 
 
 def test_losses_are_not_checked_for_ever():
@@ -449,36 +272,9 @@ def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
     assert efforts == sorted(efforts, reverse=True) and efforts[1] < 0.7 * efforts[0]
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
-    assert holds(last.standing.sentence, MAX_CAUTION + 1)
-
-
-def test_after_a_gentler_first_policy_the_search_goes_on():
-    story = Story().add(cut).add().add()
-    assert story.now.iteration == 1 and story.now.incumbent.candidate.id == "c0003"
-
-
-def test_a_gentler_policy_is_not_run_for_a_crash_that_was_set_aside():
-    story = Story().add(cut)
-    gentle = story.propose().candidate
-    assert gentle.caution == 1
-    story.trials.clear()
-    again = story.propose()
-    assert not again.is_new and again.candidate is story.candidates[0]
-    assert [story.now.verdict(t) for t in story.now.history] == ["waiting", "no trial"]
-    story.add().propose()
-    made = story.candidates[-1]
-    assert (made.id, made.base, made.caution) == ("c0003", "c0001", 0)
-
-
-def test_a_step_is_not_run_from_a_run_that_was_set_aside():
-    story = Story().add().add()
-    assert story.propose().candidate.base == "c0002"
-    del story.trials[1]
-    assert story.propose().candidate is story.candidates[1]
 
 
 def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost():
-    """c0007 was proposed still, after the run of c0006 that was its reason had been set aside."""
     story = Story().add().add(cut)
     made = story.propose().candidate
     assert made.seen == tuple(trial.id for trial in story.trials) and len(made.seen) == 2
@@ -489,24 +285,6 @@ def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost()
     assert again.standing.history[-1].void and again.standing.history[-1].gone == (wrong.id,)
     story.trials.append(wrong)
     assert story.propose().candidate is made  # restored
-
-
-@pytest.mark.parametrize("slopes", ["", "corrected", "original"])
-def test_a_step_learnt_from_a_discarded_trial_counts_as_no_loss(slopes):
-    """After `discard` of a wild run the step that it had led to still counted: -9.604."""
-    story = Story().add().add(cut)
-    made = replace(story.propose().candidate, slopes=slopes)
-    story.candidates[2:] = [made]
-    worse = replace(
-        story.trials[0], states=story.trials[0].states + 9.0, id="t9", candidate=made.id
-    )
-    story.trials.append(worse)
-    assert losers_of(story.now.history, made.base, made.model)[-1] is made
-    del story.trials[1]
-    lost = losers_of(story.now.history, made.base, made.model)
-    assert lost == ([] if slopes else [made])
-    assert story.now.history[-1].verdict() == "no better"  # which it was
-    assert story.propose().candidate is story.candidates[1]
 
 
 def test_a_run_whose_last_steps_were_not_recorded_did_not_crash():
@@ -557,14 +335,12 @@ def test_max_trials_ends_the_search():
     story = Story(max_trials=3).add().add().add()
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
-    assert holds(last.standing.sentence, 3, "[search] max_trials")
 
 
 def test_repeats_that_do_not_fit_any_more_are_not_begun():
     story = Story(max_trials=5, repeats=3).add().add().add()
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
-    assert holds(last.standing.sentence, 3, 5, "[search] max_trials")
     with pytest.raises(GroundedError, match=holding("repeats = 3", "max_trials = 2")):
         SearchOptions(repeats=3, max_trials=2)
 
@@ -575,7 +351,6 @@ def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
     assert last.candidate is None and last.standing.phase == "converged"
     assert last.standing.incumbent is not None
     assert last.standing.incumbent.candidate.id == "c0001"
-    assert holds(last.standing.sentence, "1 %", "c0001")
 
 
 def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
@@ -617,30 +392,6 @@ def test_the_order_of_stored_trials_decides_nothing():
     np.testing.assert_allclose(
         turned.candidate.policy.feedforward, made.policy.feedforward, atol=1e-9
     )
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"max_halvings": -1},
-        {"max_halvings": 31},
-        {"repeats": 0},
-        {"max_trials": 0},
-        {"tolerance": 1.0},
-        {"tolerance": -0.1},
-        {"tolerance": float("nan")},
-    ],
-    ids=str,
-)
-def test_options_out_of_range_are_refused(change):
-    with pytest.raises(GroundedError, match=next(iter(change))):
-        SearchOptions(**change)
-
-
-def test_first_steps():
-    assert SearchOptions().first_step() == Step(1.0, 1.0)
-    assert SearchOptions(step="full").first_step() == Step(0.0, 1.0)
-    assert not SearchOptions(method="policy-gradient").damps
 
 
 def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
@@ -685,7 +436,7 @@ EVENTS = {
     st.sampled_from([1, 2]),
     st.sampled_from(["damped", "full"]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
     """Crashes, noise, changed models, repeats: no exception, no worse policy."""
     story = Story(repeats=repeats, step=step, max_halvings=2, max_trials=8)
@@ -714,16 +465,6 @@ def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
         assert np.isfinite(policy.feedforward).all() and np.isfinite(policy.gain).all()
         inside = first.candidate.predicted_inputs
         assert (inside >= TASK.low).all() and (inside <= TASK.high).all()
-
-
-def test_a_candidate_that_was_never_run_does_not_stop_a_search_from_ending():
-    """Repeats that agree to the last bit, and one without a trial: it divided by none."""
-    story = Story(max_halvings=2)
-    story.propose()
-    story.task = story.task.with_model(other(story.task.model, 1.1))
-    story.add(EVENTS["large"])
-    story.trials.append(story.trials[-1])
-    assert story.propose().standing.sentence
 
 
 def weights(state=10.0, terminal=0.0, effort=0.01, change=0.01):
@@ -780,18 +521,6 @@ def test_a_loss_by_several_times_the_best_utility_is_no_luck():
     assert story.now.history[-1].accepted is False and story.now.phase == "propose"
 
 
-def test_what_another_model_gained_ends_no_search(monkeypatch):
-    """After `adopt`, small gains with the old model do not end the search."""
-    monkeypatch.setattr(About, "_doubtful", lambda *_: False)
-    story = Story().add().add()
-    for _ in range(4):
-        story.add(bad)
-    ending = story.now.ending
-    other_model = standing(story.task, story.candidates, story.trials, story.options, "another")
-    assert ending == "no step improved"
-    assert (other_model.phase, other_model.ending) == ("propose", "")
-
-
 @pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])
 def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
     """A run may be a thousand times worse than predicted although its loop is stable."""
@@ -808,21 +537,5 @@ def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
         assert [c.way for c in story.candidates].count("gentler gains") == 1
 
 
-def test_losses_of_other_slopes_raise_no_damping():
-    story = Story(tolerance=1e-9).add()
-    while story.propose().candidate is not None and len(story.candidates) < 3:
-        story.add(bad)
-    now, model = story.now, story.candidates[0].model
-    first = story.candidates[1]
-    assert (first.slopes, first.damping) == ("", 1.0)
-    history = now.history[:2]
-    steps = [
-        story.options.due(history, now.incumbent, model, "", slopes)
-        for slopes in (None, "", "corrected")
-    ]
-    assert [step.damping for step in steps] == [10.0, 10.0, 1.0]
-
-
 def test_fingerprints_are_taken_where_numpys_generator_would_draw():
-    """Those of earlier versions were, and candidates keep them."""
     assert (fixed_draws(3000) == np.random.default_rng(0).random(3000)).all()

@@ -5,17 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import holds
 from grounded.plant import Plant
-from grounded.search.candidate import Candidate, Tried
-from grounded.search.certainty import to_settle
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
-from grounded.search.starts import Starts, worth_of_start
+from grounded.search.starts import worth_of_start
 from grounded.search.step.step_size import SearchOptions, losers_of
 from grounded_trials.workspace.adopted import planner_of
-from grounded_trials.workspace.candidates.proposing import _lost_by_starts
 from small_tasks import cart_task, drive, other
 
 TASK = cart_task()
@@ -60,19 +56,12 @@ def story():
 
 
 def test_a_better_candidate_that_began_off_is_run_again_and_becomes_the_best(story):
-    """A boat's c0004 began 96 mm off, lost by 0.53, was "no better" and ended the search."""
     now = story.run(1, OFF)
     best, doubt = now.history
     assert doubt.utility < best.utility and doubt.gain_over(best) > 0
     assert (doubt.verdict(), doubt.to_settle) == ("in doubt", "c0002")
     assert (now.phase, now.outstanding.id, now.missing) == ("await-trial", "c0002", 1)
-    assert holds(now.sentence, "c0002 lost to c0001", "by the model", "itself", "better")
-    assert "from [task] start" in now.sentence
     assert losers_of(now.history, "c0001", PLANNER.fingerprint) == []
-    assert not _lost_by_starts(now)
-    lost = replace(now, history=(best, replace(doubt, accepted=False)))
-    (said,) = _lost_by_starts(lost)  # else its utility in the table looks like the step's own
-    assert said.startswith("c0002 lost to c0001 by") and "due to where their runs began" in said
     now = story.run(0, OFF)  # what the best one measures then is no better
     now = story.run(1)
     assert now.incumbent.candidate.id == "c0002" and now.phase == "propose"
@@ -92,75 +81,7 @@ def test_a_worse_candidate_that_began_off_is_run_twice_and_loses(story):
     assert [c.id for c in losers_of(now.history, "c0001", PLANNER.fingerprint)] == ["c0002"]
 
 
-def test_starts_that_agree_and_models_that_cannot_tell_leave_the_papers_rule(story):
-    """Runs that all begin 0.1 m off are compared as they are."""
-    story.trials.clear()
-    story.run(0, OFF)
-    now = story.run(1, OFF, worse=3.0)
-    assert now.history[1].excused(now.history[0]) == 0.0
-    assert now.history[1].to_settle in ("", "c0001")
-    blind = standing(TASK, *story.both, story.options, PLANNER.fingerprint)
-    assert [t.verdict() for t in blind.history] == [t.verdict() for t in now.history]
-    again = Story(rerun_incumbent=False)
-    assert again.run(1, OFF).history[1].accepted is False
-
-
-def test_a_start_that_would_cost_more_than_the_run_is_unknown(story, monkeypatch):
-    now = story.run(1, OFF)
-    best, doubt = now.history
-    for worth in (10 * doubt.utility, -np.inf, np.nan):
-        monkeypatch.setattr("grounded.search.starts.worth_of_start", lambda *_, w=worth: w)
-        assert np.isnan(Starts(PLANNER).cost(doubt))
-        told = replace(doubt, starts=Starts(PLANNER))
-        assert told.excused(best) == 0.0 and told.gain_over(best) == doubt.utility - best.utility
-
-
-def test_the_candidate_whose_start_matters_more_is_run_again(story):
-    now = story.run(1, OFF)
-    best, doubt = now.history
-    assert to_settle(best, doubt, 2) is doubt and to_settle(best, doubt, 1) is None
-    twice = replace(doubt, trials=doubt.trials * 2, utilities=doubt.utilities * 2)
-    assert to_settle(best, twice, 2) is best
-    assert to_settle(best, twice, 9) is best  # where starts scatter, it was asked for without end
-    policy = doubt.candidate.policy
-    assert worth_of_start(PLANNER, policy, OFF) < 0 == worth_of_start(PLANNER, policy, 0 * OFF)
-
-
-def test_where_starts_are_known_to_be_what_runs_scatter_by_none_is_taken_as_alike(
-    monkeypatch, story
-):
-    """A run that began 78 mm off "lost by no more than noise may explain"."""
-    monkeypatch.setattr("grounded.search.starts.beyond_noise", lambda *_: np.array([False]))
-    now = story.run(1, OFF)
-    best, doubt = now.history
-    assert Starts(PLANNER).owed(doubt, best) == 0.0
-    placed = replace(doubt, placed=True)
-    costs = [Starts(PLANNER).cost(one) for one in (best, placed)]
-    assert Starts(PLANNER).owed(placed, best) == pytest.approx(costs[0] - costs[1]) != 0.0
-    assert not now.history[1].placed  # no repeat bears that out yet
-    assert story.run(1, 0.3 * OFF).history[1].placed
-
-
-def test_another_run_for_a_loss_in_doubt_says_what_is_at_stake(story, monkeypatch):
-    """The last two of a boat's six runs were for 2.6 % of what its best one cost."""
-    now = story.run(1, worse=0.05)
-    best = now.incumbent
-    assert now.outstanding is not None and "stop with" not in now.sentence  # promises much
-    for promise, told in (
-        (0.026, "c0002 promises 2.6 % of what c0001"),
-        (-0.1, "nothing over c0001"),
-    ):
-        over = promise * -best.utility
-        monkeypatch.setattr(Candidate, "promised_over", lambda made, other, gain=over: gain)
-        assert holds(
-            story.now.sentence, told, "worth another run, stop with c0001", "(`export best`)"
-        )
-    monkeypatch.setattr(Tried, "is_unsteady", True)  # another policy may be steadier
-    assert "stop with" not in story.now.sentence
-
-
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
-    """Only the log began off the start: a rover's start was told to matter little."""
     policy = story.candidates[1].policy
     late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])
     assert late.plan.model.n > TASK.model.n

@@ -50,11 +50,3 @@ def test_a_steady_turn_of_the_car_is_trimmed():
     np.testing.assert_allclose(u[late, 0], steering, atol=0.05)
     np.testing.assert_allclose(u[late, 1], throttle, atol=0.05)
     np.testing.assert_allclose(x[:, 1:5], target("circle")[:, 1:5], atol=1e-9)
-
-
-def test_without_limits_it_starts_from_what_is_held():
-    task = cart_task(low=np.array([-np.inf]), high=np.array([np.inf]))
-    t = 0.05 * np.arange(41)
-    x = np.column_stack([1 - np.cos(t), np.sin(t)])
-    bounded, free = (trim(of, x, np.array([True, True]))[1] for of in (cart_task(), task))
-    np.testing.assert_allclose(free, bounded, atol=1e-6)

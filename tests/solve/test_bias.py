@@ -11,10 +11,8 @@ from grounded.errors import GroundedError
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task, perturbed
 from grounded.experiments.pendulum import pendulum_task
-from grounded.experiments.real_car import real_plant
 from grounded.models import aircraft, car, pendulum
 from grounded.plant import Plant
-from grounded.policy import Policy
 from grounded.rollout import augmented, simulate
 from grounded.search.improve import propose
 from grounded.search.step.step_size import SearchOptions
@@ -35,10 +33,6 @@ def run_of(task, model, seed=0, substeps=1, latency=None):
     start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
     plant = Plant(model, latency=latency or {}, substeps=substeps)
     return policy, plant.run(policy, start, rng)
-
-
-def open_loop(policy: Policy) -> Policy:
-    return replace(policy, gain=None, reference=None)
 
 
 def short(task, H):
@@ -80,7 +74,7 @@ def test_the_biased_model_replays_the_trial(name, exact, matched):
 
 
 @pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.4, 2.0, 3.75])
+@pytest.mark.parametrize("delay", [0.3, 1.0, 3.75])
 def test_any_fraction_of_latency_is_replayed(delay, exact):
     task = rover_task(latency=np.array([delay * 0.05, 0.01]))
     policy, trial = run_of(
@@ -101,15 +95,6 @@ def test_a_feedback_policy_replays_its_own_trial():
     run = simulate(task.problem(ground(task, trial, exact=True).bias, exact=True), first.policy)
     assert np.abs(run.states - trial.states).max() < 1e-9
     assert np.abs(run.inputs - trial.inputs).max() < 1e-9
-
-
-def test_the_car_of_the_paper_is_replayed_by_its_crude_model():
-    task = car_task("figure8", car.model)
-    first = propose(task, [], [], SearchOptions()).candidate
-    trial = drive(task, real_plant(), first)
-    run = simulate(task.problem(ground(task, trial, exact=True).bias, exact=True), first.policy)
-    assert np.abs(run.states - trial.states).max() < 1e-9
-    assert np.abs(trial.states[:, 4]).max() > np.pi  # a heading beyond pi was in it
 
 
 def test_angles_logged_wrapped_are_replayed_too():

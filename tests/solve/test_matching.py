@@ -5,13 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.experiments.bench import bench, optimum
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import real_plant
 from grounded.models.car import model as car
-from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy
-from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
 from grounded.solve.levenberg_marquardt import LeastSquares, solve
 
@@ -52,24 +49,6 @@ def test_a_model_that_is_right_needs_no_shift(trial):
     run = plant.run(policy, start, np.random.default_rng(0))
     still = replace(task, smoothing=0.0)
     assert np.abs(ground(still, run, match_inputs=True).shift).max() < 1e-6
-
-
-@pytest.mark.slow
-def test_one_trial_closes_most_of_the_gap_of_a_miscalibrated_car():
-    shares = {True: [], False: []}
-    for seed in range(4):
-        case = bench("circle", "parametric", seed)
-        best = optimum(case)[1]
-        for matched in shares:
-            number = iter(range(100))
-            options = SearchOptions(max_trials=2, match_inputs=matched)
-            trials = learn(
-                case.task, lambda c, n=number, case=case: case.real(c.policy, next(n)), options
-            ).trials
-            first, second = (case.task.utility(t) for t in trials)
-            shares[matched].append((max(second, first) - first) / (best - first))
-    assert min(shares[True]) > 0.98
-    assert np.median(shares[True]) > np.median(shares[False])
 
 
 def test_levenberg_marquardt_solves_each_row_and_keeps_bounds():

@@ -7,11 +7,9 @@ from grounded.compile.run.interpreted import linearised
 from grounded.model import Model, Param
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
-from grounded.solve import ddp
 from grounded.solve.measured import measured_gains
-from grounded.task import Task
-from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of
+from small_tasks import plain_task
 
 
 def roll(s, a, p):
@@ -27,54 +25,9 @@ def lagging():
         params={"inertia": Param(0.01, "kg m^2")},
         derivative=roll,
     )
-    H = 80
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.tile([1.0, 0.0], (H + 1, 1)),
-        reward=Reward(np.array([10.0, 0.0]), np.array([100.0, 1.0]), np.array([1e-4]), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-20.0]),
-        high=np.array([20.0]),
-    )
+    target, ends = np.tile([1.0, 0.0], (81, 1)), [100.0, 1.0]
+    task = plain_task(model, 0.02, target, [10.0, 0.0], 20.0, terminal=ends, effort=1e-4)
     return planner_of(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
-
-
-def two_axes(s, a, p):
-    return {
-        "q": s.w,
-        "r": s.v,
-        "w": 100 * a.moment + 30 * a.other,
-        "v": 30 * a.moment + 200 * a.other - 5 * s.q,
-    }
-
-
-def twins(s, a, p):
-    """Both moments do the same."""
-    return {**two_axes(s, a, p), "w": a.moment + a.other, "v": a.moment + a.other - 5 * s.q}
-
-
-def lagging_by_two(derivative, weight):
-    """Two axes whose moments lag, at rest; inputs cost `weight`."""
-    model = Model(
-        states={"q": "rad", "r": "rad", "w": "rad/s", "v": "rad/s"},
-        inputs={"moment": "N m", "other": "N m"},
-        params={},
-        derivative=derivative,
-    )
-    zero, H = np.zeros(2), 120
-    task = Task(
-        model=model,
-        dt=0.02,
-        target=np.tile([1.0, 0.5, 0.0, 0.0], (H + 1, 1)),
-        reward=Reward(np.array([10.0, 10.0, 1.0, 1.0]), np.zeros(4), np.full(2, weight), zero),
-        start=np.zeros(4),
-        past=zero,
-        low=np.full(2, -1e3),
-        high=np.full(2, 1e3),
-    )
-    return planner_of(task, [{"name": "first_order_lag:moment+other", "tau": 0.02}])
 
 
 def disturbed(problem, run, K, measured=2):
@@ -122,51 +75,3 @@ def test_a_clamped_input_keeps_no_gain(lagging):
     clamped[3:6] = 0.0
     K = measured_gains(problem, found.z, found.u, clamped, 2)
     assert not K[3:6].any() and K[10].any()
-
-
-def test_rounding_does_not_grow_where_inputs_are_cheap():
-    """An arm of two joints got 900 N m/rad where its plan had 30, and a singular matrix."""
-    planner = lagging_by_two(two_axes, 1e-6)
-    problem = planner.plan.problem()
-    found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
-    run = simulate(problem, planner.plan.policy(found.u, found.K, found.z[:-1]))
-    K = measured_gains(problem, found.z, found.u, found.K, 4)
-    assert np.abs(K).max() < 2 * np.abs(found.K).max()
-    full, made = (disturbed(problem, run, k, 4) for k in (found.K, K))
-    assert made < 4 * full
-
-
-def test_inputs_that_cost_nothing_and_do_the_same_are_shared():
-    """Q_uu is singular there, and DDP goes on with a damping of its own."""
-    planner = lagging_by_two(twins, 0.0)
-    problem = planner.plan.problem()
-    found = ddp.solve(problem, np.zeros((problem.horizon, 2)))
-    assert found.ok
-    K = measured_gains(problem, found.z, found.u, found.K, 4)
-    np.testing.assert_allclose(K[:, 0], K[:, 1], atol=1e-6 * np.abs(K).max())
-    assert np.isfinite(K).all() and K.any() and not K[:, :, 4:6].any()
-
-
-def test_a_line_that_is_never_left_tells_nothing_of_the_speed():
-    """A balancing robot with a filtered speed got 120,000 V per metre off its line, and fell."""
-    model = Model(
-        states={"x": "m", "y": "m", "psi": "rad", "v": "m/s", "r": "rad/s"},
-        inputs={"left": "V", "right": "V"},
-        params={},
-        derivative=lambda s, a, p: {
-            "x": s.v * np.cos(s.psi),
-            "y": s.v * np.sin(s.psi),
-            "psi": s.r,
-            "v": a.left + 1.05 * a.right - 0.5 * s.v,
-            "r": 8 * (1.1 * a.right - a.left) - 3 * s.r,
-        },
-    )
-    H, weigh = 100, np.array([10.0, 10.0, 1.0, 0.1, 0.1])
-    target = np.zeros((H + 1, 5))
-    target[:, 0] = np.linspace(0.0, 1.0, H + 1)
-    reward = Reward(weigh, weigh, np.full(2, 1e-4), np.full(2, 1e-3))
-    limits = np.full(2, 12.0)
-    task = Task(model, 0.02, target, reward, np.zeros(5), np.zeros(2), -limits, limits)
-    planner = planner_of(task, [{"name": "sensor_lag:v", "tau": 0.025}])
-    policy, _ = planner.first_policy()
-    assert np.abs(policy.gain[:, :, 1]).max() < 1e3

@@ -18,7 +18,6 @@ def step_policy(task, at=10, value=1.0):
 
 @pytest.mark.parametrize(("latency", "late"), [(0.0, 0), (0.01, 1), (0.05, 5), (0.13, 13)])
 def test_latency_is_resolved_finer_than_the_control_step(latency, late):
-    """A step of the force arrives `late` hundredths of a second after it was sent."""
     task = cart_task()
     policy = step_policy(task)
     delayed = Plant(cart, latency={"force": latency}, substeps=5).run(

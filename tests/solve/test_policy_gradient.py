@@ -20,10 +20,9 @@ from grounded.solve.policy_gradient import (
     ascent,
     gradient,
 )
-from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import Reward
 from problems import SPECS, problem
+from small_tasks import plain_task
 
 CASES = [(name, delay) for name in sorted(SPECS) for delay in (0.0, 1.4)]
 
@@ -147,17 +146,9 @@ def cart(feedback):
         params={name: Param(value) for name, value in spec["params"].items()},
         derivative=spec["function"],
     )
-    task = Task(
-        model=model,
-        dt=0.1,
-        target=np.column_stack([np.linspace(0, 1, 31), np.full(31, np.nan)]),
-        reward=Reward(np.array([1.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([0.1])),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-2.0]),
-        high=np.array([2.0]),
-        feedback=feedback,
-    )
+    target = np.column_stack([np.linspace(0, 1, 31), np.full(31, np.nan)])
+    weights = {"effort": 0.01, "change": 0.1}
+    task = plain_task(model, 0.1, target, [1.0, 0.0], 2.0, feedback=feedback, **weights)
     return task, task.with_model(model.with_values({"mass": 0.75}))
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.compile.run.interpreted import box_qp, trajectory_cost
+from grounded.compile.run.interpreted import box_qp
 from grounded.solve.ddp import sweep
 from problems import linear_least_squares, problem
 
@@ -121,13 +121,3 @@ def test_a_cost_without_input_weights_is_regularised_not_raised():
     assert found.ok and found.mu > 0
     bad = sweep(task, np.full((6, 3), np.nan), np.zeros((5, 1)))
     assert not bad.ok
-
-
-def test_cost_wraps_angles():
-    task = problem("pendulum", 3)
-    z = np.zeros((4, 3))
-    z[:, 0] = task.target[:, 0]
-    moved = z.copy()
-    moved[:, 0] += 2 * np.pi
-    u = np.zeros((3, 1))
-    assert trajectory_cost(task, z, u) == pytest.approx(trajectory_cost(task, moved, u))

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from grounded.models.car import model as car
 from grounded.onboard import Runner
 from grounded.plant import Plant
-from grounded.rollout import augmented, each_stepped, simulate
+from grounded.rollout import augmented, simulate
 from small_tasks import cart_task, rover, rover_task
 
 
@@ -55,13 +54,6 @@ def test_a_run_that_diverges_is_minus_infinity_and_no_exception():
     assert run.utility == -np.inf
 
 
-def test_a_rollout_is_read_only():
-    run = simulate(cart_task().problem(), cart_task().policy(np.zeros((40, 1)), None, None))
-    with pytest.raises(ValueError, match="read-only"):
-        run.inputs[0] = 1.0
-    assert run.states.shape == (41, 2)
-
-
 def test_the_inputs_already_sent_stand_beside_the_states():
     task = rover_task(latency=np.array([0.0, 0.15]))
     problem = task.problem()
@@ -89,17 +81,3 @@ def test_the_plant_with_the_models_own_latency_is_the_model():
     trial = plant.run(policy, {}, np.random.default_rng(0))
     np.testing.assert_allclose(trial.states, run.states, atol=1e-9)
     np.testing.assert_allclose(trial.inputs, run.inputs, atol=1e-9)
-
-
-def test_rows_of_equal_parameters_are_stepped_together(monkeypatch):
-    rng, calls = np.random.default_rng(1), []
-    p = np.tile(car.values, (6, 1))
-    p[[1, 2, 5], 0] *= 1.5  # two sets of parameters, one of them in two places
-    x, u = rng.normal(size=(6, car.n)), rng.normal(size=(6, car.m))
-    alone = np.concatenate([car.system.step(x[[i]], u[[i]], p[i], 0.05) for i in range(6)])
-    own = type(car.system).step
-    monkeypatch.setattr(
-        type(car.system), "step", lambda *a, **k: (calls.append(len(a[1])), own(*a, **k))[1]
-    )
-    np.testing.assert_array_equal(each_stepped(car, x, u, p, 0.05), alone)
-    assert sorted(calls) == [3, 3]

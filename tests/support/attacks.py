@@ -1,10 +1,4 @@
-"""Attacks on files, folders and commands, which count what was tried and what broke.
-
-Each attack takes a random generator and a time, runs until the time is over (at least once) and
-returns a `Tally`. A break is a wrong number without a warning, an exception that is not one
-sentence, more than 10 s or more than 1 GB. `benchmarks/attack.py` runs all attacks; test_attacks
-runs a few tries of each.
-"""
+"""Attacks on files, folders and commands, which count what was tried and what broke."""
 
 from __future__ import annotations
 
@@ -542,11 +536,7 @@ READING = (("status",), ("propose",))
 
 
 def flips(rng: random.Random, seconds: float) -> Tally:
-    """Flip one bit of any file of a workspace: commands end well, and `verify` finds it.
-
-    Files that the user edits (grounded.toml, model.py, target.csv) have no checksum, so only a
-    traceback counts as a break there. Results of a study are unchanged or gone.
-    """
+    """Flip one bit of any file of a workspace: commands end well, and `verify` finds it."""
     tally = Tally()
     results = {f"seed {k}": {"utility": -1.5 + k, "errors": [0.25, float("inf")]} for k in range(3)}
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:

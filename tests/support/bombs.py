@@ -1,7 +1,4 @@
-"""Small files whose reading would take gigabytes or hours, one of each kind; see `BOMBS`, `OTHERS`.
-
-`bomb(name, folder)` writes one and returns it with the path of the number to read.
-"""
+"""Small files whose reading would take gigabytes or hours, one of each kind."""
 
 from __future__ import annotations
 
@@ -397,10 +394,7 @@ class Cost:
 
     @property
     def wrong(self) -> str:
-        """Return why this is not a clean end, or "": no traceback, under 500 MB, and in time.
-
-        The time allowed is the budget (and 1 s per MB) and 4 s to start and end.
-        """
+        """Return why this is not a clean end, or "": no traceback, under 500 MB, and in time."""
         if "Traceback" in self.text or self.exit not in (0, 1, 3):
             return f"exit {self.exit}: {self.text[-300:]}"
         allowed = self.budget_s + 4.0 + self.size_mb

@@ -1,12 +1,4 @@
-"""Check whether a filter's covariances are right, on simulated trials with known states.
-
-    NIS   e_t' S_t^-1 e_t / ny         mean 1 if the innovations are as large as claimed
-    NEES  (x - xhat)' P^-1 (x - xhat) / n    mean 1 if the states are as uncertain as claimed
-    whiteness   correlation of neighbouring whitened innovations, 0 if they are white
-
-Each mean is compared with the 95 % band that independent draws would give (chi squared; Bar-Shalom,
-Li & Kirubarajan 2001, ch. 5). States within a trial are correlated, so NEES is judged by trials.
-"""
+"""Check whether a filter's covariances are right, on simulated trials with known states."""
 
 from __future__ import annotations
 
@@ -28,19 +20,7 @@ def merged(
     *,
     resolution: float = 1e-6,
 ) -> Record:
-    """Merge measurements and commands into one record with states at the times of both.
-
-    For a camera and a controller of different rates; times closer than `resolution` [s] are merged.
-    Commands act exactly when they were sent, plus their latency.
-
-    Args:
-        times: of the measurements [s], (N,).
-        measured: (N, ny).
-        command_times: [s], (M,).
-        commands: (M, m).
-        past: held before the first command, (m,).
-        resolution: [s].
-    """
+    """Merge measurements and commands into one record with states at the times of both."""
     inside = (command_times >= times[0]) & (command_times <= times[-1])
     ticks = np.unique(np.round(np.concatenate([times, command_times[inside]]) / resolution))
     where = np.searchsorted(ticks, np.round(np.asarray(times) / resolution))
@@ -73,13 +53,7 @@ def consistency(
     truth: Sequence[Array] | None = None,
     states: Sequence[int] | None = None,
 ) -> Consistency:
-    """Compute the consistency of filtered trials.
-
-    Args:
-        estimated: of `smooth_trials` with `forward` (NEES without it too).
-        truth: the true states of each trial, (T + 1, n), where a simulation knows them.
-        states: index of the states that NEES judges; None: all.
-    """
+    """Compute the consistency of filtered trials. Args: estimated."""
     squares, count, products, pairs = 0.0, 0, 0.0, 0
     for trial in estimated:
         eps = _whitened(trial)

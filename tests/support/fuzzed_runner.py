@@ -1,7 +1,4 @@
-"""Random calls of the runner that a robot uses, and files that ask it for gigabytes.
-
-Needs only Python 3.8 and NumPy, as the runner itself does.
-"""
+"""Random calls of the runner that a robot uses, and files that ask it for gigabytes."""
 
 from __future__ import annotations
 
@@ -82,14 +79,7 @@ class Found:
 
 
 def fuzz(runner: Path, folder: Path, calls: int, seed: int) -> Found:
-    """Call `action` and `done` with random things, NumPy's errors and all warnings raised.
-
-    Args:
-        runner: the file grounded/onboard.py, or a copy of it.
-        folder: for the policies.
-        calls: number of calls of `action`.
-        seed: of the random numbers.
-    """
+    """Call `action` and `done` with random things, NumPy's errors and all warnings raised."""
     spec = importlib.util.spec_from_file_location("fuzzed_onboard", runner)
     assert spec is not None and spec.loader is not None
     onboard = importlib.util.module_from_spec(spec)

@@ -1,10 +1,4 @@
-"""Run `grounded` commands and kill them at random moments, in a separate process for test_kill.
-
-    python killing.py SEED KILLS LONGEST_S WORKSPACE COMMAND...
-
-Forks after everything is imported, so that kills hit the work and not the start-up. Prints how
-many runs were killed; the last run is not.
-"""
+"""Run `grounded` commands and kill them at random moments, in a separate process for test_kill."""
 
 import os
 import random

@@ -1,7 +1,4 @@
-"""Real systems whose authors published what their crude model lacks (../shared/data).
-
-Each has a model, as a user would write it in model.py, and the trials of its log.
-"""
+"""Real systems whose authors published what their crude model lacks (../shared/data)."""
 
 from __future__ import annotations
 

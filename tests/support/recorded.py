@@ -31,14 +31,7 @@ def record(
     ahead=0,
     most=np.inf,
 ):
-    """Run a policy on the model against a load, and log everything as a table.
-
-    `late`: rows by which program and log receive the position late. `noise`: of x [m], v [m/s].
-    `differs`: rows over which the program differentiates x, in place of the speed. `turned`: the
-    motor is wired the wrong way round. `stale`: steps by which the program passes an older sample,
-    with its time, `old`: the same at the present time. `ahead`: steps by which the program's clock
-    ran before the run. `most`: where the program cuts its commands.
-    """
+    """Run a policy on the model against a load, and log everything as a table."""
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
     past, acted = [], []

@@ -1,9 +1,4 @@
-"""Torture tests of files and store, which count tries and losses.
-
-`python tests/support/reliability.py` makes the full counts of docs/reliability.md; the tests run
-the same functions with fewer tries. Each returns (tries, failures). A failure is a wrong number, a
-traceback, an acknowledged file that is gone, or a store that does not verify.
-"""
+"""Torture tests of files and store, which count tries and losses."""
 
 from __future__ import annotations
 
@@ -98,10 +93,7 @@ def read_damaged(flips: bool, stride: int = 1) -> Outcome:
 
 
 def recover_damaged(flips: bool, stride: int = 1) -> Outcome:
-    """Check that `recover` saves only right numbers and never calls a loss complete.
-
-    All files are read in one child process.
-    """
+    """Check that `recover` saves only right numbers and never calls a loss complete."""
     return within("all of them", 10**10, _recover_damaged, flips, stride)
 
 

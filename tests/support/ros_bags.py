@@ -79,10 +79,7 @@ def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
 
 
 def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
-    """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s.
-
-    `seen` is a topic of its pose.
-    """
+    """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s."""
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
         "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
@@ -108,10 +105,7 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
 
 
 def rover_bag(folder, *, seen=""):
-    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry.
-
-    With `seen`, the topic of a camera's poses, nothing else is logged beside the commands.
-    """
+    """Write a bag of a two-wheeled robot whose commands begin a little before its odometry."""
     topics = {"/cmd_vel": "geometry_msgs/msg/Twist"}
     if seen:
         topics |= {seen: "geometry_msgs/msg/PoseStamped"}
@@ -179,22 +173,19 @@ def turned(roll, pitch, yaw):
     return T["geometry_msgs/msg/Quaternion"](*map(float, q)), rz @ ry @ rx
 
 
-def drone_bag(folder, yaw=1.4, turning=0.0, followed=True):
-    """Write a bag of a drone as mavros does: the velocity of its odometry is in its own axes.
-
-    Not `followed`: its attitude ignores the commands.
-    """
+def drone_bag(folder, turning=0.0):
+    """Write a bag of a drone as mavros does: the velocity of its odometry is in its own axes."""
     topics = {
         "/mavros/local_position/odom": "nav_msgs/msg/Odometry",
         "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
     }
     messages, rng = [], np.random.default_rng(0)
-    at, v, angles = np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, yaw])
+    at, v, angles = np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, 1.4])
     for k in range(700):
         t = START + k * 2 * 10**7
         if k % 25 == 0:
             tilt, thrust = rng.uniform(-0.3, 0.3, 2), 0.5 + rng.uniform(-0.03, 0.03)
-        sent = np.array([*tilt, yaw + turning * np.sin(0.01 * k)])
+        sent = np.array([*tilt, 1.4 + turning * np.sin(0.01 * k)])
         q, rotation = turned(*angles)
         own = rotation.T @ v
         message = odometry(t, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -210,8 +201,7 @@ def drone_bag(folder, yaw=1.4, turning=0.0, followed=True):
             thrust=np.float32(thrust),
         )
         messages.append(("/mavros/setpoint_raw/attitude", t, command))
-        wish = sent if followed else rng.uniform(-0.3, 0.3, 3)
-        angles = angles + 0.02 * (wish - angles) / 0.15
+        angles = angles + 0.02 * (sent - angles) / 0.15
         push = rotation @ np.array([0.0, 0.0, 9.81 * thrust / 0.5]) - [0.0, 0.0, 9.81]
         v = v + 0.02 * (push - 0.2 * v)
         at = at + 0.02 * v
@@ -233,15 +223,7 @@ def arm_bag(folder, scale=1.0):
 def commanded_arm_bag(
     folder, order=("shoulder", "elbow"), goals=True, seed=0, measured_torques=False
 ):
-    """Write a bag of a vertical arm: JointState in alphabetical order, commands without names.
-
-    Args:
-        folder: of the bag.
-        order: of the torques in the array of commands.
-        goals: new ones every second; False: it hangs at rest, the torques are noise of the loop.
-        seed: of goals and noise.
-        measured_torques: JointState has efforts, noisy.
-    """
+    """Write a bag of a vertical arm: JointState in alphabetical order, commands without names."""
     rng, own, h = np.random.default_rng(seed), ("shoulder", "elbow"), 0.002
     topics = {
         "/joint_states": "sensor_msgs/msg/JointState",
@@ -292,12 +274,12 @@ STORE.register(
 )
 
 
-def crane_bag(folder, joint="trolley", load="/sway/state"):
-    """A gantry crane driven by hand for 16 s; `joint`: its name, `load`: the topic of its swing."""
+def crane_bag(folder, joint="trolley"):
+    """A gantry crane driven by hand for 16 s; `joint`: its name."""
     swing, volt = "crane_msgs/msg/SwingState", "crane_msgs/msg/MotorVoltage"
     topics = {
         "/joint_states": "sensor_msgs/msg/JointState",
-        load: swing,
+        "/sway/state": swing,
         "/motor/command": volt,
     }
     messages, x, v, th, w, u = [], 0.0, 0.0, 0.0, 0.0, 0.0
@@ -309,7 +291,7 @@ def crane_bag(folder, joint="trolley", load="/sway/state"):
             messages.append(("/motor/command", t, T[volt](header=header(t), voltage=u)))
         if k % 2 == 0:
             angle, rate = th + 1e-3 * rng.normal(), w + 8e-3 * rng.normal()
-            messages.append((load, t, T[swing](header=header(t), angle=angle, rate=rate)))
+            messages.append(("/sway/state", t, T[swing](header=header(t), angle=angle, rate=rate)))
         q, qd = np.array([x + 2e-4 * rng.normal()]), np.array([v + 4e-3 * rng.normal()])
         messages.append(("/joint_states", t, joints(t, [joint], q, qd, np.zeros(0))))
         for _ in range(5):
@@ -321,24 +303,16 @@ def crane_bag(folder, joint="trolley", load="/sway/state"):
     return bag(folder, topics, messages)
 
 
-def thruster_bag(folder, swapped=False, names=False, late=0):
-    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array.
-
-    Args:
-        folder: of the bag.
-        swapped: the array is [right, left].
-        names: the thrusters' commands are on a topic each, /thruster/left and /thruster/right.
-        late: samples by which positions are late.
-    """
+def thruster_bag(folder, swapped=False):
+    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array."""
     rng, h = np.random.default_rng(3), 0.02
-    array, number = T["std_msgs/msg/Float64MultiArray"], T["std_msgs/msg/Float64"]
+    array = T["std_msgs/msg/Float64MultiArray"]
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
-    topics = {"/odom": "nav_msgs/msg/Odometry"}
-    if names:
-        topics |= dict.fromkeys(("/thruster/left", "/thruster/right"), "std_msgs/msg/Float64")
-    else:
-        topics["/thrusters/cmd"] = "std_msgs/msg/Float64MultiArray"
-    messages, way, (x, y, psi, u, v, r) = [], [], np.zeros(6)
+    topics = {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/thrusters/cmd": "std_msgs/msg/Float64MultiArray",
+    }
+    messages, (x, y, psi, u, v, r) = [], np.zeros(6)
     felt, sent = np.zeros(2), np.zeros(2)
     for k in range(3000):
         t = START + k * 20_000_000
@@ -346,15 +320,8 @@ def thruster_bag(folder, swapped=False, names=False, late=0):
             sent = rng.uniform(-0.6, 1.0, 2)
         if k % 5 == 0:
             told = sent[::-1] if swapped else sent
-            if names:
-                for side, one in zip(("left", "right"), told, strict=True):
-                    messages.append((f"/thruster/{side}", t, number(data=float(one))))
-            else:
-                messages.append(("/thrusters/cmd", t, array(layout=layout, data=np.array(told))))
-        way.append((x, y))
-        seen = np.array([*way[max(k - late, 0)], psi, u, r]) + rng.normal(
-            0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3]
-        )
+            messages.append(("/thrusters/cmd", t, array(layout=layout, data=np.array(told))))
+        seen = np.array([x, y, psi, u, r]) + rng.normal(0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3])
         pose = odometry(t, *seen)
         pose.twist.twist.linear.y = v + 0.015 * rng.normal()
         messages.append(("/odom", t, pose))

@@ -97,6 +97,29 @@ def rover_task(**changes: Any) -> Task:
     return Task(**fields | changes)
 
 
+def plain_task(
+    model: Model, dt: float, target: Any, state: Any, limit: float, **changes: Any
+) -> Task:
+    """Return a task from rest, with |inputs| <= limit and weights of zero but for the state's.
+
+    `terminal`, `effort` and `change` are the other weights, for all inputs alike.
+    """
+    n, m = model.n, model.m
+    weights = {name: changes.pop(name, 0.0) for name in ("terminal", "effort", "change")}
+    spread = [np.broadcast_to(weights[k], size) for k, size in zip(weights, (n, m, m), strict=True)]
+    fields: dict[str, Any] = {
+        "model": model,
+        "dt": dt,
+        "target": np.asarray(target, float),
+        "reward": Reward(np.broadcast_to(np.asarray(state, float), n), *spread),
+        "start": np.zeros(n),
+        "past": np.zeros(m),
+        "low": np.full(m, -limit),
+        "high": np.full(m, limit),
+    }
+    return Task(**fields | changes)
+
+
 def speed_rover() -> Model:
     """Return a robot driven by speed commands, in NumPy."""
     return Model(

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from cli import grounded
-from facts import holds
 from grounded_trials.starting.begin import begin
 
 MODEL = """from grounded import Model
@@ -41,7 +39,6 @@ def found_in(folder, **renamed):
 
 
 def test_what_unit_derivative_and_the_only_pair_agree_on_is_sure(tmp_path):
-    """Four of five lines were UNSURE, and all of them right."""
     by = found_in(tmp_path)
     assert {name: g.path for name, g in by.items()} == {
         "x": "/csv.cart_mm",
@@ -64,30 +61,6 @@ def test_without_a_unit_it_is_asked(tmp_path):
     assert not by["th"].sure and by["x"].sure
 
 
-def test_an_angle_and_its_rate_that_look_exchanged_are_asked_and_told(tmp_path):
-    """The rate was negated, as surely right, and the diagnosis found sensors that were slow."""
-    by = found_in(tmp_path, pole_deg="w", pole_speed="th")
-    assert not by["th"].sure and not by["w"].sure and by["w"].scale == 1
-    assert holds(" ".join(by["w"].reasons), "/csv.th and /csv.w look exchanged", "sign")
-    told = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "hand.csv")
-    assert holds(told.err, "the columns of th and w look exchanged", "their paths in [log]")
-    assert "discard" in told.out
-
-
-def test_a_negated_rate_in_the_angle_s_column_is_told_with_its_scale(tmp_path):
-    """`init` wrote such a scale, and no exchange was found with it."""
-    by, log = found_in(tmp_path, pole_deg="th", pole_speed="w"), tmp_path / "hand.csv"
-    assert by["th"].sure and by["w"].sure
-    table, t = np.loadtxt(log, delimiter=",", skiprows=1), np.arange(0, 30, 0.02)
-    table[:, 3] = 2 * np.cos(5 * t) + 0.8 * np.cos(2 * t)
-    table[:, 4] = 0.4 * np.sin(5 * t) + 0.4 * np.sin(2 * t)
-    np.savetxt(log, table, "%.6f", ",", header=log.read_text().splitlines()[0], comments="")
-    config = tmp_path / "w" / "grounded.toml"
-    config.write_text(config.read_text().replace('"/csv.w"', '"/csv.w"\nscale = -1'))
-    told = grounded("-C", tmp_path / "w", "ingest", "--data", log)
-    assert holds(told.err, "th and w", "opposite sign", "exchanged", "the scale in [log.state.w]")
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_rate_of_the_opposite_sign_is_asked(tmp_path, sign):
     """Of a slow swing, an exchange fits as well: either is possible."""
@@ -99,4 +72,3 @@ def test_a_rate_of_the_opposite_sign_is_asked(tmp_path, sign):
     done = begin(tmp_path / "w", tmp_path / "a.csv", model=tmp_path / "m.py")
     _, w = done.states
     assert w.sure == (sign > 0) and w.scale == sign
-    assert holds(" ".join(w.reasons), "OPPOSITE SIGN", "; or", "look exchanged") == (sign < 0)

@@ -54,7 +54,6 @@ def found_in(folder: Path, names: dict[str, str]) -> dict[str, tuple[str, bool, 
 
 
 def test_a_boats_columns_are_found(tmp_path: Path) -> None:
-    """None fitted, and `yaw_rate_deg_s` was a rival of `heading_deg`."""
     named = {"north": "north_m", "east": "east_m", "heading": "heading_deg"}
     named |= {"surge": "surge_m_s", "sway": "sway_m_s", "yaw_rate": "yaw_rate_deg_s"}
     found = found_in(tmp_path, named)
@@ -67,36 +66,7 @@ def test_a_boats_columns_are_found(tmp_path: Path) -> None:
     assert found["r"] == ("yaw_rate_deg_s", True, degree, set())
 
 
-def test_earth_fixed_positions_are_found(tmp_path: Path) -> None:
-    named = {"north": "x0", "east": "y0", "surge": "u", "sway": "v", "heading": "psi"}
-    found = found_in(tmp_path, named)
-    assert (found["x"][0], found["y"][0]) == ("x0", "y0")
-
-
 def test_one_axis_of_the_compass_alone_is_no_place(tmp_path: Path) -> None:
     named = {"north": "north_m", "heading": "heading_deg", "yaw_rate": "yaw_rate_deg_s"}
     found = found_in(tmp_path, named)
     assert found["x"][0] == found["y"][0] == ""
-
-
-def test_a_speed_is_no_sway(tmp_path: Path) -> None:
-    named = {"heading": "heading_deg", "surge": "speed", "yaw_rate": "yaw_rate_deg_s"}
-    assert found_in(tmp_path, named)["v"][0] == ""
-
-
-def test_a_trolleys_pos_is_its_x(tmp_path: Path) -> None:
-    """`x` was left to the smoother, which can't know a position from a swing's angle."""
-    t = np.arange(0, 10, 0.02)
-    rows = np.column_stack([t, np.sin(3 * np.floor(t)), 0.3 * np.sin(t), 5 * np.cos(4 * t)])
-    path = tmp_path / "crane.csv"
-    np.savetxt(path, rows, "%.5f", ",", header="t,u,pos,swing_deg", comments="")
-    states = '{"x": "m", "v": "m/s", "th": "rad", "w": "rad/s"}'
-    rates = '{"x": s.v, "v": a.u - s.v, "th": s.w, "w": -9 * s.th - a.u}'
-    (tmp_path / "m.py").write_text(
-        "from grounded import Model\n\n"
-        f'model = Model(states={states}, inputs={{"u": "V"}}, '
-        f"derivative=lambda s, a, p: {rates})\n"
-    )
-    done = begin(tmp_path / "w", path, model=tmp_path / "m.py")
-    found = {g.name: g.path.removeprefix("/csv.") for g in done.states}
-    assert (found["x"], found["th"], found["v"], found["w"]) == ("pos", "swing_deg", "", "")

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.logs.inspection.joint_names import joint_units, slides
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.next_step import to_plan
-from grounded_trials.workspace.off_target import logged_target
 from ros_bags import crane_bag
 
 CRANE = """import numpy as np
@@ -49,7 +46,6 @@ def test_a_trolley_and_its_load_are_told_apart(tmp_path, joint, th):
 
 @pytest.mark.parametrize("joint, kind", [("trolley", "crane"), ("hinge", "pendulum")])
 def test_a_trolley_with_a_load_is_a_crane(tmp_path, joint, kind):
-    """It was a pendulum, on the grid of its sensor."""
     found = begin(tmp_path / "w", crane_bag(tmp_path / "bag", joint))
     assert found.kind == kind and found.dt == 0.04
     if kind == "crane":
@@ -92,20 +88,3 @@ def test_joints_that_slide_by_their_names(joint, slide):
     assert slides(joint) is slide
     units = joint_units({"/j": (joint,)})
     assert units["/j.velocity[0]"] == ("m/s" if slide else "rad/s")
-
-
-def test_a_crane_from_its_log_to_its_target(tmp_path):
-    """Ranges had no units, and nothing said how a load is brought to rest, or to draw it at all."""
-    (tmp_path / "mine.py").write_text(CRANE.format(th="th"))
-    w, log = tmp_path / "w", crane_bag(tmp_path / "bag")
-    begin(w, log, model=tmp_path / "mine.py")
-    taken = grounded("-C", w, "ingest", "--data", log).out
-    assert all(unit in taken for unit in (" m/s\n", " rad\n", " V\n", "header stamps"))
-    assert logged_target(Workspace(w)) == "t0001"
-    grounded("-C", w, "discard", "t0001")  # to read it in another unit: the target is the old run
-    assert logged_target(Workspace(w)) == "t0001" and to_plan(Workspace(w)).verb == "target"
-    drawn = grounded("-C", w, "target", "line", "--to", "x=1", "--seconds", "3").out
-    assert "`--rest`" in drawn and "th = 0" in drawn
-    assert logged_target(Workspace(w)) == ""
-    rest = ("--to", "x=1", "--to", "th=0")
-    assert "free" not in grounded("-C", w, "target", "line", *rest, "--seconds", "3").out

@@ -1,13 +1,10 @@
 """A drone's log as mavros writes it: body velocities in the odometry, an attitude as command."""
 
-import re
-
 import numpy as np
 import pytest
 
 import ros_bags
 from grounded.errors import GroundedError
-from grounded_trials import Workspace
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.shapes import Drive, path_target
@@ -44,14 +41,6 @@ def test_a_drone_that_turns_has_its_yaw_as_a_state(tmp_path):
     assert model.angles == ("yaw",)
 
 
-def test_an_attitude_that_nothing_follows_is_asked_for(tmp_path):
-    found = begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag", followed=False))
-    by = by_name(found)
-    for name in ("roll_command", "pitch_command"):
-        assert not by[name].sure and not by[name].path
-        assert f"{COMMAND}.orientation.@rpy.{name[:-8]}" in by[name].others
-
-
 def test_the_skeleton_predicts_its_own_drone(tmp_path):
     """The skeleton's equations are those of the bag: right signs, at a yaw of 80 degrees."""
     bag = ros_bags.drone_bag(tmp_path / "bag")
@@ -76,13 +65,6 @@ def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):
         read_signals((next(bag.glob("*.db3")),), {"v": SignalSpec(path)})
 
 
-def test_a_robot_that_only_rolls_forwards_is_offered_no_velocity_in_the_world(tmp_path):
-    from grounded_trials.logs.inspection.inspect_log import inspect_log
-
-    report = inspect_log(ros_bags.car_bag(tmp_path / "bag"))
-    assert not [f for t in report.topics for f in t.fields if "@world_velocity" in f.path]
-
-
 def test_a_path_of_a_drone_keeps_its_height(tmp_path):
     """Left free, the height would be what costs least: the drone would sink."""
     begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
@@ -95,20 +77,3 @@ def test_a_path_of_a_drone_keeps_its_height(tmp_path):
     assert (path_target("line", Drive(), model, 0.02, {}, {"z": 3.0})["z"] == 3.0).all()
     with pytest.raises(GroundedError, match="itself sets 'x'"):
         path_target("circle", Drive(), model, 0.02, {"x": 1.0, "z": 1.0})
-
-
-def test_a_hover_in_wind_is_found_though_its_limits_leave_out_zero(tmp_path):
-    """The tilt against the wind is a state that the target leaves free; its thrust is known."""
-    grounded_file = tmp_path / "w" / "grounded.toml"
-    begin(tmp_path / "w", ros_bags.drone_bag(tmp_path / "bag"))
-    source = tmp_path / "w" / "model.py"
-    windy = source.read_text().replace("- p.drag * s.vx,", "- p.drag * s.vx + 0.3,")
-    source.write_text(windy)
-    workspace = Workspace(tmp_path / "w")
-    workspace.target(path_target("circle", Drive(), workspace.base_model, 0.02, {"z": 2.0}))
-    text = re.sub(r"(?m)^thrust = .*$", "thrust = [0.4, 0.9]", grounded_file.read_text())
-    grounded_file.write_text(re.sub(r"(?m)^start = .*$", "start = { }", text))
-    workspace.forget()
-    (note,) = [n for n in workspace.propose().proposal.notes if "the plan assumes" in n]
-    thrust = float(re.search(r"start = .*thrust = ([\d.]+)", note)[1])
-    assert thrust == pytest.approx(0.5 / np.cos(np.arctan(0.3 / 9.81)), abs=2e-3)

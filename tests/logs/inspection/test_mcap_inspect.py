@@ -14,10 +14,10 @@ from mcap.writer import Writer
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
-from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
+from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
-from grounded_trials.logs.inspection.inspect_guess import Guess, guess_mapping, is_simulated
+from grounded_trials.logs.inspection.inspect_guess import guess_mapping, is_simulated
 from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
@@ -38,33 +38,6 @@ def test_every_shared_log_can_be_inspected() -> None:
         assert bool(report.damage) == ("derived_corrupt" in str(path)), path.name
         for topic in report.topics:
             assert topic.problem == "" or topic.encoding == "wrong_format", (path.name, topic)
-
-
-@needs_data
-def test_service_events_are_read() -> None:
-    (path,) = files("mcap_format_fixtures/rosbag2/*bags__topics_and_services.mcap")
-    report = inspect_log(path)
-    (events,) = [t for t in report.topics if t.topic == "/add_two_ints/_service_event"]
-    values = {f.path: (f.low, f.high) for f in events.fields}
-    assert values["/add_two_ints/_service_event.info.event_type"] == (1, 2)
-    assert values["/add_two_ints/_service_event.request[0].a"] == (1, 3)
-    assert values["/add_two_ints/_service_event.response[0].sum"] == (4, 6)
-
-
-@needs_data
-@pytest.mark.parametrize(
-    ("bag", "says"),
-    [
-        ("pitch-45bag", "@rpy.pitch show the same motion with OPPOSITE SIGN (correlation -1.000)"),
-        ("flybag", "@rpy.pitch show the same motion with OPPOSITE SIGN"),
-        ("yx3bag", "/vicon/Group466CF/Group466CF/pose has a gap of 0.930 s"),
-        ("yx4bag", "/cf_logpos has values that are not numbers, first in /cf_logpos.position.x"),
-        ("flybag", "/cf_command has a single message"),
-    ],
-)
-def test_the_crazyflie_bags_defects_are_found_and_said(bag: str, says: str) -> None:
-    report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
-    assert any(says in remark for remark in report.remarks), report.remarks
 
 
 @needs_data
@@ -145,25 +118,6 @@ def test_number_paths() -> None:
     assert len(number_paths(Dynamic(), deep)) < 20
 
 
-def test_a_json_log_with_odd_names(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("odd topic.name", "json", 0)
-    for i in range(10):
-        body = b'{"timestamp": {"sec": %d, "nsec": 0}, "my value": %d}' % (i, i)
-        writer.add_message(channel, i * 10**9, body, i * 10**9)
-    writer.finish()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stream.getvalue())
-    (topic,) = inspect_log(path).topics
-    paths = [f.path for f in topic.fields]
-    assert paths[-1] == '"odd topic.name"."my value"' and topic.stamped and topic.skew_s == 0
-    guess = Guess("v", paths[-1], "header", True, ())
-    table = tomllib.loads(mapping_toml([guess], []))
-    assert table["log"]["state"]["v"]["path"] == paths[-1]
-
-
 def test_twins() -> None:
     t = np.arange(0, 10, 0.01)
     ns = (t * 1e9).astype(np.int64)
@@ -178,53 +132,6 @@ def test_twins() -> None:
     (twins,) = find_twins(samples)
     assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
     assert twins.opposite and twins.correlation < -0.999
-
-
-def test_a_table_wider_than_the_list_says_so(tmp_path):
-    for columns, said in ((150, False), (206, True)):
-        path = tmp_path / f"{columns}.csv"
-        rows = [",".join(["t", *(f"u{i}" for i in range(columns))])]
-        rows += [",".join(f"{k * 0.01 + i:.3f}" for i in range(columns + 1)) for k in range(40)]
-        path.write_text("\n".join(rows) + "\n")
-        found = inspect_log(path)
-        assert len(found.topics[0].fields) == min(columns, FIELD_LIMIT)
-        assert any(str(FIELD_LIMIT) in remark for remark in found.remarks) == said
-
-
-def test_an_input_in_volts_is_sought_by_its_unit_too(tmp_path):
-    """A part of a quaternion was offered for `volts` before `/motor/voltage`."""
-    log, t = tmp_path / "log.csv", np.arange(0, 5, 0.01)
-    columns = np.column_stack([t, np.sin(t), 3 * np.sin(2 * t), np.sin(3 * t)])
-    np.savetxt(log, columns, "%.5f", ",", header="t,tilt,motor_voltage,orientation_x", comments="")
-    units = {"theta": "rad", "volts": "V"}
-    (theta,), (volts,) = guess_mapping(inspect_log(log), ["theta"], ["volts"], units)
-    assert (theta.path, volts.path) == ("/csv.tilt", "/csv.motor_voltage")
-
-
-@pytest.mark.parametrize(
-    ("others", "found"),
-    [
-        ([], "motor_voltage"),
-        (["motor_voltage_rate"], "motor_voltage"),
-        (["pump_voltage"], ""),
-        (["voltage"], "voltage"),
-    ],
-)
-def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
-    """The only other number of a cart's only command topic was "UNSURE no name in the log fits"."""
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("/cart/command", "json", 0)
-    for i in range(50):
-        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
-        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
-        writer.add_message(channel, i * 10**8, body, i * 10**8)
-    writer.finish()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stream.getvalue())
-    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
-    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)
 
 
 @pytest.mark.parametrize("step", [0.00153, 0.0044, 1e-7])
@@ -243,3 +150,43 @@ def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, s
     assert 0.8e-3 < measured["x"] < 1.3e-3
     low, high = (0.95 * step / np.sqrt(12), step) if step > 1e-6 else (1e-6, 1e-4)
     assert low < measured["beam"] < high
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("bag", "named"),
+    [
+        ("pitch-45bag", "@rpy.pitch"),
+        ("yx3bag", "0.930 s"),
+        ("yx4bag", "/cf_logpos.position.x"),
+        ("flybag", "/cf_command"),
+    ],
+)
+def test_the_crazyflie_bags_defects_are_found(bag: str, named: str) -> None:
+    report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
+    assert any(named in remark for remark in report.remarks), report.remarks
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ([], "motor_voltage"),
+        (["motor_voltage_rate"], "motor_voltage"),
+        (["pump_voltage"], ""),
+        (["voltage"], "voltage"),
+    ],
+)
+def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/cart/command", "json", 0)
+    for i in range(50):
+        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
+        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
+        writer.add_message(channel, i * 10**8, body, i * 10**8)
+    writer.finish()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(stream.getvalue())
+    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
+    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)

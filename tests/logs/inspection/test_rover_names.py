@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from cli import grounded, plain
-from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.diagnosing import unwritten_in
 from grounded_trials.workspace.folder import Folder
 from ros_bags import rover_bag
 
@@ -30,10 +27,7 @@ def table(path, names):
 @pytest.mark.parametrize(
     ("measured", "sent"),
     [
-        (("v", "omega"), ("cmd_v", "cmd_omega")),
         (("v [m/s]", "yaw_rate [rad/s]"), ("cmd_v [m/s]", "cmd_w [rad/s]")),
-        (("v", "omega"), ("v_cmd", "w_cmd")),
-        (("speed", "yaw_rate"), ("v_ref", "w_ref")),
         (("v", "omega"), ("cmd_vel.linear.x", "cmd_vel.angular.z")),
     ],
 )
@@ -46,47 +40,12 @@ def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent)
     word = [name.partition(" ")[0].replace(".", "_") for name in sent]
     assert [found["speed"], found["turn"]] == [f"/csv.{name}" for name in word]
     assert all(found[name] for name in ("v", "omega", "x", "y", "psi"))
-    taken = " ".join(grounded("-C", tmp_path / "w", "ingest", "--data", log).out.split())
-    assert "Hz, jitter, gap: by the column of times" in taken  # a table has no headers
-
-
-def test_a_command_that_a_heading_follows_closely_is_no_measured_turn_rate(tmp_path):
-    """Of poses and commands alone, cmd_omega was the state omega, and `turn` had nothing."""
-    rows = np.loadtxt(table(tmp_path / "a.csv", "abcdefgh"), delimiter=",", skiprows=1)
-    named = "t,x,y,theta,cmd_v,cmd_omega"
-    kept = rows[:, [0, 1, 2, 3, 6, 7]]
-    np.savetxt(tmp_path / "poses.csv", kept, "%.6f", ",", header=named, comments="")
-    done = begin(tmp_path / "w", tmp_path / "poses.csv")
-    found = {g.name: g.path for g in (*done.states, *done.inputs)}
-    assert found["turn"] == "/csv.cmd_omega" and found["speed"] == "/csv.cmd_v"
-    assert not found["omega"] and not found["v"] and done.then.verb == "ingest"
 
 
 def test_commands_beside_a_camera_s_poses_are_no_measured_speeds(tmp_path):
-    """/cmd_vel became the states v and omega, and "nothing in the log fits" speed and turn."""
     done = begin(tmp_path / "w", rover_bag(tmp_path / "bag", seen="/mocap"))
     found = {g.name: g.path for g in (*done.states, *done.inputs)}
     assert found["speed"] == "/cmd_vel.linear.x" and found["turn"] == "/cmd_vel.angular.z"
     assert not found["v"] and not found["omega"] and found["x"] == "/mocap.pose.position.x"
     config = Folder(tmp_path / "w").config
     assert config.file.read_text().count("the smoother estimates v, omega") == 1
-
-
-def test_a_target_beside_unmapped_inputs_leads_to_the_log(tmp_path):
-    """`target` named `propose` next, which refuses to plan for inputs that [log] lacks."""
-    log = table(tmp_path / "drive.csv", ("time", "x", "y", "yaw", "v", "omega", "p_one", "p_two"))
-    begin(tmp_path / "w", log, kind="rover")
-    done = grounded("-C", tmp_path / "w", "target", "circle", "--size", 1, "--speed", 0.4)
-    assert done.code == 0 and done.out.split()[-1] == "LOG" and "inspect" in done.out.split()[-3:]
-    assert "[log] maps no 'speed' and 'turn'" in plain(done.err)
-
-
-def test_the_equations_of_no_robot_are_told_as_that(tmp_path):
-    """`diagnose` of what `init` filled in ended with `adopt`, and no word on the equations."""
-    log = table(tmp_path / "drive.csv", ("time", "a", "b", "c", "d", "e", "p_one", "p_two"))
-    assert begin(tmp_path / "w", log).kind == "generic"
-    (told,) = unwritten_in(Folder(tmp_path / "w"))
-    assert "Write these first" in told
-    model = Workspace(tmp_path / "w").folder / "model.py"
-    model.write_text(model.read_text().replace("replace them by your robot's equations", "mine"))
-    assert not unwritten_in(Folder(tmp_path / "w"))

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from grounded.plant import Noise, Plant
-from grounded.search import making
-from grounded.search.feedback.oscillation import calm_ranges, periodic, quiet_gains
+from grounded.search.feedback.oscillation import periodic, quiet_gains
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
@@ -45,19 +44,12 @@ def gains(made):
 
 
 def test_a_step_after_a_loss_of_gentler_gains_has_no_more_than_those():
-    """On a SCARA it had all of those that had oscillated, and ended in a limit cycle at -97."""
     run = search(0.03, 4)
     loud, gentle, *steps = run.candidates
     assert gentle.way == "gentler gains" and not run.history[1].accepted
     assert all(one.way == "" and one.base for one in steps)
     assert max(map(gains, steps)) <= 1.05 * gains(gentle) < 0.5 * gains(loud)
     assert all(one.caution > 0 for one in steps)
-
-
-def test_without_a_bound_those_steps_oscillate_again(monkeypatch):
-    monkeypatch.setattr(making, "quiet_gains", lambda *known: None)
-    run = search(0.03, 3)
-    assert gains(run.candidates[2]) > 0.95 * gains(run.candidates[0])
 
 
 @pytest.fixture(scope="module")
@@ -108,35 +100,19 @@ def test_feedback_is_bounded_by_what_ran_quietly(told, levels, most, by, needed)
     assert found.most == pytest.approx(most)
 
 
-def test_stronger_feedback_says_what_it_risks(told):
-    history = told.ran((-1.0, -9.0), (0.3, -20.0))
-    found = quiet_gains(told.task, history)
-    loud, gentle = (tried.candidate for tried in history)
-    assert found.risk(gentle) == ""
-    again = found.risk(loud)
-    assert "c0001 made inputs oscillate when it ran" in again and "c0002, 30 %" in again
-    policy = replace(loud.policy, gain=1.5 * loud.policy.gain)
-    risk = found.risk(replace(loud, id="c0003", policy=policy))
-    assert "c0003 is 150 % as strong as that of c0001" in risk and "c0002, 20 % as strong" in risk
-    assert quiet_gains(told.task, history, "another model") is None
-
-
-def test_a_plan_that_replays_swings_is_no_measure_of_them(told):
-    """A step from a run that swung plans with its swings; the plan before it does not."""
-    history = told.ran((-1.0, -9.0), (1.0, -9.0))
-    swung = replace(
-        told.first, id="c0002", predicted_inputs=told.first.predicted_inputs + told.wave
-    )
-    later = [history[0], replace(history[1], candidate=swung)]
-    _, sizes = calm_ranges(told.task, later)
-    np.testing.assert_array_equal(sizes, np.ptp(told.first.predicted_inputs, axis=0))
-    assert np.ptp(swung.predicted_inputs) > 1.5 * sizes[0]
-
-
 @pytest.mark.parametrize("cycle", [False, True])
 def test_noise_that_gains_carry_is_told_from_a_limit_cycle(cycle):
-    """17 swings of a boat's thruster "oscillated", by noise that `propose` had announced."""
     rng, T = np.random.default_rng(0), 120
     shaken = np.convolve(rng.normal(0, 0.12, T + 2), [0.3, 0.5, 0.3], "valid")
     moves = 0.2 * np.sin(0.7 * np.arange(T)) + 0.3 * shaken if cycle else 1.6 * shaken
     assert periodic(moves) == cycle
+
+
+def test_only_stronger_feedback_is_a_risk(told):
+    history = told.ran((-1.0, -9.0), (0.3, -20.0))
+    found = quiet_gains(told.task, history)
+    loud, gentle = (tried.candidate for tried in history)
+    assert found.risk(gentle) == ""
+    policy = replace(loud.policy, gain=1.5 * loud.policy.gain)
+    assert found.risk(loud) and found.risk(replace(loud, id="c0003", policy=policy))
+    assert quiet_gains(told.task, history, "another model") is None

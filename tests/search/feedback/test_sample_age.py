@@ -51,7 +51,6 @@ def test_the_age_is_found_from_commands_and_states(age, seed):
 
 @pytest.mark.parametrize("share", [0.4, 0.9])
 def test_the_age_is_found_in_a_run_that_was_stopped(share):
-    """`next` of a run that was stopped half way ended in a traceback."""
     task = rover_task()
     made = first(task)
     stopped = driven(task, made, 0.04).until(round(share * task.horizon))
@@ -81,7 +80,6 @@ def test_a_model_that_replays_a_trial_replays_it_with_its_policy_on_old_samples(
 
 
 def test_steps_keep_their_promise_on_a_robot_with_old_samples():
-    """A car's second step promised -0.0165 and gave -0.0330: it led by the age once more."""
     task = rover_task()
     made = first(task)
     trial = driven(task, made)
@@ -101,7 +99,6 @@ def test_a_policy_for_late_samples_runs_as_planned():
 
 
 def test_a_plan_is_for_the_mean_age_if_it_differs_from_run_to_run():
-    """A timer's phase was drawn anew each time: each plan was for the age of one run, and lost."""
     task = rover_task()
     made = first(task)
 

@@ -10,7 +10,6 @@ from grounded.plant import Plant
 from grounded.search.ask_tell import Search, learn
 from grounded.search.candidate import BY_STEP, Tried
 from grounded.search.feedback.margin import worse_costs
-from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, predicted
 from grounded.search.standing import standing
 from grounded.search.step.by_step import PRICES, Told, believed_by_step, worth
@@ -54,14 +53,6 @@ def test_a_search_goes_on_where_laws_of_the_whole_run_lose(story):
     assert steps[0].candidate.damping == 10.0
 
 
-def test_the_search_on_the_rails_repeats_itself(story):
-    again = learn(TASK, lambda c: drive(TASK, Plant(RAILS), c), SearchOptions()).standing
-    for one, other in zip(story.history, again.history, strict=True):
-        np.testing.assert_array_equal(
-            one.candidate.policy.feedforward, other.candidate.policy.feedforward
-        )
-
-
 @pytest.fixture
 def grounded():
     """Return a search after two trials, and the crude model grounded on the best one."""
@@ -93,27 +84,6 @@ def test_slopes_that_change_along_the_run_are_found(grounded):
     law = Told.by(others, own, problem).law(PRICES[0])
     q = E.shape[2]
     assert np.abs(law[:, :, :q] - E).max() < 0.1 * np.abs(E).max()
-
-
-def test_a_single_trial_is_explained_and_says_nothing_about_other_directions(grounded):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, (other,) = turning(own, 1)
-    told = Told.by([other], own, problem)
-    law, dear = told.law(PRICES[0]), worth(own, problem)
-    assert told.off(PRICES[0], other, own, problem, dear) < 0.01
-    R = told.doubt(PRICES[0], dear)
-    d = np.hstack([other.x - own.x, other.u - own.u])
-    across = np.stack([d[:, 1], -d[:, 0], 0 * d[:, 0]], axis=1)
-
-    def doubt(d):
-        return np.sum(np.einsum("tpq,tq->tp", R, d) ** 2) / np.sum(d**2)
-
-    assert doubt(d) < 0.1 * doubt(across)
-    n = own.x.shape[1]
-    step = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], across)
-    known = np.einsum("tnq,tq->tn", law[:, :, : n + 1] - told.whole[:, :, : n + 1], d)
-    assert np.abs(step).mean() < np.abs(known).mean()
 
 
 @pytest.mark.parametrize("age", [0.0, 0.013])
@@ -149,27 +119,6 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 
 
-@pytest.mark.parametrize("age", [0.0, 0.013])
-def test_runs_together_may_differ_in_bias_and_law(grounded, age):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, others = turning(own, 3)
-    told = Told.by(others, own, problem)
-    models = []
-    for k, price in enumerate(PRICES[:3]):
-        made = Corrected(problem.system, told.law(price), own.x, own.u, own.before).on(problem)
-        bias = made.bias + 1e-3 * k * np.sin(np.arange(made.bias.size)).reshape(made.bias.shape)
-        models.append(replace(made, bias=bias, age=age))
-    policy = best.candidate.policy
-    policies = [replace(policy, gain=share * policy.gain) for share in (1.0, 0.9, 0.8)]
-    alone = [predicted(*each) for each in zip(models, policies, strict=True)]
-    assert np.ptp([one.utility for one in alone]) > 1e-6
-    assert_same_runs(runs(models, policies), alone)
-    open_loop = [replace(policy, gain=None, reference=None), *policies[1:]]
-    alone = [predicted(*each) for each in zip(models, open_loop, strict=True)]
-    assert_same_runs(runs(models, open_loop), alone)
-
-
 def assert_same_runs(found, expected):
     np.testing.assert_allclose(
         [one.utility for one in found], [one.utility for one in expected], rtol=1e-9
@@ -177,34 +126,6 @@ def assert_same_runs(found, expected):
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one.states, other.states, atol=1e-9)
         np.testing.assert_allclose(one.inputs, other.inputs, atol=1e-8)
-
-
-def test_doubt_is_a_cost_with_the_derivatives_of_its_steps(grounded):
-    _, best, problem = grounded
-    own = seen(Planner(TASK, TASK), best, problem)
-    _, others = turning(own, 3)
-    told = Told.by(others, own, problem)
-    law, R = told.law(0.1), told.doubt(0.1, worth(own, problem))
-    parts = (problem.system, law, own.x, own.u, own.before)
-    plain, cautious = Corrected(*parts), Corrected(*parts, R)
-    policy = best.candidate.policy
-    there = predicted(cautious.on(problem), policy)
-    assert there.utility == pytest.approx(predicted(plain.on(problem), policy).utility)
-    moved = replace(policy, feedforward=policy.feedforward + 0.1)
-    runs = [predicted(system.on(problem), moved) for system in (plain, cautious)]
-    d = np.hstack([runs[0].states[:-1, :2] - own.x, runs[0].inputs - own.u])
-    price = np.sum(np.einsum("tpq,tq->tp", R, d) ** 2)
-    assert runs[0].utility - runs[1].utility == pytest.approx(price)
-    assert price > 0
-
-    rng, dt = np.random.default_rng(1), problem.dt
-    x = 0.1 * rng.standard_normal((len(own.x), cautious.n))
-    u = own.u + 0.1 * rng.standard_normal(own.u.shape)
-    F, G = cautious.linearise(x, u, problem.p, dt)
-    dx, du = 1e-6 * rng.standard_normal(x.shape), 1e-6 * rng.standard_normal(u.shape)
-    change = cautious.step(x + dx, u + du, problem.p, dt) - cautious.step(x, u, problem.p, dt)
-    told_by = np.einsum("tij,tj->ti", F, dx) + np.einsum("tij,tj->ti", G, du)
-    np.testing.assert_allclose(change, told_by, atol=1e-9)
 
 
 def losing(search: Search, count: int, **changes: object) -> list[Tried]:
@@ -242,27 +163,9 @@ def test_they_wait_until_two_steps_have_lost(grounded, lost, options, error, ste
     assert options.due(losing(search, lost), incumbent, model, BY_STEP) == step
 
 
-def test_after_two_of_them_lost_too_the_others_go_on(grounded):
-    search, best, _ = grounded
-    model, options = best.candidate.model, SearchOptions()
-    history = losing(search, 2, way=BY_STEP, slopes="corrected", damping=10.0)
-    assert options.due(history, best, model, BY_STEP) is None
-    by_step = replace(best, candidate=replace(best.candidate, way=BY_STEP))
-    assert options.due(history, by_step, model, BY_STEP) == Step(100.0)
-    assert options.due(history, by_step, "another model", BY_STEP) is None
-
-
 def test_one_other_trial_is_too_few(grounded):
     search, best, problem = grounded
     assert believed_by_step(Planner(TASK, TASK), best, search.standing.history, problem) is None
-
-
-def test_slopes_by_step_do_not_refute_laws_of_the_whole_run(grounded):
-    search, best, _ = grounded
-    history = losing(search, 2, way=BY_STEP, slopes="corrected", predicted_gain=1.0)
-    now = replace(search.standing, history=tuple(history))
-    maker = Maker(Planner(TASK, TASK), now, "c0099", best.candidate.model)
-    assert About(maker, best, SearchOptions(), "")._refuted() == 0
 
 
 def test_small_gains_before_the_first_of_them_do_not_end_the_search(story):
@@ -274,21 +177,3 @@ def test_small_gains_before_the_first_of_them_do_not_end_the_search(story):
     options = SearchOptions(tolerance=0.5)  # all gains are small
     now = standing(TASK, candidates, trials, options, candidates[0].model)
     assert now.phase == "propose"
-
-
-def test_the_plain_model_is_no_witness_after_it_mispredicted_losses(grounded):
-    search, best, _ = grounded
-    now, planner = search.standing, Planner(TASK, TASK)
-
-    def about(history):
-        maker = Maker(planner, replace(now, history=tuple(history)), "c0099", best.candidate.model)
-        return About(maker, best, SearchOptions(), "")
-
-    history = losing(search, 1)
-    told = about(history)
-    change = predicted(told.plain, history[-1].candidate.policy).utility - told.plainly
-    right = replace(history[-1], utilities=(best.utility + 0.8 * change,))
-    wrong = replace(history[-1], utilities=(best.utility + 0.1 * change,))
-    assert not about([*history[:-1], right])._plain_refuted
-    assert about([*history[:-1], wrong])._plain_refuted
-    assert not about(now.history)._plain_refuted

@@ -9,13 +9,8 @@ import pytest
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
-from grounded.search.feedback.margin import AGES, worse_costs
-from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, predicted
-from grounded.search.step import mispredictions
 from grounded.search.step.mispredictions import apart, believed, shared
-from grounded.search.step.step_size import SearchOptions
-from grounded.solve import ddp
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task
 
@@ -54,23 +49,6 @@ def test_the_trial_is_still_replayed_and_others_are_foretold(found):
     assert abs(told - first.utility) < 0.7 * abs(crude - first.utility)
 
 
-def test_a_new_trial_is_foretold_too():
-    """A correction learnt from two trials holds for a third one in another direction."""
-    task = cart_task()
-    plant = Plant(task.model.with_values({"mass": 1.6, "drag": 0.6}))
-    found = searched(task, plant, 2)
-    planner, history = Planner(task, task), found.search.standing.history
-    made = believed(planner, found.best, history, found.problem)
-    assert made.missed < 0.05
-    moved = found.best.candidate.policy
-    bump = 0.5 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
-    moved = replace(moved, feedforward=moved.feedforward + bump)
-    real = task.utility(drive(task, plant, replace(found.best.candidate, policy=moved)))
-    crude = predicted(found.problem, moved).utility
-    told = predicted(made.problem, moved).utility
-    assert abs(told - real) < 0.2 * abs(crude - real)
-
-
 def test_its_derivatives_are_those_of_its_steps(found):
     planner, history = Planner(found.task, found.task), found.search.standing.history
     made = believed(planner, found.best, history, found.problem).corrected
@@ -91,14 +69,6 @@ def test_its_derivatives_are_those_of_its_steps(found):
     by_p = made.sensitivities(x, u, p, dt)[2]
     base = found.problem.system.sensitivities(np.ascontiguousarray(x[:, :n]), u, p, dt)[2]
     np.testing.assert_array_equal(by_p[:, :n], base)
-
-
-def test_it_is_solved_as_any_other_model(found):
-    planner, history = Planner(found.task, found.task), found.search.standing.history
-    made = believed(planner, found.best, history, found.problem)
-    solved = ddp.solve(made.problem, found.own.inputs)
-    assert solved.status == "converged"
-    assert solved.cost <= -found.best.utility
 
 
 def test_a_law_is_found_and_noise_gives_none():
@@ -155,82 +125,6 @@ def lost(found, utility=-100.0, **changes):
     return replace(first, candidate=made, utilities=(utility,), accepted=False, **changes)
 
 
-@pytest.mark.parametrize(("slopes", "believes"), [("", True), ("corrected", False)])
-def test_a_step_by_corrected_slopes_that_lost_far_away_refutes_them(slopes, believes):
-    """Laws may predict the near trials and still lose with each step made from them."""
-    task = cart_task()
-    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
-    first = found.search.standing.history[0]
-    near = [replace(first, candidate=replace(first.candidate, id=f"n{k}")) for k in range(3)]
-    policy = found.best.candidate.policy
-    bump = 2.0 * np.sin(np.linspace(0, 9, task.horizon))[:, None]
-    policy = replace(policy, feedforward=policy.feedforward + bump)
-    run = predicted(found.problem, policy)  # by the model's own slopes
-    trial = replace(found.own, states=run.states, inputs=run.inputs)
-    made = replace(first.candidate, id="far", policy=policy, slopes=slopes)
-    far = replace(first, candidate=made, trials=(trial,), accepted=False)
-    told = believed(Planner(task, task), found.best, (*near, found.best, far), found.problem)
-    assert (told.corrected is not None) is believes
-
-
-@pytest.mark.parametrize(
-    ("utilities", "slopes"), [((), "corrected"), ((-100.0,), "corrected"), ((-99.0, -98.0), "")]
-)
-def test_after_two_lost_more_than_foretold_steps_are_by_the_models_own_slopes(utilities, slopes):
-    task = cart_task()
-    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
-    now, planner = found.search.standing, Planner(task, task)
-    history = (*now.history, *(lost(found, u) for u in utilities))
-    named = [
-        replace(t, candidate=replace(t.candidate, id=f"c{k}")) if k > 1 else t
-        for k, t in enumerate(history)
-    ]
-    now = replace(now, history=tuple(named), incumbent=found.best)
-    maker = Maker(planner, now, "c0099", found.best.candidate.model)
-    assert About(maker, found.best, SearchOptions(), "").slopes == slopes
-    doubted = [
-        replace(t, candidate=replace(t.candidate, likely_off=1000.0)) if k > 1 else t
-        for k, t in enumerate(named)
-    ]  # losses within the likely error
-    maker = replace(maker, now=replace(now, history=tuple(doubted)))
-    assert About(maker, found.best, SearchOptions(), "").slopes == "corrected"
-
-
-def test_old_samples_are_asked_of_corrected_slopes_too(found):
-    """A law belongs to its step, also if several runs are simulated at once."""
-    planner, now = Planner(found.task, found.task), found.search.standing
-    maker = Maker(planner, now, "c0099", found.best.candidate.model)
-    about = About(maker, found.best, SearchOptions(), "")
-    assert (about.slopes == "corrected") is (found.task.model.m == 1)
-    costs = worse_costs([about.real], found.best.candidate.policy)
-    assert costs.shape == (1, len(AGES)) and np.isfinite(costs).all()
-    assert costs[0, -1] > -predicted(about.real, found.best.candidate.policy).utility
-
-
-def wired_wrongly(task, candidate):
-    """Return the trial of a candidate on a robot whose motors turn the other way."""
-    own = task.model
-
-    def derivative(s, a, p):
-        turned = SimpleNamespace(**{name: -getattr(a, name) for name in own.input_names})
-        return own.derivative(s, turned, p)
-
-    return drive(task, Plant(replace(own, derivative=derivative)), candidate)
-
-
-def test_a_run_with_a_motor_wired_wrongly_corrects_no_derivatives():
-    """Its law gave a helicopter a step that lost six times the best cost."""
-    task = cart_task()
-    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 1)
-    made = found.search.ask()
-    search = Search(task, candidates=found.search.candidates, trials=found.search.trials)
-    search.tell(wired_wrongly(task, made))
-    history = search.standing.history
-    assert history[-1].utility < 1000 * history[0].utility
-    told = believed(Planner(task, task), search.best, history, found.problem)
-    assert told.corrected is None and not told.alternatives
-
-
 def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
     planner, history = Planner(found.task, found.task), found.search.standing.history
     made = believed(planner, found.best, history, found.problem).alternatives
@@ -247,26 +141,3 @@ def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
                 costs.append(-predicted(replace(one.problem, bias=bias), policy).utility)
             alone.append(one.weight * np.mean(costs))
         np.testing.assert_allclose(one.costs(policies), alone, rtol=1e-9)
-
-
-def test_corrected_derivatives_must_replay_the_best_run(monkeypatch):
-    """With the wild run of a motor they gave -2,014 for a best run of -1.553."""
-    task = cart_task()
-    found = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
-    planner, history = Planner(task, task), found.search.standing.history
-    moved = replace(found.problem, start=found.problem.start + 0.01)  # noise of the first sample
-
-    def flattered(problems, own, others):
-        return [1.0 if problem is moved else 0.0 for problem in problems]
-
-    def unstable(own, others, grounded):
-        law = np.zeros((len(own.x), 2, 6))
-        law[:, :, :2] = 1.5 * np.eye(2)  # each step more than doubles what is off
-        return law, 0.0
-
-    monkeypatch.setattr(mispredictions, "unforetold", flattered)
-    assert believed(planner, found.best, history, moved).corrected is not None
-    monkeypatch.setattr(mispredictions, "laws", unstable)
-    made = believed(planner, found.best, history, moved)
-    assert made.corrected is None
-    assert [one.weight for one in made.alternatives] == [1.0, 0.0]
