@@ -25,7 +25,7 @@ from grounded_trials.formats.mcap_records import (
     Record,
     Schema,
 )
-from grounded_trials.formats.mcap_writer import LIBRARY, CopyWriter
+from grounded_trials.formats.mcap_writer import CopyWriter
 from grounded_trials.logs.log_files import empty, open_log
 from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
@@ -35,6 +35,8 @@ from grounded_trials.within import within
 from grounded_trials.wording import count
 
 MOST_LOSSES = 50  # number of losses listed
+HEAD = 2**20  # [bytes] at the beginning of a log, in which its first chunk begins
+COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")  # a chunk's; then the copy is compressed, too
 
 
 @dataclass(frozen=True)
@@ -91,10 +93,12 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
 
 def _recover(source: Path, target: Path) -> Recovery:
     with open_log(source) as stream:
+        head = stream.read(HEAD)
+        stream.seek(0)
         salvage = Salvage(stream, str(source))
         try:
             with target.open("xb") as out:
-                copy = _Copy(out)
+                copy = _Copy(out, compressed=any(name in head for name in COMPRESSED))
                 for record in salvage.records():
                     copy.add(record)
                 copy.finish()
@@ -157,8 +161,8 @@ def _horizon(policy: bytes) -> int | None:
 class _Copy:
     """The file that is being written; messages wait until their channel is known."""
 
-    def __init__(self, out: IO[bytes]) -> None:
-        self.out = out
+    def __init__(self, out: IO[bytes], *, compressed: bool) -> None:
+        self.out, self.compressed = out, compressed
         self.writer: CopyWriter | None = None
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -196,8 +200,7 @@ class _Copy:
         """Return the writer, opened at the first record."""
         if self.writer is None:
             header = header or Header("", "")
-            compressed = not header.library.startswith(LIBRARY)
-            self.writer = CopyWriter(self.out, header, compressed=compressed)
+            self.writer = CopyWriter(self.out, header, compressed=self.compressed)
         return self.writer
 
     def messages(self, batch: Messages, *, final: bool) -> None:
