@@ -55,6 +55,18 @@ def test_a_session_from_an_example_to_a_report(tmp_path):
     assert w.verify().damaged == ()
 
 
+def test_the_condition_of_a_run_is_named_and_named_anew(tmp_path):
+    w = Workspace.create(tmp_path / "w", example="pendulum")
+    w.propose()
+    file = w.run().trial_file
+    for group in ("wet", "dry", "", "wet"):  # "" leaves what was named
+        assert w.ingest(file, group=group).trial == "t0001"
+        (trial,) = w.task_trials()
+        assert trial.group == (group or "dry")
+    (measured,) = w.task_trials(measured=True)
+    assert measured.group == "wet" and w.verify().damaged == ()
+
+
 @pytest.mark.parametrize(
     ("verb", "options"),
     [
