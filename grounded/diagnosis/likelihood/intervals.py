@@ -17,14 +17,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.linearise import gains_of, linearise
+from grounded.diagnosis.likelihood.linearise import gains_of, linearise, thresholds
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
 from grounded.filter import kalman
 from grounded.frozen import Array
 
@@ -35,6 +39,9 @@ LONG = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
 # single one, an interval would double by the last bit
 CHANCE, CLEAR = 0.02, 0.005
+DROP = 3.67  # [nats] within which a threshold has its 95 % interval
+FAR = 12**0.5  # standard deviations of the prior up to which a threshold is moved: its bounds
+HALVINGS, ZOOMS, PARTS = 10, 3, 4  # of the widest move; then in parts between two of them
 LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
 
 
@@ -60,11 +67,51 @@ def standard_deviations(
             scatter = np.sqrt((len(some) - 1) * some.var(axis=0))
             std = np.maximum(std, scatter)
             half = np.maximum(half, _student(len(some) - 1) * scatter)
+    k = len(fit.hypothesis.theta)
+    which = calibrated(predictor.data).tolist()
+    for i in thresholds(predictor, fit) if fit.hypothesis.spread else ():
+        at = k + which.index(i)
+        low, high = level(predictor, fit, i, DROP / worth)
+        half[at] = max(-low, high) / param_scale(predictor.data.model)[i]
+        std[at] = half[at] / NORMAL
     smeared = np.hypot(
         between_steps(fit.hypothesis, predictor.data.dt, len(std)),
         between_samples(fit.hypothesis, predictor.data, len(std)),
     )
     return np.hypot(std, smeared), np.hypot(half, NORMAL * smeared)
+
+
+def level(predictor: Predictor, fit: Fitted, i: int, drop: float) -> tuple[float, float]:
+    """Return how far parameter i may move down and up until the fit falls by `drop` nats.
+
+    The noise and the track stay as they are. What it can't fall by ends at a bound.
+    """
+    h, data = fit.hypothesis, predictor.data
+    shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
+    value = float(data.model.values[i] + shift[i])
+    ends, unit = [*data.model.params.values()][i].reach, np.arange(len(shift)) == i
+    span = [min(abs(end - value), FAR * param_scale(data.model)[i]) for end in ends]
+
+    def within(moves: Array) -> Any:
+        """Return whether the fit is within `drop` after each move, (N,)."""
+        tried = [replace(h, shift=shift + move * unit, spread=0.0) for move in moves]
+        starts = [(one, fit.noise, fit.track) for one in tried]
+        found = refine(predictor, starts, iterations=1, fixed_noise=True)
+        if len(found) < len(starts):  # one could not be filtered
+            return np.zeros(len(moves), bool)
+        return np.array([fit.loglik - one.loglik <= drop for one in found])
+
+    sides = []
+    for sign, far in zip((-1.0, 1.0), span, strict=True):
+        near, steps = 0.0, far * 2.0 ** np.arange(-HALVINGS, 1)
+        for _ in range(ZOOMS if far > 0 else 0):
+            bad = np.flatnonzero(~within(sign * steps))
+            near, far = (*[near, *steps][bad[0] : bad[0] + 2],) if len(bad) else (far, far)
+            steps = np.linspace(near, far, PARTS + 1)[1:]
+            if not len(bad):
+                break
+        sides.append(sign * far)
+    return sides[0], sides[1]
 
 
 def between_steps(h: Hypothesis, dt: float, count: int) -> Array:

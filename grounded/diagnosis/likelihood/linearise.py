@@ -324,6 +324,14 @@ SOME = 10  # samples that show at once of most parameters that they have a slope
 PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
 
 
+def thresholds(predictor: Predictor, fit: Fitted) -> list[int]:
+    """Return the uncertain parameters whose slope is zero at every sample of a fit."""
+    model, h = predictor.data.model, fit.hypothesis
+    x, u = predictor.flat(fit.track[:-1], predictor.inputs(h))
+    f_p = model.system.sensitivities(x, u, predictor.params(h), predictor.data.dt)[2]
+    return [int(i) for i in calibrated(predictor.data) if not f_p[..., i].any()]
+
+
 def sensitivities(
     model: Model, x: Array, u: Array, p: Array, dt: float
 ) -> tuple[Array, Array, Array]:
