@@ -47,8 +47,6 @@ def sound_data(
     moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
     between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
     return (
-        replace(
-            data, filters=filters, between=frozenset(between), interpolated_s=interpolated_s
-        ),
+        replace(data, filters=filters, between=frozenset(between), interpolated_s=interpolated_s),
         looked,
     )

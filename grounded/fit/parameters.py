@@ -22,9 +22,9 @@ from grounded.diagnosis.hypotheses.search import (
     undefined,
 )
 from grounded.diagnosis.likelihood.data import Data, entire
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.intervals import level
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.intervals import FAR, level
 from grounded.diagnosis.likelihood.linearise import thresholds
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
@@ -203,10 +203,9 @@ def _searched(search: Alone, late: Sequence[Effect], tick: Stages) -> Fitted | N
         return None
     best = max(found, key=search.score)
     _tell(tick, best, data)
-    unknowns = [*enumerate(late), *((i, None) for i in thresholds(search.predictor, best))]
-    for i, effect in unknowns:
-        rivals = [(h, best.noise, best.track) for h in _elsewhere(best, data, i, effect)]
-        best = max(search.refined([best, *rivals], TO_THE_TOP, rivals=True), key=search.score)
+    for j, grid in _far_off(search, best):
+        tried = [(_at(best, data, j, value), best.noise, best.track) for value in grid]
+        best = max(search.refined([best, *tried], TO_THE_TOP, rivals=True), key=search.score)
     best = max([best, *search.structures(best)], key=search.score)
     search.structures(search.exact_null()) if crude else None
     search.settled([best])
@@ -218,7 +217,9 @@ def _with_all(
 ) -> tuple[Alone, Fitted, Fitted | None]:
     """Return the fit, and that of the model as given, on all runs and not only those searched."""
     few, more = search.data, entire(search.data)
-    bare = [f for f in search.fits.values() if f.hypothesis.spread == 0 and not f.hypothesis.effects]
+    bare = [
+        f for f in search.fits.values() if f.hypothesis.spread == 0 and not f.hypothesis.effects
+    ]
     crude = max(bare, key=search.score, default=None)
     if more is few:
         return search, fit, crude
@@ -234,28 +235,36 @@ def _with_all(
     return every, found[0][0], found[1][0] if found[1:] and found[1] else None
 
 
-def _elsewhere(fit: Fitted, data: Data, i: int, late: Effect | None) -> list[Hypothesis]:
-    """Return a fit's hypothesis with other values of an unknown that may begin far off.
+def _far_off(search: Alone, fit: Fitted) -> list[tuple[int, Array]]:
+    """Return the unknowns towards which the likelihood does not rise from afar, with a grid each.
 
-    These are delays and thresholds: what the likelihood does not rise towards from afar.
+    These are delays and thresholds, in the units of `moved`.
     """
-    h = fit.hypothesis
-    if late is not None:
-        at = np.arange(len(h.theta)) == i
-        return [h.with_theta(np.where(at, d, h.theta)) for d in late.free[0].grid]
-    grid = np.linspace(*[*data.model.params.values()][i].reach, GRID) - data.model.values[i]
-    at = np.arange(data.model.system.k) == i
-    return [replace(h, shift=np.where(at, value, h.shift)) for value in grid]
+    data, effects = search.data, fit.hypothesis.effects
+    found = [(k, np.array(effect.free[0].grid)) for k, effect in enumerate(effects)]
+    for j in thresholds(search.predictor, fit):
+        i = calibrated(data)[j - len(effects)]
+        ends = np.array([*data.model.params.values()][i].reach) - data.model.values[i]
+        low, high = np.clip(ends / param_scale(data.model)[i], -FAR, FAR).tolist()
+        found.append((j, np.linspace(low, high, GRID)))
+    return found
+
+
+def _at(fit: Fitted, data: Data, j: int, value: float) -> Hypothesis:
+    """Return a fit's hypothesis with another value of unknown j."""
+    h, which = fit.hypothesis, calibrated(data)
+    shift = np.zeros(0) if h.shift is None else h.shift[which] / param_scale(data.model)[which]
+    now = np.concatenate([h.theta, shift])
+    return moved(data, h, np.where(np.arange(len(now)) == j, value - now, 0.0))
 
 
 def _centred(search: Alone, fit: Fitted) -> Fitted:
     """Return a fit with each threshold amid the values that are as likely: no sample is there."""
-    predictor, h = search.predictor, fit.hypothesis
-    for i in thresholds(predictor, fit):
-        move = sum(level(predictor, fit, i, LEVEL)) / 2
-        shift = np.where(np.arange(len(h.shift)) == i, h.shift + move, h.shift)
-        start = (replace(h, shift=shift), fit.noise, fit.track)
-        (there,) = refine(predictor, [start], iterations=1, fixed_noise=True) or [fit]
+    for j in thresholds(search.predictor, fit):
+        move = sum(level(search.predictor, fit, j, LEVEL)) / 2
+        unit = np.arange(fit.gram.shape[-1]) == j
+        start = (moved(search.data, fit.hypothesis, move * unit), fit.noise, fit.track)
+        (there,) = refine(search.predictor, [start], iterations=1, fixed_noise=True) or [fit]
         if there.peak > fit.peak - LEVEL:
             fit = replace(there, settled=fit.settled, fine=fit.fine)
     return fit

@@ -17,7 +17,7 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate
-from grounded.diagnosis.validation.choose import SCATTERS
+from grounded.diagnosis.validation.choose import CLAIM, SCATTERS
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
@@ -71,6 +71,7 @@ class Fit(Result):
     status: str  # converged, or why it stopped
     sentence: str
     samples: int
+    nats: float = 0.0  # log evidence over the values as given
     before: PredictionError | None = None  # of held-out trials; None if none could be held out
     after: PredictionError | None = None
     gain: Gain | None = None  # of the held-out errors, and the same the other way round
@@ -83,12 +84,9 @@ class Fit(Result):
 
     @property
     def helps(self) -> bool:
-        """Whether held-out trials are predicted better, as a diagnosis asks of a cause.
-
-        True if none was held out; False if nothing could be fitted.
-        """
+        """Whether the values are likelier and predict held-out trials better (`choose`)."""
         better = self.gain is None or (self.gain.pays(SCATTERS) and not self.gain.ruins)
-        return bool(np.isfinite(self.loglik)) and better
+        return self.nats >= CLAIM and better
 
     @property
     def worse(self) -> bool:
@@ -172,9 +170,7 @@ def report(
     values = model.values + (0.0 if shift is None else shift)
     std, half = (
         scale * one
-        for one in standard_deviations(
-            search.predictor, best, data.folds, search.tempering.factor
-        )
+        for one in standard_deviations(search.predictor, best, data.folds, search.tempering.factor)
     )
     names = [*found.delayed, *(model.param_names[i] for i in calibrated(data) if shift is not None)]
     of = {name: i for i, name in enumerate(names)}
@@ -228,6 +224,7 @@ def report(
         status=status,
         sentence=status,
         samples=int(data.seen[1:].sum()),
+        nats=np.inf if found.crude is None else search.score(best) - search.score(found.crude),
         preflight=tuple(findings),
         covariance=covariance,
         **more,
@@ -276,6 +273,6 @@ def _said(found: Fit) -> list[str]:
     ]
     if found.at_bounds:
         parts.append("at a bound: " + ", ".join(found.at_bounds))
-    if found.gain is not None and not found.helps:
-        parts.append("held-out trials are predicted no better than before")
+    if not found.helps:
+        parts.append("the values before are as likely, or predict held-out trials as well")
     return parts

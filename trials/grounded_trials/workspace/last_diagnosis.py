@@ -80,8 +80,7 @@ def _with_limit(found: Diagnosis) -> Diagnosis:
 def diagnosable(workspace: Folder) -> list[Trial]:
     """Return the trials in order of arrival, each up to the first missing or unbounded number.
 
-    A fit needs complete states. A diagnosis does not, so a sensor dropout only costs its own
-    samples, not the rest of the trial.
+    A sensor dropout only costs its own samples, not the rest of the trial.
 
     Raises:
         GroundedError: if a stored file is damaged.
@@ -277,7 +276,7 @@ def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
 
 
 def fittable(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
-    """Return stored trials of this model, each up to its first non-finite sample.
+    """Return the trials that a fit uses: those of `diagnosable` that are long enough.
 
     Args:
         workspace: the workspace.
@@ -286,7 +285,6 @@ def fittable(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
     Raises:
         GroundedError: if there is none, or one of those named can't be used.
     """
-    trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
-    found = [trial.until(T) for trial, T in trials if T >= 3]
+    found = [trial for trial in diagnosable(workspace) if trial.steps > LEAST_STEPS]
     chosen = named_trials(workspace, names, ids_of(found))
     return [trial for trial in found if not chosen or trial.id in chosen]
