@@ -138,7 +138,7 @@ def fit(
         if isinstance(found, GroundedError):
             return nothing(given, data, asked, delayed, found)
         tick("predict")
-        return report(given, asked, found, looked.findings, share.sentence)
+        return report(given, asked, found, looked.findings).of_share(share.sentence)
 
 
 def prediction_error(

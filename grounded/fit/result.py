@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.validation.choose import CLAIM, SCATTERS
-from grounded.diagnosis.validation.gain import Gain
+from grounded.diagnosis.validation.gain import LEAST, Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.errors import GroundedError
@@ -82,6 +82,10 @@ class Fit(Result):
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
 
+    def of_share(self, sentence: str) -> Fit:
+        """Return the fit with a sentence added on which share of the trials it used; "": all."""
+        return replace(self, sentence=f"{self.sentence}; {sentence}") if sentence else self
+
     @property
     def helps(self) -> bool:
         """Whether the values are likelier and predict held-out trials better (`choose`)."""
@@ -90,10 +94,10 @@ class Fit(Result):
 
     @property
     def worse(self) -> bool:
-        """Whether held-out trials are predicted worse than before."""
+        """Whether held-out trials are predicted worse than before, by as much as matters."""
         if self.gain is None or self.loss is None:
             return False
-        return self.loss.pays(SCATTERS) or self.gain.ruins
+        return (self.loss.pays(SCATTERS) and self.loss.mean > LEAST) or self.gain.ruins
 
     @property
     def at_bounds(self) -> tuple[str, ...]:
@@ -154,7 +158,6 @@ def report(
     asked: Sequence[str],
     found: Found,
     findings: Sequence[Finding] = (),
-    share: str = "",
 ) -> Fit:
     """Build the `Fit` of a finished search.
 
@@ -163,7 +166,6 @@ def report(
         asked: the parameters that were to be fitted.
         found: the end of the search.
         findings: what the sensors show by themselves.
-        share: a sentence on which share of the trials was used; "": all.
     """
     search, best, data = found.search, found.best, found.search.data
     scale, shift = _scales(found), best.hypothesis.shift
@@ -229,7 +231,7 @@ def report(
         covariance=covariance,
         **more,
     )
-    return replace(made, sentence="; ".join([*_said(made), *filter(None, [share])]))
+    return replace(made, sentence="; ".join(_said(made)))
 
 
 def nothing(

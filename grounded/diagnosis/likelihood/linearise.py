@@ -20,8 +20,8 @@ sign within half a step.
 
 A threshold (the throttle below which a motor stalls) has zero derivative, since a small change
 moves no sample across it. If a parameter's derivative is zero at every sample, a finite difference
-that is wide enough for some sample is used instead. So a wrong threshold is found like any other wrong
-parameter, and is not attributed to an effect.
+that is wide enough for some sample is used instead. So a wrong threshold is found like any other
+wrong parameter, and is not attributed to an effect.
 
 A run starts at the measured state. A state that was not measured at the start (a speed that is not
 logged, a sensor that had dropped out) gets a wide prior about the track, and each pass moves the

@@ -17,10 +17,9 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, measured_alike
-from grounded.share import share_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import fittable, ids_of, write_fit
+from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
 from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
@@ -78,7 +77,8 @@ def fit_in(
     from grounded.fit import fit
     from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
-    planner, used = workspace.planner, share_of(fittable(workspace, trials)).trials
+    planner, share = workspace.planner, chosen(workspace, trials)
+    used = share.trials
     adopted = _adopted_delays(workspace)
     rows, early = unsure_times(workspace.whole_trials(), ids_of(used))
     found = fit(
@@ -93,7 +93,7 @@ def fit_in(
         progress=progress,
     )
     late = [n for n in found.params if n in adopted or n.startswith("latency")]
-    found = _as_rows_tell(found, late, rows)
+    found = _as_rows_tell(found.of_share(share.sentence), late, rows)
     seen = where_to_mend(workspace, used, found.preflight)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):

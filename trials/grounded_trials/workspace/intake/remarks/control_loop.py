@@ -218,7 +218,10 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
         by, what = ("by its commands", "velocities") if np.ptp(old) else (by, what)
     error = task.model.difference(states, task.target[: len(states)])
     moved_on = task.model.difference(states[1:], states[:-1]) / task.dt
-    off, speed = (np.sqrt(np.nanmean(e**2, axis=0)) for e in (error, moved_on))
+    off, speed = (
+        np.sqrt(np.nansum(e**2, axis=0) / np.isfinite(e).sum(axis=0).clip(1))
+        for e in (error, moved_on)
+    )
     fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0  # not past inputs
     counts = fed & (task.reward.state > 0) & (old > 0) & (old * speed > LEADS * off)
     told = [i for i in np.flatnonzero(counts) if task.model.state_names[i] not in allowed]
