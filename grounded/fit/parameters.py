@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -26,16 +26,18 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import FAR, level
 from grounded.diagnosis.likelihood.linearise import thresholds
+from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.sound_data import sound_data
+from grounded.diagnosis.validation.choose import WITHIN
 from grounded.diagnosis.validation.limits import counted_once, held
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError, nearest, type_of
+from grounded.errors import GroundedError, list_of, nearest, type_of
 from grounded.fit.result import Fit, Found, PredictionError, errors_of, nothing, report
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -94,13 +96,12 @@ def fit(
         GroundedError: for an unknown or constant parameter, trials that do not match the model, are
             too short or unusable, or a model with too many states.
     """
-    loose = not isinstance(trials, Sequence | Trial) or isinstance(trials, str)
-    logged: Any = [trials] if isinstance(trials, Trial) else trials
-    if not isinstance(model, Model | Task) or loose or {*map(type, logged)} - {Trial}:
+    if not isinstance(model, Model | Task):
         raise GroundedError(
             "fit(model, trials) takes a Model or a Task and a list of Trials, got "
             f"{type_of(model)} and {type_of(trials)}"
         )
+    logged = list_of([trials] if isinstance(trials, Trial) else trials, Trial, "trials")
     if isinstance(names, str) or not isinstance(names, Sequence | None):
         raise GroundedError(f"names must be a list of parameters, got {names!r:.60}")
     given = model.model if isinstance(model, Task) else model
@@ -182,11 +183,19 @@ def _identified(
         if found is None:
             return undefined(search.predictor)
         model = held(search.predictor, found, less_noise=1.0)
-        if model is data.model:
-            search, best, crude = _with_all(search, found, late, tick)
-            free = Predictor(replace(search.data, model=given))
-            return Found(search, _centred(search, best), crude, free, delayed)
-        data = replace(data, model=model)
+        if model is not data.model:
+            data = replace(data, model=model)
+            continue
+        search, best, crude = _with_all(search, found, late, tick)
+        free = Predictor(replace(search.data, model=given))
+        done = Found(search, _centred(search, best), crude, free, delayed)
+        # trials that disagree, or a model that is wrong, may show less than the information says
+        lost = [n for n in done.told if n in data.model.uncertain and not done.told[n].known]
+        if not lost:
+            return done
+        params = data.model.params
+        surest = min(lost, key=lambda n: params[n].spread / max(abs(params[n].value), 1e-9))
+        data = replace(data, model=_only(data.model, {*data.model.uncertain} - {surest}))
 
 
 def _searched(search: Alone, late: Sequence[Effect], tick: Stages) -> Fitted | None:
@@ -206,21 +215,35 @@ def _searched(search: Alone, late: Sequence[Effect], tick: Stages) -> Fitted | N
     for j, grid in _far_off(search, best):
         tried = [(_at(best, data, j, value), best.noise, best.track) for value in grid]
         best = max(search.refined([best, *tried], TO_THE_TOP, rivals=True), key=search.score)
-    best = max([best, *search.structures(best)], key=search.score)
-    search.structures(search.exact_null()) if crude else None
+    if crude:
+        search.structures(search.exact_null())
+    search.structures(best)
+    free = [f for f in search.fits.values() if f.hypothesis.names == h.names]
+    best = _supported(search, [f for f in free if f.hypothesis.spread == h.spread])
     search.settled([best])
     return search.latest(best)
+
+
+def _supported(search: Alone, fits: Sequence[Fitted]) -> Fitted:
+    """Return the likeliest of the fits that predict held-out trials as well as any (`choose`).
+
+    They differ in their noise. Coloured noise can absorb what a model lacks, and with it what the
+    parameters should explain: it is likelier, and predicts worse.
+    """
+    ruler = Ruler(search.predictor)
+    if not ruler.held_out or len(fits) == 1:
+        return max(fits, key=search.score)
+    best = max(fits, key=ruler.score)
+    near = [f for f in fits if (gain := ruler.gain(f, best)).mean <= WITHIN * gain.scatter]
+    return max(near or [best], key=search.score)
 
 
 def _with_all(
     search: Alone, fit: Fitted, late: Sequence[Effect], tick: Stages
 ) -> tuple[Alone, Fitted, Fitted | None]:
-    """Return the fit, and that of the model as given, on all runs and not only those searched."""
-    few, more = search.data, entire(search.data)
-    bare = [
-        f for f in search.fits.values() if f.hypothesis.spread == 0 and not f.hypothesis.effects
-    ]
-    crude = max(bare, key=search.score, default=None)
+    """Return the fit and that of the model as given, under its noise, on all runs."""
+    few, more, own = search.data, entire(search.data), fit.noise.structure
+    crude = search.fits.get((own, 0.0, ())) or search.fits.get((Structure(), 0.0, ()))
     if more is few:
         return search, fit, crude
     tick("fit", f" to all {more.steps} steps")

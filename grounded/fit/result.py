@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from grounded.accounts.finding import Finding
+from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
@@ -143,6 +145,44 @@ class Found:
     free: Predictor  # with all parameters free that were asked for
     delayed: Mapping[str, tuple[int, ...]]  # the inputs of each fitted delay
 
+    @cached_property
+    def scales(self) -> Array:
+        """The unit of each unknown: of delays, then of the parameters' shifts, (C,)."""
+        data, h = self.search.data, self.best.hypothesis
+        shifts = param_scale(data.model)[calibrated(data)] if h.spread else np.zeros(0)
+        return np.concatenate([np.ones(len(h.theta)), shifts])
+
+    @cached_property
+    def sure(self) -> tuple[Array, Array]:
+        """The standard deviation and half-width of the interval of each unknown, (C,) each."""
+        search, folds = self.search, self.search.data.folds
+        found = standard_deviations(search.predictor, self.best, folds, search.tempering.factor)
+        return self.scales * found[0], self.scales * found[1]
+
+    @cached_property
+    def at(self) -> dict[str, int]:
+        """Where each delay and each parameter that was fitted is among the unknowns."""
+        data, h = self.search.data, self.best.hypothesis
+        names = [data.model.param_names[i] for i in calibrated(data)] if h.spread else []
+        return {name: k for k, name in enumerate((*self.delayed, *names))}
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """The value of every parameter of the model."""
+        model, shift = self.search.data.model, self.best.hypothesis.shift
+        values = model.values + (0.0 if shift is None else shift)
+        return dict(zip(model.param_names, values.tolist(), strict=True))
+
+    @cached_property
+    def told(self) -> dict[str, Identifiable]:
+        """How well the trials identify each parameter that was asked for."""
+        known = {
+            name: Estimate(self.values[name], float(self.sure[0][k]))
+            for name, k in self.at.items()
+            if name in self.values
+        }
+        return {one.parameter: one for one in identifiable(self.free, self.best, known)}
+
 
 def errors_of(ruler: Ruler, fit: Fitted) -> PredictionError:
     """Return the held-out errors of a fit one step and, at most, a second ahead."""
@@ -168,33 +208,16 @@ def report(
         findings: what the sensors show by themselves.
     """
     search, best, data = found.search, found.best, found.search.data
-    scale, shift = _scales(found), best.hypothesis.shift
-    values = model.values + (0.0 if shift is None else shift)
-    std, half = (
-        scale * one
-        for one in standard_deviations(search.predictor, best, data.folds, search.tempering.factor)
-    )
-    names = [*found.delayed, *(model.param_names[i] for i in calibrated(data) if shift is not None)]
-    of = {name: i for i, name in enumerate(names)}
-    # values with intervals: of parameters, then of delays
-    known = {
-        name: Estimate(float(values[model.param_names.index(name)]), float(std[i]))
-        for name, i in of.items()
-        if name in model.params
-    }
-    told = {one.parameter: one for one in identifiable(found.free, best, known)}
-    params = dict[str, FittedValue]()
+    params, (std, half) = dict[str, FittedValue](), found.sure
     for name in asked:
         param, start = model.params[name], model.params[name].value
-        low, high = param.reach
-        one, i = told.get(name), of.get(name)
-        if i is None or one is None or one.verdict == "not identifiable":
-            value = known[name].value if name in known else start
-            params[name] = FittedValue(value, np.inf, low, high, param.unit, False, start)
+        (low, high), k = param.reach, found.at.get(name)
+        if k is None:
+            params[name] = FittedValue(start, np.inf, low, high, param.unit, False, start)
             continue
-        value, e, w = known[name].value, known[name].std, float(half[i])
-        low, high = max(low, value - w), min(high, value + w)
-        params[name] = FittedValue(value, e, low, high, param.unit, True, start, tuple(one.given))
+        value, e, w = found.values[name], float(std[k]), float(half[k])
+        low, high, given = max(low, value - w), min(high, value + w), (*found.told[name].given,)
+        params[name] = FittedValue(value, e, low, high, param.unit, True, start, given)
     latency = data.latency.copy()
     for k, (name, inputs) in enumerate(found.delayed.items()):
         q, start = best.hypothesis.effects[k].free[0], float(data.latency[inputs[0]])
@@ -211,16 +234,16 @@ def report(
         ruler.beside(found.crude)
         more |= {"before": errors_of(ruler, found.crude), "after": errors_of(ruler, best)}
         more |= {"gain": ruler.gain(found.crude, best), "loss": ruler.gain(best, found.crude)}
-    covariance, at = np.zeros((len(params), len(params))), [of.get(name) for name in params]
+    covariance, at = np.zeros((len(params), len(params))), [found.at.get(name) for name in params]
     rows = [k for k, i in enumerate(at) if i is not None]
     picked = [i for i in at if i is not None]
-    covariance[np.ix_(rows, rows)] = (best.covariance * np.outer(scale, scale))[
+    covariance[np.ix_(rows, rows)] = (best.covariance * np.outer(found.scales, found.scales))[
         np.ix_(picked, picked)
     ]
     status = "converged" if best.settled else "still rising"
     made = Fit(
         params=params,
-        model=model.with_values(dict(zip(model.param_names, values.tolist(), strict=True))),
+        model=model.with_values(found.values),
         latency=latency,
         loglik=best.loglik,
         status=status,
@@ -251,13 +274,6 @@ def nothing(
         params[name] = FittedValue(start, np.inf, 0.0, np.inf, "s", False, start)
     said = f"nothing was fitted: {why}"
     return Fit(params, model, data.latency, -np.inf, "diverged", said, int(data.seen[1:].sum()))
-
-
-def _scales(found: Found) -> Array:
-    """Return the unit of each unknown of a fit: of delays, then of the parameters' shifts, (C,)."""
-    data, h = found.search.data, found.best.hypothesis
-    shifts = param_scale(data.model)[calibrated(data)] if h.shift is not None else np.zeros(0)
-    return np.concatenate([np.ones(len(h.theta)), shifts])
 
 
 def _said(found: Fit) -> list[str]:
