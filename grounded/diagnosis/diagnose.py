@@ -227,20 +227,18 @@ def diagnose(
     with np.errstate(all="ignore"), interruptible(found_so_far), running(engine, copied=copied):
         try:
             tick("predict")
-            decision, left_out = decide(search, ruler), set[str]()
+            decision, restarts = decide(search, ruler), len(candidates) > PAIR
             while decision.gap or options.max_effects:
-                leader, before = decision.leader, decision.fit
-                again = decision.gap and leader and not left_out and len(candidates) > PAIR
-                size = len(before.hypothesis.names)
+                before, size = decision.fit, len(decision.fit.hypothesis.names)
+                again = bool(restarts and decision.gap and decision.leader)
                 other = decision.gap and 0 < size < most and before is not search.of_size(size)[0]
-                more = most < limit and (options.max_effects or size >= most)
-                if not (again or other or more):
+                if not (again or other or (most < limit and (options.max_effects or size >= most))):
                     break
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
                 if again:
-                    left_out.add(leader)
-                    regrown(search, leader, max(size, PAIR))
+                    restarts = False
+                    regrown(search, decision.leader, max(size, PAIR))
                 elif other:
                     grown(search, before, size + 1)
                 else:
