@@ -85,7 +85,6 @@ WHOLE = 0.9  # share of a run that a log must last to be one, or else the error 
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
 ENDED = ("stopped", "converged")  # phases of a search
-MOST_ASKED = 3  # latest trials whose signs of inputs are compared
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
@@ -374,25 +373,24 @@ def sent_reversed(workspace: Folder, trial: Trial, names: Sequence[str]) -> str:
     Returns:
         What shows it: the end of a sentence; "" if it may be the log that has the other sign.
     """
-    from grounded.search.returned.reversed_input import signs_of
+    from grounded.accounts.judge import contradicted
+    from grounded.accounts.table import Account
 
-    planner = workspace.planner
-    if not {*names} <= {*planner.task.model.input_names}:
+    model = workspace.base_model
+    if not {*names} <= {*model.input_names}:
         return ""
-
-    def as_modelled(one: Trial) -> list[int]:
-        signs = signs_of(planner, one)
-        return [signs[name] for name in names]
-
-    moved, program = as_modelled(trial), f"so its program sends {listed(names)} times -1"
-    if all(sign > 0 for sign in moved):
+    columns = tuple(model.n + model.input_names.index(name) for name in names)
+    fault, known = Account("sign", columns, -1.0), trial.until(trial.known_steps)
+    as_logged, mended = (
+        contradicted(model, one, range(model.n), fault, constant=False)
+        for one in (known, fault.mended(known))
+    )
+    program = f"so its program sends {listed(names)} times -1"
+    if as_logged:
         return f"but the robot moved as the log says, {program}"
-    earlier = workspace.task_trials(measured=True)[-MOST_ASKED:]
-    if any(sign < 0 for sign in moved) or not earlier:
+    if mended or not without(workspace, replace(trial, id=""), fault):
         return ""
-    if all(min(as_modelled(one)) > 0 for one in earlier):
-        return f"but earlier logs, read in the same way, have the right one, {program}"
-    return ""
+    return f"but earlier logs, read in the same way, have the right one, {program}"
 
 
 def sent_scaled(workspace: Folder, names: Sequence[str], by: float) -> str:

@@ -67,7 +67,8 @@ class Fault:
         if not self.mend:
             return self.said
         again = f"then discard {trial.id} and ingest the log again" if trial.id else ""
-        return f"{self.said}. {self.mend}, {again or 'and ingest it again'}"
+        end = "" if self.said.endswith("?") else "."
+        return f"{self.said}{end} {self.mend}, {again or 'and ingest it again'}"
 
 
 def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
