@@ -9,8 +9,8 @@ import pytest
 from cli import grounded
 from facts import holding, holds
 from grounded import places
+from grounded.accounts.judge import judge
 from grounded.errors import GroundedError, NextCommand
-from grounded.search.returned.by_motion import exchanged
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.starting.shapes import Drive, path_target
@@ -132,14 +132,10 @@ def test_logs_of_another_dt_are_told_as_left_out(w):
 @pytest.mark.parametrize("scale", [0.8, 1.0])
 def test_inputs_that_acted_in_each_other_s_place_are_told_by_the_motion(w, crossed, scale):
     """Of nine runs with exchanged plugs, one was named; the others were asked about."""
-    planner = w.planner
-    before = [driven(w, seed, scale=scale) for seed in (1, 2)]
-    found = exchanged(planner, driven(w, 3, crossed, scale), before)
-    assert (found is not None) == crossed
-    if found is not None:
-        assert found.inputs == ("left", "right") and found.shown == ("t0002", "t0003")
-        assert holds(found.said, "did with left what was sent as right", "times as well")
-    assert exchanged(planner, driven(w, 3, True, scale), [driven(w, 1, True, scale)]) is None
+    told = judge(w.base_model, [driven(w, 3, crossed, scale)], range(6)).told
+    assert [(one.account.kind, one.account.pairs) for one in told] == (
+        [("exchange", ((6, 7),))] if crossed else []
+    )
 
 
 def test_who_proposes_at_the_end_of_a_search_has_gone_on_with_the_run(w, monkeypatch):
