@@ -186,41 +186,30 @@ def _in_other_column(
     of = "state" if a in model.state_names else "input"
     tables = f"[log.{of}.{a}] and [log.{of}.{b}]"
     every = (*model.state_names, *model.input_names)
-    names = model.state_names if of == "state" else model.input_names
     fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
     run, right = log.trial_from(begins), proven(fault)
-    show = f"{ranges(right)}, read in the same way, show{'s' * (len(right) == 1)} no exchange"
+    said = f"only with {a} and {b} exchanged are its commands those of {own.id}"
+    show = f"; {ranges(right)}, read in the same way, show{'s' * (len(right) == 1)} no exchange"
+    show *= bool(right)
     if run is None or not contradicted(model, run.until(run.known_steps), range(model.n), fault):
-        mend = f"Exchange the paths in {tables}, or the column headers in the log"
-        if right:
-            mend = f"{show}, so [log] is right: exchange the two in this log, and in what wrote it"
-        said = (
-            f"{a} and {b} seem to be in each other's column: only with them exchanged are its "
-            f"commands those of {own.id}. {mend}"
-        )
+        paths = f"the paths in {tables}, or the column headers in the log"
+        mend = "the two in this log, and in what wrote it" if right else paths
+        said = f"{a} and {b} seem to be in each other's column: {said}{show}. Exchange {mend}"
         return replace(found, said=said)
-    said = (
-        f"only with {a} and {b} exchanged are its commands those of {own.id}, but the robot moved "
-        "as the log says"
-    )
-    said += f", and {show}" * bool(right)
+    said += f", but the robot moved as the log says{show}"
+    its = f"its program sends {a} as {b}, and the reverse (swap its outputs back)"
     if of == "state":
-        how = (
+        its = (
             f"so the log is right, and its program passes {a} and {b} to `runner.action` in each "
-            f"other's place: the order is {', '.join(names)}. Mend that"
+            f"other's place: the order is {', '.join(model.state_names)}"
         )
     elif right:
-        how = (
-            f"so the log is right, and its program sends {a} as {b}, and the reverse. Swap its "
-            "outputs back"
-        )
+        its = f"so the log is right, and {its}"
     else:
-        how = (
-            f"so its program sends {a} as {b}, and the reverse (swap its outputs back); or both "
-            f"[log] and the robot have them exchanged (exchange the paths in {tables}, and swap "
-            "its wires back). Mend that"
-        )
-    return replace(found, said=f"{said}: {how} and run {own.id} again", rerun=True)
+        its += "; or both [log] and the robot have them exchanged (exchange the paths in "
+        its += f"{tables}, and swap its wires back)"
+    said += f": {its}. Mend that and run {own.id} again"
+    return replace(found, said=said, rerun=True)
 
 
 def offset_in(

@@ -2,8 +2,8 @@
 
 A log may be the run of another candidate, of one of an earlier task that was left on the robot, or
 of its own one read in another unit, at another rate or from exchanged columns; or the robot's
-program passed its candidate the wrong things. Each is tried before a log is refused, so that the
-error names the remedy. A user who names the candidate gets a warning instead.
+program passed its candidate the wrong things. Each is a story with a score; the likeliest is
+told, with its remedy. A user who names the candidate gets a warning instead.
 """
 
 from __future__ import annotations
@@ -322,16 +322,12 @@ def _scaled(case: Case, story: Story) -> GroundedError:
         how = next(misused_in(log, case.task, case.own), None)
         if how and how.left <= story.left + CLEAR:
             return _told(case, how)
-    then = NextCommand("next", ("LOG",))
-    if by == -1 and (shown := sent_reversed(case.workspace, case.whole, names)):
+    if shown := sent_otherwise(case.workspace, case.whole, names, by):
+        sign = f": only with {listed(names)} of the other sign are its commands those of {ran}, "
         return GroundedError(
-            f"{case.path}: only with {listed(names)} of the other sign are its commands those of "
-            f"{ran}, {shown}. Mend that and run {ran} again",
-            then,
-        )
-    if by != -1 and (shown := sent_scaled(case.workspace, names, by)):
-        return GroundedError(
-            f"{case.path} ran {ran}, but {shown}. Mend that and run {ran} again", then
+            f"{case.path}{sign if by == -1 else f' ran {ran}, '}{shown}. Mend that and run {ran} "
+            "again",
+            NextCommand("next", ("LOG",)),
         )
     other_unit = units_told(case.task, names, by, case.read.log is not None)
     return GroundedError(f"{case.path} ran {ran}, {other_unit}", case.again)
@@ -443,61 +439,47 @@ def turned_in(workspace: Folder, log: Recording, ran: str) -> str:
     )
 
 
-def sent_reversed(workspace: Folder, trial: Trial, names: Sequence[str]) -> str:
-    """Return that a program sent inputs with the other sign, which the log shows as they were sent.
+def sent_otherwise(workspace: Folder, trial: Trial, names: Sequence[str], by: float) -> str:
+    """Return that a program sent inputs times a number, which the log shows as they were sent.
+
+    Another scale in the log would spoil every later one.
 
     Args:
-        workspace: the workspace with the model.
+        workspace: the workspace with the model and the earlier runs, read in the same way.
         trial: the log, as it is read.
-        names: signals of which only the opposite is what the candidate sends.
-
-    Returns:
-        What shows it: the end of a sentence; "" if it may be the log that has the other sign.
-    """
-    from grounded.accounts.judge import contradicted
-    from grounded.accounts.table import Account
-
-    model = workspace.base_model
-    if not {*names} <= {*model.input_names}:
-        return ""
-    columns = tuple(model.n + model.input_names.index(name) for name in names)
-    fault, known = Account("sign", columns, -1.0), trial.until(trial.known_steps)
-    as_logged, mended = (
-        contradicted(model, one, range(model.n), fault, constant=False)
-        for one in (known, fault.mended(known))
-    )
-    program = f"so its program sends {listed(names)} times -1"
-    if as_logged:
-        return f"but the robot moved as the log says, {program}"
-    if mended or not without(workspace, replace(trial, id=""), fault):
-        return ""
-    return f"but earlier logs, read in the same way, have the right one, {program}"
-
-
-def sent_scaled(workspace: Folder, names: Sequence[str], by: float) -> str:
-    """Return that a program sent inputs times a number that is no unit, as earlier runs show.
-
-    They were read in the same way and had what their candidates send. Another scale in the log
-    would spoil every later one.
-
-    Args:
-        workspace: the workspace with the earlier runs.
         names: signals that have to be multiplied for the candidate's commands.
         by: the number.
 
     Returns:
-        A clause; "" if the log may have another unit, or there are no earlier runs.
+        What shows it, a clause; "" if the log may have another unit, or nothing tells.
     """
-    task = workspace.task
-    known = unit_by_factor(task.model, names, by) or of_full_scale(task, names, by)
-    earlier = any(one.candidate for one in workspace.task_trials(measured=True))
-    if not {*names} <= {*task.model.input_names} or known or by in THOUSAND or not earlier:
+    from grounded.accounts.judge import contradicted
+    from grounded.accounts.table import Account
+
+    model, task, which = workspace.base_model, workspace.task, listed(names)
+    if not {*names} <= {*model.input_names}:
         return ""
-    tables = listed(f"[log.input.{name}]" for name in names)
+    if by == -1:
+        columns = tuple(model.n + model.input_names.index(name) for name in names)
+        fault, known = Account("sign", columns, -1.0), trial.until(trial.known_steps)
+        as_logged, mended = (
+            contradicted(model, one, range(model.n), fault, constant=False)
+            for one in (known, fault.mended(known))
+        )
+        program = f"so its program sends {which} times -1"
+        if as_logged:
+            return f"but the robot moved as the log says, {program}"
+        if mended or not without(workspace, replace(trial, id=""), fault):
+            return ""
+        return f"but earlier logs, read in the same way, have the right one, {program}"
+    unit = unit_by_factor(model, names, by) or of_full_scale(task, names, by)
+    earlier = any(one.candidate for one in workspace.task_trials(measured=True))
+    if unit or by in THOUSAND or not earlier:
+        return ""
     return (
-        f"its program sends {listed(names)} {times_too(by)}: earlier runs, whose logs were read in "
-        f"the same way, have the right size (if it is the log that changed since, multiply the "
-        f"scale in {tables} by {by:.6g})"
+        f"but its program sends {which} {times_too(by)}: earlier runs, whose logs were read in the "
+        "same way, have the right size (if it is the log that changed since, multiply the scale in "
+        f"{listed(f'[log.input.{name}]' for name in names)} by {by:.6g})"
     )
 
 

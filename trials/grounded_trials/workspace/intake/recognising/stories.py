@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from math import log
+from typing import Any
 
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
@@ -65,23 +66,7 @@ class Story:
         return self.commands + self.motion + self.price
 
 
-def unexplained(error: float) -> float:
-    """Return what is left of commands [nats] with an error, relative to their size."""
-    return log(error + FINE)
-
-
-def scored(
-    kind: Kind,
-    said: str,
-    own: Candidate,
-    run: Trial,
-    error: float,
-    *,
-    price: float = 0.0,
-    rerun: bool = False,
-    names: tuple[str, ...] = (),
-    by: float = 1.0,
-) -> Story:
+def scored(kind: Kind, said: str, own: Candidate, run: Trial, error: float, **other: Any) -> Story:
     """Return a story with its score.
 
     Args:
@@ -90,12 +75,9 @@ def scored(
         own: the candidate whose commands these are.
         run: the trial as it was by the story.
         error: what is left of the commands, relative to their size.
-        price: what it costs before a log is seen [nats].
-        rerun: as in `Story`.
-        names: as in `Story`.
-        by: as in `Story`.
+        other: further fields of `Story`.
     """
-    return Story(kind, said, unexplained(error), apart(own, run), price, rerun, names, by)
+    return Story(kind, said, log(error + FINE), apart(own, run), **other)
 
 
 def likeliest(stories: Iterable[Story | None], as_logged: Story) -> Story:
