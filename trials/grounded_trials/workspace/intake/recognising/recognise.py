@@ -161,7 +161,8 @@ class Case:
     @cached_property
     def columns(self) -> list[Fault]:
         """The faults of columns; none of them can be told without the commands."""
-        known = replace(self.read.trial, id="").until(self.read.trial.known_steps)
+        trial, fell = replace(self.read.trial, id=""), self.look.fell
+        known = trial.until(min(trial.known_steps, fell.steps if fell else trial.steps))
         untold = self.read.bare or self.seen.silent
         return [] if untold else column_faults(self.workspace, known)
 
