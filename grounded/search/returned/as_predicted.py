@@ -43,9 +43,10 @@ def far(own: Candidate, trial: Trial) -> Array:
     return found
 
 
-def apart(own: Candidate, trial: Trial) -> float:
-    """Return how far a trial is from its prediction [nats], summed over the states."""
-    return float(np.nansum(np.log(np.fmax(far(own, trial), NEAR))))
+def apart(own: Candidate, trial: Trial, but: Sequence[str] = ()) -> float:
+    """Return how far a trial is from its prediction [nats], summed over the states `but` some."""
+    counts = ~np.isin(trial.state_names, but)
+    return float(np.nansum(np.log(np.fmax(far(own, trial), NEAR))[counts]))
 
 
 def like_predicted(own: Candidate, trial: Trial) -> bool:

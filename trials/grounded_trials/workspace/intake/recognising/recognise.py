@@ -22,7 +22,7 @@ from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import odd_columns
+from grounded.search.returned.as_predicted import apart, odd_columns
 from grounded.search.returned.misused import WITHOUT, without_feedback
 from grounded.search.returned.other_scale import (
     THOUSAND,
@@ -262,7 +262,9 @@ def _of_log(case: Case) -> Iterator[Story]:
         yield from otherwise(log, task, own, case.proven)
         yield from misuses(log, task, own, case.look.found)
     if dead := [one for one in case.columns if one.kind == "dead"]:
-        yield from _of_columns(case, dead)  # what is fed back of it looks like anything
+        names = [name for one in dead for name in one.names]
+        plain, motion = case.as_logged.commands, apart(own, case.whole, names)
+        yield replace(next(_of_columns(case, dead)), commands=plain, motion=motion)
     earlier = None if case.read.bare else of_earlier_task(case.workspace, log, case.whole)
     if earlier:
         yield replace(earlier, said=case.seen.why)

@@ -43,6 +43,7 @@ class Fault:
         kind: that of the account: unit, sign, exchange, dead, offset, axes, pace or clock.
         inputs: the inputs that are in another unit.
         factor: how many times too large these are, below 1 too small.
+        names: all columns that are at fault, but exchanged ones.
     """
 
     said: str
@@ -52,6 +53,7 @@ class Fault:
     factor: float = 1.0
     robot: str = ""
     kind: str = ""
+    names: tuple[str, ...] = ()
 
     def told(self, trial: Trial, *, own: bool) -> str:
         """Return the warning; `own` is for a trial that was written by grounded, not a log."""
@@ -135,7 +137,8 @@ def _fault(workspace: Folder, known: Trial, told: Told) -> Fault:
         said, how = clause(model, told, log=False), mend(model, told)
     sent = tuple(n for n in names_of(model, account.columns) if n in model.inputs)
     should = f"write {_units(model, names_of(model, account.columns))}" * (account.kind == "unit")
-    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind)
+    names = tuple(names_of(model, account.columns))
+    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind, names=names)
 
 
 def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
