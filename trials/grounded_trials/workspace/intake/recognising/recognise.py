@@ -258,7 +258,7 @@ def _of_log(case: Case) -> Iterator[Story]:
         error = np.nanmean((case.seen.ran.off / case.seen.ran.fine)[: fell.steps] ** 2) ** 0.5
         part = case.whole.until(fell.steps)
         yield scored(Kind.FELL, fell.told, own, part, FINE * float(error), price=SHORTER)
-    if log and not case.seen.silent:
+    if log:
         yield from otherwise(log, task, own, case.proven)
         yield from misuses(log, task, own, case.look.found)
     if dead := [one for one in case.columns if one.kind == "dead"]:
