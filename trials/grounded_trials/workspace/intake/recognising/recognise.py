@@ -59,7 +59,6 @@ from grounded_trials.workspace.intake.recognising.read_otherwise import (
     units_told,
 )
 from grounded_trials.workspace.intake.recognising.stories import (
-    CLEAR,
     Kind,
     Story,
     likeliest,
@@ -321,10 +320,9 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
 def _scaled(case: Case, story: Story) -> GroundedError:
     """Return the error of a log in another unit or of another sign, or of a program that is."""
     names, by, ran, log = story.names, story.by, case.ran, case.log
-    if log and _in_programs_unit(case.task.model, names, by):
-        how = next(misused_in(log, case.task, case.own), None)
-        if how and how.left <= story.left + CLEAR:
-            return _told(case, how)
+    its = log if _in_programs_unit(case.task.model, names, by) else None
+    if its and (how := next(misused_in(its, case.task, case.own), None)):
+        return _told(case, how)
     if shown := sent_otherwise(case.workspace, case.whole, names, by):
         sign = f": only with {listed(names)} of the other sign are its commands those of {ran}, "
         return GroundedError(
