@@ -39,12 +39,7 @@ UNITS: dict[str, dict[str, float]] = {
     "%": {"parts of 1": 0.01},
 }
 FULL = {"percent": 100.0, "counts of 8 bits": 255.0, "thousandths": 1000.0}  # full scale of a part
-WORDS = {
-    "deg": "degrees",
-    "deg/s": "degrees a second",
-    "rad": "radians",
-    "rad/s": "radians a second",
-}
+WORDS = {"deg": "degrees", "deg/s": "degrees a second", "rad": "radians"}
 OPENED, OVER = 0.05, 1.03  # share of full scale that the largest command of a log lies between
 PREFIXES = ("m", "k", "c", "u", "M")
 

@@ -137,8 +137,8 @@ def _fault(workspace: Folder, known: Trial, told: Told) -> Fault:
         said, how = clause(model, told, log=False), mend(model, told)
     sent = tuple(n for n in names_of(model, account.columns) if n in model.inputs)
     should = f"write {_units(model, names_of(model, account.columns))}" * (account.kind == "unit")
-    names = tuple(names_of(model, account.columns))
-    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind, names=names)
+    every = tuple(names_of(model, account.columns))
+    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind, names=every)
 
 
 def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
