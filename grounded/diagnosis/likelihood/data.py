@@ -210,7 +210,7 @@ def prepare(
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
         raise GroundedError(
-            "nothing to diagnose: no trial has two steps with finite values; verify the stored "
+            "nothing can be learnt: no trial has two steps with finite values; verify the stored "
             "files, or ingest a trial that ran",
             then=NextCommand("verify"),
         )
