@@ -58,7 +58,10 @@ VERDICTS = {
 )
 @click.option("--data", is_flag=True, help="The log ran no candidate: for fit and diagnose only.")
 @click.option(
-    "--group", default="", metavar="NAME", help="The condition of the run that no signal shows: wet."
+    "--group",
+    default="",
+    metavar="NAME",
+    help="The condition of the run that no signal shows: wet.",
 )
 @in_workspace
 @as_json

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
+from grounded.figures.figure import Figure
 from grounded.result import Result, document, figure, html_table, percent, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import (
@@ -38,6 +39,7 @@ from grounded.search.certainty import (
     runs_needed,
     runs_to_show,
 )
+from grounded.search.pictures import search_figure
 from grounded.search.scatter import Repeats
 from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
@@ -45,7 +47,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
     from grounded.search.planner import Planner
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
@@ -182,8 +183,6 @@ class Standing(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
-        from grounded.search.pictures import search_figure
-
         found = search_figure(self)
         return () if found is None else (found,)
 

@@ -234,7 +234,8 @@ def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, A
 
     A case whose logs are refused counts as unknown: nothing is named, and the others go on.
     """
-    from grounded.diagnosis.report import Diagnosis, Verdict
+    from grounded.diagnosis.parts import Verdict
+    from grounded.diagnosis.report import Diagnosis
 
     begin, case = time.process_time(), Folder(Path(folder) / name)
     try:

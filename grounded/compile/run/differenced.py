@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
-from grounded.compile.problem import Limits
+from grounded.compile.problem import Samples
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
 from grounded.foreign import contained
@@ -98,21 +98,13 @@ class DifferencedSystem(Interpreted):
                 "jacobian out to difference the step"
             )
 
-    def jacobian(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float,
-        width: int,
-        limits: Limits | None = None,
-    ) -> Array:
+    def jacobian(self, at: Samples, width: int) -> Array:
         """See `Interpreted.jacobian`; by central differences.
 
         Where derivatives come with the model, those by a parameter are taken to one side: half the
         steps, and none with a friction below zero.
         """
+        x, u, p, dt, _, limits = at
         shifted = self.n + self.m
         both, free = np.concatenate([x, u], axis=1), np.full(shifted, np.inf)
         low, high = -free, free.copy()
@@ -123,8 +115,8 @@ class DifferencedSystem(Interpreted):
         size = max(1, CHUNK // (2 * shifted))
         if self.signature.jacobian is not None:
             J[:, :, :shifted], size = self._given(x, u, p, dt), 0
-        for at in range(0, len(x), size) if size else ():
-            some = slice(at, at + size)
+        for first in range(0, len(x), size) if size else ():
+            some = slice(first, first + size)
             J[some, :, :shifted] = self._differences(both[some], p, dt, low, high)
         given = self.signature.jacobian is not None
         base = self.step(x, u, p, dt) if given and width > shifted else None

@@ -110,4 +110,3 @@ def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> tuple[Arr
             shifts[i] = scale * np.linalg.lstsq(scaled, pull, rcond=1e-8)[0]
         rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
     return shifts, rss
-

@@ -22,15 +22,18 @@ from typing import Any
 
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
-from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
-
-DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # nesting of types; items of an array
-_KINDS = {"int": ("i", 1, 2, 4, 8), "uint": ("u", 1, 2, 4, 8), "float": ("f", 4, 8)}
-NUMBERS = {  # by their ROS names: int8 ... float64
-    f"{word}{8 * size}": Number(f"{kind}{size}")
-    for word, (kind, *sizes) in _KINDS.items()
-    for size in sizes
-} | {"bool": Number("b1"), "char": Number("u1")}
+from grounded_trials.formats.messages import (
+    COUNT_LIMIT,
+    DEPTH_LIMIT,
+    NUMBERS,
+    Array,
+    BadSchema,
+    Field,
+    Number,
+    Struct,
+    Text,
+    Type,
+)
 
 
 def struct_of(schema: Schema) -> Struct:

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from grounded.diagnosis.report import Diagnosis, Estimate, Made
+from grounded.diagnosis.parts import Estimate, Made
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
 from grounded.result import begun, listed, number
