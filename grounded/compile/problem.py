@@ -354,16 +354,6 @@ class System(ABC):
         more: its arrays may be used again.
         """
 
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: DescentOptions,
-    ) -> Descent | None:
-        """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
-
-        From the rollout of ubar (H, m) or of ubar + K (z - zbar).
-        """
+    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
+        """The loop of `ddp.solve` from a first rollout; None where it is left to `ddp`."""
         return None

@@ -246,14 +246,7 @@ class CompiledSystem(TracedSystem):
             failed = 0
         return Backward(k, K, float(expected[0]), float(expected[1]), failed)
 
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: DescentOptions,
-    ) -> Descent | None:
+    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
         """See `System.descend`."""
         if self.m > MAX_INPUTS:
             return None
@@ -266,9 +259,9 @@ class CompiledSystem(TracedSystem):
             | {"expected": (2,), "result": (4,), "lines": (most + 1, 4)}
         )
         results["alphas"][:] = 1.0
-        policy = _policy(Controls(ubar, K, zbar))
-        first = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
-        rollout = table(ROLLOUT, known, at | first | policy)
+        run_0 = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
+        policy = _policy(first)  # the arrays live as long as the kernel runs
+        rollout = table(ROLLOUT, known, at | run_0 | policy)
         sweep = table(SWEEP, known | {"jacobian": jacobian}, at)
         values = at | {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
         values |= {"halvings": int(options.halvings), "max_iterations": most}

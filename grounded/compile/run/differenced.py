@@ -70,7 +70,7 @@ class DifferencedSystem(Interpreted):
             self._batches = False
             self.note += SLOW
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
-            len(x), len(self.signature.outputs)
+            len(x), len(self.signature.states)
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
@@ -192,8 +192,8 @@ class DifferencedSystem(Interpreted):
         self._calls += 1
         try:
             values = self._call([*x.T], [*u.T], p, dt)
-            result = np.empty((len(x), len(self.signature.outputs)))
-            for i, name in enumerate(self.signature.outputs):
+            result = np.empty((len(x), len(self.signature.states)))
+            for i, name in enumerate(self.signature.states):
                 result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
         except Exception:  # whatever it is, the call on one sample tells the user
             return None
@@ -208,25 +208,25 @@ class DifferencedSystem(Interpreted):
     def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The function on one sample; NaN where it leaves the finite numbers."""
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.full(len(self.signature.outputs), np.nan)
+            return np.full(len(self.signature.states), np.nan)
         try:
             values = self._call(x.tolist(), u.tolist(), p, dt)
         except ArithmeticError:
-            return np.full(len(self.signature.outputs), np.nan)
+            return np.full(len(self.signature.states), np.nan)
         except ValueError as error:
             if "math domain error" in str(error) or "nonnegative input" in str(error):
-                return np.full(len(self.signature.outputs), np.nan)
+                return np.full(len(self.signature.states), np.nan)
             raise self._failure(error) from error
         except GroundedError:
             raise
         except Exception as error:
             raise self._failure(error) from error
-        return np.array([self._number(name, values[name]) for name in self.signature.outputs])
+        return np.array([self._number(name, values[name]) for name in self.signature.states])
 
     def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
         with np.errstate(all="ignore"):
             values = self.signature.call(x, u, np.asarray(p, float).tolist(), dt)
-        check_names(values, self.signature.outputs, self.signature.function)
+        check_names(values, self.signature.states, self.signature.function)
         return values
 
     def _number(self, name: str, value: Any) -> float:

@@ -90,9 +90,9 @@ class Interpreted(System):
             except (ArithmeticError, ValueError) as error:
                 kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
                 return f"{raised_at(error, signature.function)}: {kind}{error}"
-            found = np.array([float(values[name]) for name in signature.outputs])
+            found = np.array([float(values[name]) for name in signature.states])
             if not np.isfinite(found).all():
-                name = signature.outputs[int(np.argmin(np.isfinite(found)))]
+                name = signature.states[int(np.argmin(np.isfinite(found)))]
                 return f"{self.source}: {values[name]:g} for '{name}'"
             if self.kind == "step":
                 break
