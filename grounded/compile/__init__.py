@@ -27,7 +27,6 @@ from grounded.compile.problem import (
     Swarm,
     System,
     deepest,
-    history_depths,
 )
 from grounded.compile.run import jit
 from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
@@ -47,7 +46,6 @@ __all__ = [
     "Swarm",
     "System",
     "deepest",
-    "history_depths",
     "system_of",
 ]
 MAX_COMPILED = 30_000  # operations of a model and its derivatives, about 7 s of compiling

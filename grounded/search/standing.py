@@ -171,7 +171,21 @@ class Standing(Result):
     def table(self) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
         """Return (rows, header) of all candidates, as `grounded status` prints them."""
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
-        return [_row(one, self.verdict(one)) for one in self.history], header
+        return [self.row(one) for one in self.history], header
+
+    def row(self, tried: Tried) -> tuple[str, ...]:
+        """Return a candidate's row of the table."""
+        return (
+            tried.candidate.id,
+            str(tried.candidate.iteration),
+            f"{tried.candidate.alpha:g}",
+            figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
+            figure(tried.promised),
+            figure(tried.utility),
+            spread(tried.standard_error),
+            str(len(tried.trials)),
+            self.verdict(tried),
+        )
 
     def _repr_html_(self) -> str:
         """Return the candidates as a table and the phase as a sentence, for Jupyter."""
@@ -218,20 +232,6 @@ class Proposal(Result):
         )
         best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
         return known | best if made else known
-
-
-def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
-    return (
-        tried.candidate.id,
-        str(tried.candidate.iteration),
-        f"{tried.candidate.alpha:g}",
-        figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
-        figure(tried.promised),
-        figure(tried.utility),
-        spread(tried.standard_error),
-        str(len(tried.trials)),
-        verdict,
-    )
 
 
 def standing(

@@ -20,6 +20,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.messages import (
@@ -48,8 +49,6 @@ def struct_of(schema: Schema) -> Struct:
     if schema.encoding in ("ros1msg", "ros2msg"):
         return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
     if schema.encoding in ("ros2idl", "omgidl"):
-        from grounded_trials.formats.idl_schema import parse_idl
-
         return parse_idl(text, schema.name)
     raise BadSchema(
         f"the schema's language '{schema.encoding}' can't be read; expected ros1msg, ros2msg, "
