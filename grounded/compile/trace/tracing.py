@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
+from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
@@ -173,8 +174,6 @@ class Variant:
         Raises:
             TooLong: when they are more operations than can be compiled.
         """
-        from grounded.compile.trace.derivative import jacobian
-
         variables = self._variables(width)
         column = {v: c for c, v in enumerate(variables)}
         rows = jacobian(self.trace.graph, self.trace.outputs, variables)
