@@ -199,14 +199,14 @@ def _begin(
     report = inspect_log(log)
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
-    if all(field.low is None for topic in report.topics for field in topic.fields):
-        there = [field.path for topic in report.topics for field in topic.fields]
+    if all(field.low is None for field in report.numbers):
+        there = [field.path for field in report.numbers]
         words = f"only text in {listed(there[:NAMED])}" if there else "no column but the times"
         raise GroundedError(
             f"{log} holds no numbers, {words}: init needs a log with the robot's states and "
             "commands as numbers"
         )
-    numbers = [field for topic in report.topics for field in topic.fields if field.low is not None]
+    numbers = [field for field in report.numbers if field.low is not None]
     if all(field.low == field.high for field in numbers):
         raise GroundedError(
             f"nothing changes in {log}: each of its {count(len(numbers), 'number')} is the same in "

@@ -252,7 +252,7 @@ def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> 
     taken = {guess.path for guess in guesses.values()}
     if name not in guesses or guesses[name].path or guesses[name].others:
         return {}
-    fields = [f for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
+    fields = [f for f in log.numbers if f.low != f.high and f.path not in taken]
     bare = [f.path for f in fields if re.search(r"\.data(\[\d+\])?$", f.path)]
     return {name: replace(guesses[name], others=tuple(bare[:COMBINATIONS]))}
 
@@ -347,7 +347,7 @@ def from_the_rest(
         joints: units of joints' numbers by path, see `joint_units`.
     """
     stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
-    moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    moving = log.moving
     left = [p for p in moving if p not in taken and not PARTS.search(p)]
     lost = [guess for guess in guesses if not guess.path and not guess.others]
     fits = {g.name: [p for p in left if _goes_with(stated.unit(p), units[g.name])] for g in lost}

@@ -300,7 +300,7 @@ def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ..
     """Return the usual names of a state; north and east only if the log has both."""
     if name == "v" and "u" in states:
         return _BESIDE_U
-    said = {without_unit(f.path).lower().rpartition(".")[2] for t in log.topics for f in t.fields}
+    said = {without_unit(f.path).lower().rpartition(".")[2] for f in log.numbers}
     plane = all(said.intersection(axis) for axis in _COMPASS)
     left = () if plane else {one for axis in _COMPASS for one in axis}
     return tuple(one for one in _MEANINGS.get(name, (name,)) if one not in left)
