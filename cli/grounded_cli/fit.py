@@ -36,10 +36,9 @@ STANDS_IN = (
     "fitted parameters can also compensate for effects that the equations lack (a mass for a "
     "friction): `grounded diagnose` separates the two, on the same trials"
 )
-HELD_OUT = (  # `fit.parameters.split_in_time`
-    "rms, open loop, on data that this fit did not use: the last quarter of each trial, or every "
-    "fourth trial if they are short. `grounded diagnose` predicts all trials, each with values "
-    "from the others, so its errors differ"
+HELD_OUT = (
+    "rms, open loop, of each group of trials (or piece of a single log), predicted with values "
+    "from the others, as `grounded diagnose` does"
 )
 
 
@@ -62,8 +61,7 @@ def command(
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
     Sensor faults (a delay, filtered speeds, degrees) are corrected first, as in `diagnose`.
-    Prediction errors are measured on a held-out quarter of the time; values that predict it worse
-    are never written.
+    Trials are predicted with values from the others; values that predict worse are never written.
     """
     workspace = open_workspace()
     from grounded.diagnosis.tables import instrument_lines
@@ -103,7 +101,7 @@ def command(
         remark("note", STANDS_IN)
         show("\nto write the values to grounded.toml, add --apply")
     else:
-        show("\nnothing was written: these values don't reduce the held-out errors by 1 %")
+        show("\nnothing was written: these values don't clearly reduce the held-out errors")
     show(next_line(done.then))
 
 
@@ -122,12 +120,6 @@ def _unknown_times(done: Fitted) -> str:
     if done.rows_s:
         rows = f"the {done.rows_s:.3g} s between rows of the log"
         why.append(f"{rows}, which do not say when in between a command was sent")
-    if done.mean_s > SLIGHT:
-        why.append(
-            f"{done.mean_s:.2g} s since a fit takes the mean of two commands where an input "
-            "arrives within a step; `diagnose` makes such steps in parts, so its value is the "
-            "better one"
-        )
     from grounded.diagnosis.tables import in_between
 
     text = f"interval of a delay, to each side: {'; '.join(why)}" if why else ""
@@ -135,9 +127,6 @@ def _unknown_times(done: Fitted) -> str:
         text += "; " * bool(text)
         text += f"std of delays and time constants: {in_between(done.interpolated_s)}"
     return text
-
-
-SLIGHT = 1e-5  # [s] of a delay that is not told
 
 
 def _stopped(names: Sequence[str]) -> str:

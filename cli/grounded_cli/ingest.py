@@ -61,7 +61,7 @@ VERDICTS = {
     "--group",
     default="",
     metavar="NAME",
-    help="The condition of the run that no signal shows: wet.",
+    help="A condition that no signal shows: wet.",
 )
 @in_workspace
 @as_json

@@ -61,7 +61,7 @@ STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps i
 NONE, LARGE, FINE = 3.0, 0.01, 0.02  # of a bias: standard deviations, shares of the rms
 SPEEDY = 0.5  # share of the squares that a constant leaves, below which the speed explains more
 CLOSE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
-AGREE = 2.5
+AGREE, UNSURE = 2.5, 0.25  # standard deviations; and of a delay: larger ones show none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
 
@@ -564,8 +564,10 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
         if abs(one.delay - other.delay) > max(sure, CLOSE * every.delay):
             return None
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
+    if any(std > UNSURE * late for late, std in _left(ways, 0.0, dt, apart=apart)):
+        return None  # beside a drift nothing shows it
     for left, std in _left(ways, every.delay / dt, dt, apart=apart):
-        if std > 0.25 * every.delay or abs(left) > max(AGREE * std, CLOSE * every.delay):
+        if std > UNSURE * every.delay or abs(left) > max(AGREE * std, CLOSE * every.delay):
             return None
     return every
 

@@ -260,11 +260,12 @@ def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
     known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
     if not known:
         return UNKNOWN
-    # over the length that tells most it must lead, over the others do better than its reverse
+    # over the shortest length that tells it must lead, over the others do better than its reverse:
+    # resistance that the model lacks leaves less of an input the longer it acts
     leads = [
         float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]
     ]
-    nats, share = known[int(np.argmax(leads))]
+    nats, share = known[next((k for k, lead in enumerate(leads) if lead > HINT), 0)]
     way = int(nats.argmin())
     agree = [float(one[2 - way] - one[way]) for one, _ in known]
     reversal = way == 2 and (len(known) < 2 or min(agree) < HINT)

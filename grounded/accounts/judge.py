@@ -147,7 +147,9 @@ def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterat
         yield Told(account, some, 0.0, whole=len(some) == len(trials), moved=each[some[0]][j])
 
 
-def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Account) -> bool:
+def contradicted(
+    model: Model, trial: Trial, shown: Sequence[int], account: Account, *, constant: bool = True
+) -> bool:
     """Check whether the model predicts a trial clearly better as logged than without a fault.
 
     Args:
@@ -155,11 +157,13 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         trial: of its states and inputs.
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
+        constant: remove a constant rate of each state, which a command at its limit may make.
     """
     known, ones = _known(trial, shown), np.ones(model.m)
     seconds = horizon_of(trial, known)
     logged, mended = (
-        Ahead(model, one, known, STARTS, horizon=seconds) for one in (trial, account.mended(trial))
+        Ahead(model, one, known, STARTS, constant=constant, horizon=seconds)
+        for one in (trial, account.mended(trial))
     )
     if not (logged.enough and mended.enough) or not np.isfinite(trial.inputs).all():
         return False

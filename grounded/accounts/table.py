@@ -8,7 +8,7 @@ small, a velocity's sign before its position's, a unit before an exchange.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -39,6 +39,7 @@ UNITS: dict[str, dict[str, float]] = {
     "%": {"parts of 1": 0.01},
 }
 FULL = {"percent": 100.0, "counts of 8 bits": 255.0, "thousandths": 1000.0}  # full scale of a part
+WORDS = {"deg": "degrees", "deg/s": "degrees a second", "rad": "radians"}
 OPENED, OVER = 0.05, 1.03  # share of full scale that the largest command of a log lies between
 PREFIXES = ("m", "k", "c", "u", "M")
 
@@ -122,6 +123,23 @@ def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
     if not base or " " in unit or "^" in unit or base[:1] in PREFIXES:
         return {f"thousandths of {unit}": 1e3}
     return {f"m{unit}": 1e3}
+
+
+def unit_named(units: Iterable[str], factor: float) -> str:
+    """Return in which unit signals are that are too large by a factor; "" if it has no name.
+
+    Args:
+        units: the model's, of each signal.
+        factor: how many times as large as in these.
+    """
+    names = set[str]()
+    for unit in units:
+        stem = unit.partition("/")[0]
+        known = FULL if unit == "1" else {**units_of(unit), **units_of(stem)}
+        names |= {next((name for name, f in known.items() if np.isclose(f, factor)), "")}
+    name = min(names, key=len)  # of a length, if its velocity is in the same unit
+    alike = len({one.partition("/")[0] for one in names}) == 1
+    return WORDS.get(name, name) if alike else ""
 
 
 def of_rows(

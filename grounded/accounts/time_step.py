@@ -124,6 +124,8 @@ def _missed(model: Model, x: Array, one: Array, finer: Array) -> Array:
     """
     with np.errstate(all="ignore"):
         off, change = model.difference(one, finer) ** 2, model.difference(finer, x) ** 2
+        known = np.isfinite(off).any(axis=0)  # else it overflowed everywhere
+        off[:, ~known] = change[:, ~known] = 0.0
         usual = ~(off > np.nanquantile(off, USUAL, axis=0))
         off, change = (np.nanmean(np.where(usual, y, np.nan), axis=0) ** 0.5 for y in (off, change))
         least = MOVES * np.nanmax(np.abs(x), axis=0) + 1e-12

@@ -6,11 +6,9 @@ import numpy as np
 
 from grounded.accounts.judge import Told
 from grounded.accounts.kinematics import turned
-from grounded.accounts.table import DEGREES, Account
+from grounded.accounts.table import DEGREES, WORDS, Account
 from grounded.model import Model
 from grounded.result import listed, with_unit
-
-WORDS = {"deg": "degrees", "deg/s": "degrees a second"}
 
 
 def names_of(model: Model, columns: object) -> list[str]:
@@ -126,7 +124,7 @@ def remedy(model: Model, told: Told, k: int, where: str) -> tuple[str, str]:
     if account.kind == "offset":
         return f"is {-angle:.0f} degrees off the course given by the positions{where}", ""
     if account.kind == "unit":
-        other = {"deg": "degrees", "deg/s": "degrees a second"}.get(account.unit, account.unit)
+        other = WORDS.get(account.unit, account.unit)
         if account.unit == "deg" and unit.endswith("/s"):
             other = "degrees a second"
         what = f"is in {other}, not in {unit}" if other else f"is too small by {DEGREES:.4g}"

@@ -28,8 +28,6 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import SENSOR_DELAY, late_as_positions
-from grounded.accounts.lag import whole_steps
-from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -38,11 +36,12 @@ from grounded.diagnosis.hypotheses.attribution import (
     so_far,
 )
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
-from grounded.diagnosis.likelihood.data import Data, prepare
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.sound_data import sound_data
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import (
@@ -50,7 +49,6 @@ from grounded.diagnosis.validation.limits import (
     held,
     knowable,
     limits,
-    with_measured_filters,
 )
 from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
@@ -160,8 +158,6 @@ def diagnose(
             f"most {MOST_NAMES} of both together, since each may affect each: diagnose a model of "
             "the part where the gap is"
         )
-    latency = subject.latency if isinstance(subject, Task) else None
-    past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
     shares = share_of(trials), share_of(compare)
     trials, copies = counted_once(shares[0].trials)
@@ -169,15 +165,15 @@ def diagnose(
     copies += more
     exact = bool(copies) and not (scattered(trials) or scattered(compare))
     first = sum(trial.known_steps >= 2 for trial in trials)
-    group = len(trials) if compare else None
-    looked = sound_trials(subject, [*trials, *compare], options.hidden, group, options.one_message)
-    trials, model = looked.trials, with_measured_filters(model, looked.findings)
-    data = prepare(model, trials, latency, past, options.hidden)
-    filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
-    moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
-    between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
-    early = options.interpolated_s
-    data = replace(data, filters=filters, between=frozenset(between), interpolated_s=early)
+    data, looked = sound_data(
+        subject,
+        [*trials, *compare],
+        hidden=options.hidden,
+        one_message=options.one_message,
+        first=len(trials) if compare else None,
+        interpolated_s=options.interpolated_s,
+    )
+    trials, model = looked.trials, data.model
     known = limits(data, looked.left_out)
     told = filter(None, [share.sentence for share in shares])
     known = replace(known, sentences=(*known.sentences, *copies, *told))
@@ -231,20 +227,18 @@ def diagnose(
     with np.errstate(all="ignore"), interruptible(found_so_far), running(engine, copied=copied):
         try:
             tick("predict")
-            decision, left_out = decide(search, ruler), set[str]()
+            decision, restarts = decide(search, ruler), len(candidates) > PAIR
             while decision.gap or options.max_effects:
-                leader, before = decision.leader, decision.fit
-                again = decision.gap and leader and not left_out and len(candidates) > PAIR
-                size = len(before.hypothesis.names)
+                before, size = decision.fit, len(decision.fit.hypothesis.names)
+                again = bool(restarts and decision.gap and decision.leader)
                 other = decision.gap and 0 < size < most and before is not search.of_size(size)[0]
-                more = most < limit and (options.max_effects or size >= most)
-                if not (again or other or more):
+                if not (again or other or (most < limit and (options.max_effects or size >= most))):
                     break
                 tick.beside = "one more effect; Ctrl-C keeps what was found"
                 tick("more effects")
                 if again:
-                    left_out.add(leader)
-                    regrown(search, leader, max(size, PAIR))
+                    restarts = False
+                    regrown(search, decision.leader, max(size, PAIR))
                 elif other:
                     grown(search, before, size + 1)
                 else:

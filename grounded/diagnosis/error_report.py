@@ -287,6 +287,11 @@ class Identifiable(Document):
     jointly: bool = field(metadata=BRIEF, default=False)
 
     @property
+    def known(self) -> bool:
+        """Whether the trials identify it, if only weakly."""
+        return self.verdict != "not identifiable"
+
+    @property
     def lost(self) -> bool:
         """Whether its calibrated value is not known, not even together with the others."""
         return self.verdict == "not identifiable" and not self.jointly

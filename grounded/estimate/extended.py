@@ -2,9 +2,7 @@
 
     x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - h(x^-_t),      H = h_x(x^-_t)
 
-The linear equations are those of `grounded.filter.kalman`. The derivative of the whitened
-innovations by parameters theta of the model follows the same recursion, driven by f_theta, so a fit
-is a least-squares problem in the innovations (`sensitivity`).
+The linear equations are those of `grounded.filter.kalman`.
 
 A pass either runs step by step (`recursion`), linearising at each state that it reaches, or it
 iterates to the same result: the model is evaluated along a whole track in one call, the linear
@@ -19,7 +17,7 @@ Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -51,7 +49,6 @@ class Track:
     """The estimated states of a pass, from which another pass may start."""
 
     x: Array  # (T + 1, B, n) filtered
-    std: Array  # (T + 1, B, n) of x
     x_prior: Array  # (T + 1, B, n) predicted
 
 
@@ -61,7 +58,6 @@ class Filtered(Track):
 
     e: Array  # (T + 1, B, ny) innovations, zero where not seen
     eps: Array  # (T + 1, B, ny) the same whitened
-    more: Array  # (T, B, n) variance added to the process noise, see `steps`
     gains: Gains  # of T + 1 steps, the first an identity step; with covariances
     loglik: float
     status: str = "filtered"
@@ -98,15 +94,12 @@ def filter_batch(
     (T, B), n = batch.dt.shape, batch.start.shape[1]
     if T > 0 and kernels.available(measurement.ny, n):
         if about is not None and about.x.shape == (T + 1, B, n):
-            start = about.x[:-1], about.std[:-1], about.x_prior
+            start = about.x[:-1], about.x_prior
         elif measurement.states == tuple(range(n)) and batch.seen[1:].all():
             x = np.concatenate([batch.start[None], batch.y[1:]])
-            start = x[:-1], np.broadcast_to(noise.measurement, x[:-1].shape), x
+            start = x[:-1], x
         else:
-            first = recursion(batch, measurement, noise, replace(steps, wide=False).at)
-            if not steps.wide or not np.isfinite(first.loglik):
-                return first
-            start = first.x[:-1], first.std[:-1], first.x_prior
+            return recursion(batch, measurement, noise, steps.at)
         found = _sweeps(batch, measurement, noise, steps, *start)
         if found is not None:
             return found
@@ -119,22 +112,21 @@ def _sweeps(
     noise: NoiseStd,
     steps: ModelSteps,
     track: Array,
-    std: Array,
     xbar: Array,
 ) -> Filtered | None:
-    """Iterate to the fixed point from a track, its std (T, B, n) and predictions (T + 1, B, n).
+    """Iterate to the fixed point from a track (T, B, n) and predictions (T + 1, B, n).
 
     Returns None if it is not found.
     """
     last = -np.inf
     with np.errstate(all="ignore"):
         for sweep in range(SWEEPS):
-            f, A, more = steps.along(track, std)
+            f, A = steps.along(track)
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
             direct = measurement.states == tuple(range(track.shape[-1]))
-            done = _about(batch, noise, (f, A, more), (H, e0, direct), track, xbar)
+            done = _about(batch, noise, (f, A), (H, e0, direct), track, xbar)
             if done is None:
                 return None
             assert done.gains.P is not None
@@ -142,19 +134,18 @@ def _sweeps(
             moved = max(
                 float(np.max(np.abs(done.x[:-1] - track) / wide[:-1])),
                 float(np.max(np.abs(done.x_prior - xbar) / wide)),
-                float(np.max(np.abs(done.std[:-1] - std) / wide[:-1])) if steps.wide else 0.0,
             )
             settled = abs(done.loglik - last) < (STILL if sweep < SWEEPS - 1 else ENOUGH)
             if moved < CLOSE or settled:
                 return done
-            track, std, xbar, last = done.x[:-1], done.std[:-1], done.x_prior, done.loglik
+            track, xbar, last = done.x[:-1], done.x_prior, done.loglik
     return None
 
 
 def _about(
     batch: RecordBatch,
     noise: NoiseStd,
-    step: tuple[Array, Array, Array],
+    step: tuple[Array, Array],
     seen: tuple[Array, Array, bool],
     track: Array,
     xbar: Array,
@@ -164,14 +155,14 @@ def _about(
     `direct`, the last item of `seen`, says whether channel i measures state i. Returns None if the
     result is not finite.
     """
-    (f, A, more), (H, e0, direct) = step, seen
+    (f, A), (H, e0, direct) = step, seen
     d = np.empty_like(xbar)
     d[0] = batch.start - xbar[0]
     d[1:] = f + (A @ (xbar[:-1] - track)[..., None])[..., 0] - xbar[1:]
     still = np.broadcast_to(np.eye(A.shape[-1]), A[:1].shape)
     try:
         A = np.concatenate([still, A])
-        system = _system(batch, noise, A, more, None if direct else H)
+        system = _system(batch, noise, A, None if direct else H)
         g = gains(system, covariances=True)
     except np.linalg.LinAlgError:
         return None
@@ -184,19 +175,15 @@ def _about(
     x_prior = np.empty_like(x)
     x_prior[0], x_prior[1:] = batch.start, f + (A[1:] @ (x[:-1] - track)[..., None])[..., 0]
     e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
-    assert g.P is not None
-    variance = np.einsum("tbii->tbi", g.P) - np.sum(g.k**2, axis=2)
-    return Filtered(x, np.sqrt(np.maximum(variance, 0.0)), x_prior, e, eps, more, g, loglik)
+    return Filtered(x, x_prior, e, eps, g, loglik)
 
 
-def _system(
-    batch: RecordBatch, noise: NoiseStd, A: Array, more: Array, H: Array | None
-) -> LinearSystem:
+def _system(batch: RecordBatch, noise: NoiseStd, A: Array, H: Array | None) -> LinearSystem:
     """Return the linear system with Jacobians A (T + 1, B, n, n), the first an identity step."""
     R, seen = noise.measurement**2, np.zeros((len(A) + 1, *batch.seen.shape[1:]))
     seen[1:] = batch.seen
     Q = np.zeros(A.shape[:-1])
-    Q[1:] = _durations(batch)[..., None] * (noise.process**2 / noise.dt) + more
+    Q[1:] = _durations(batch)[..., None] * (noise.process**2 / noise.dt)
     channel = batch.start_channel
     start = batch.start_var + np.where(channel >= 0, R[np.maximum(channel, 0)], 0.0)
     return LinearSystem(A, Q, np.where(seen > 0, R, 1.0), seen, start, H=H)
@@ -239,7 +226,7 @@ def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gain
         numpy.linalg.LinAlgError: if a covariance is not finite.
     """
     system = about.gains.system
-    g = gains(_system(batch, noise, system.A, about.more, system.H))
+    g = gains(_system(batch, noise, system.A, system.H))
     eps = innovations(g, *about.columns)[0][..., 0]
     return g, eps, likelihood(g, eps, batch)
 
@@ -249,11 +236,11 @@ def recursion(
 ) -> Filtered:
     """Filter a batch step by step, linearising at each state that is reached."""
     T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny
-    A, more, H = np.zeros((T + 1, B, n, n)), np.zeros((T, B, n)), np.zeros((T + 1, B, ny, n))
+    A, H = np.zeros((T + 1, B, n, n)), np.zeros((T + 1, B, ny, n))
     A[0] = np.eye(n)
-    system = _system(batch, noise, A, more, H)
+    system = _system(batch, noise, A, H)
     k, weight, P = np.zeros_like(H), np.zeros((T + 1, B, ny)), np.zeros_like(A)
-    e, eps, x, std, x_prior = (np.zeros((T + 1, B, size)) for size in (ny, ny, n, n, n))
+    e, eps, x, x_prior = (np.zeros((T + 1, B, size)) for size in (ny, ny, n, n))
     g, status, t = Gains(system, k, weight, P), "filtered", 0
     x_prior[0], P[0] = batch.start, system.start[..., None] * np.eye(n)
     with np.errstate(all="ignore"):
@@ -267,36 +254,16 @@ def recursion(
                 weight[t] = np.einsum("bii->bi", W) * seen
                 eps[t] = (W @ e[t][..., None])[..., 0]
                 x[t] = x_prior[t] + (k[t].swapaxes(1, 2) @ eps[t][..., None])[..., 0]
-                std[t] = np.sqrt(np.einsum("bii->bi", after))
                 if t == T:
                     break
-                x_prior[t + 1], A[t + 1], more[t] = advance(t, x[t], std[t])
+                x_prior[t + 1], A[t + 1] = advance(t, x[t])
                 if not (np.isfinite(x_prior[t + 1]).all() and np.isfinite(A[t + 1]).all()):
                     raise np.linalg.LinAlgError
-                P[t + 1] = predicted(after, A[t + 1], system.Q[t + 1] + more[t])
+                P[t + 1] = predicted(after, A[t + 1], system.Q[t + 1])
         except np.linalg.LinAlgError:
             status = f"the filter diverged to non-finite numbers at step {t + 1}"
         loglik = likelihood(g, eps, batch) if status == "filtered" else -np.inf
-    system.Q[1:] += more
-    return Filtered(x, std, x_prior, e, eps, more, g, loglik, status)
-
-
-def sensitivity(filtered: Filtered, f_theta: Array) -> Array:
-    """Return the derivative of the whitened innovations by parameters theta of the model.
-
-    Args:
-        filtered: the pass about which to linearise.
-        f_theta: derivative of the next state, (T, B, n, k).
-
-    Returns:
-        d eps / d theta, (T + 1, B, ny, k).
-    """
-    T, B, n, k = f_theta.shape
-    ny = filtered.e.shape[-1]
-    wide = whole(k, ny)
-    d, r = np.zeros((T + 1, B, n, wide)), np.zeros((T + 2, B, ny, wide))
-    d[1:, ..., :k] = f_theta
-    return innovations(filtered.gains, d, r)[0][..., :k]
+    return Filtered(x, x_prior, e, eps, g, loglik, status)
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,6 @@ def maximum_likelihood(
     start: NoiseStd,
     *,
     rounds: int = ROUNDS,
-    wide: bool = False,
     held: bool = False,
 ) -> NoiseEstimate:
     """Search for the most likely noise from `start`.
@@ -59,10 +58,9 @@ def maximum_likelihood(
         measurement: ny channels.
         start: initial noise, see `first_noise`.
         rounds: most linearisations.
-        wide: see `grounded.estimate.steps`.
         held: whether the measurement noise of `start` is known and kept.
     """
-    steps = ModelSteps(system, p, batch, wide)
+    steps = ModelSteps(system, p, batch)
     noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS, held)
     status = "converged"
     for round_ in range(rounds):

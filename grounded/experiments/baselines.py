@@ -52,7 +52,7 @@ def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
     from grounded.fit import fit
 
     whole = [trial for trial in trials if trial.finite_steps >= 3]
-    return fit(task, whole, hold_out=0.0).model if whole else task.model
+    return fit(task, whole).model if whole else task.model
 
 
 def refit_alone(case: Bench, options: SearchOptions, rounds: int = 6) -> list[Kept]:

@@ -22,12 +22,13 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.estimate import Record
-from grounded.experiments.driving import RATE, drive, markers
+from grounded.experiments.driving import RATE, drive
 from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
 from grounded.fit import fit
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
+from grounded.trial import Trial
 
 
 def first_values(
@@ -130,6 +131,17 @@ def _speed_response(
     return tau, float(np.median(fall)) if len(fall) else -1.0
 
 
+def seen_by_camera(film: Record, length: float) -> Trial:
+    """Return a film as a trial: position and heading of the rigid body through both markers."""
+    front, rear = film.measured[:, :2], film.measured[:, 2:]
+    states = np.full((film.steps + 1, car.n), np.nan)
+    heading = np.unwrap(np.arctan2(*(front - rear).T[::-1]))
+    half = 0.5 * length * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    states[:, 2:4], states[:, 4] = 0.5 * (front + rear) - half, heading
+    names = (car.state_names, car.input_names)
+    return Trial(states, film.commands, 1 / RATE, *names, start_inputs=np.zeros(car.m))
+
+
 BENCH = 0.005  # [rad] noise of a steering angle measured on the bench
 FITTED = ("a1", "b1", "a2", "b2", "a3", "a4", "tau_delta", "tau_v", "stall")
 
@@ -202,15 +214,8 @@ def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
     first = first_values(records, length, bench_angles(truth, rng))
     begin = np.full(2, first.pop("latency"))
     start = car.with_values({**first, "L": length})
-    found = fit(
-        start,
-        records,
-        FITTED,
-        latency=begin,
-        fit_latency="common",
-        measurement=markers(length),
-        rng=np.random.default_rng(seed),
-    )
+    trials = [seen_by_camera(film, length) for film in records]
+    found = fit(start, trials, FITTED, latency=begin, fit_latency="common")
     params = {}
     for name, estimate in found.params.items():
         true = latency if name == "latency" else truth.params[name].value

@@ -1,17 +1,13 @@
 """Estimate the parameters of a model from trials, with confidence intervals.
 
-    fit                parameters, latencies and thresholds by maximum likelihood
-    prediction_error   one step and a second ahead, open loop
-
-Read `parameters` first (the function `fit`), then `search` (the alternating search), `gauss_newton`
-(the optimiser), `point` (the likelihood and its derivatives), `unknowns`, `result` (values and
-intervals), `prediction`. The likelihood is that of `grounded.estimate`.
+A fit is a diagnosis without candidates: its data, its likelihood, its held-out errors and its
+notion of what trials identify are those of `grounded.diagnosis`. Read `parameters` (the function
+`fit`), then `result`.
 """
 
 from __future__ import annotations
 
-from grounded.fit.parameters import fit
-from grounded.fit.prediction import PredictionError, prediction_error
-from grounded.fit.result import Fit, FittedValue
+from grounded.fit.parameters import fit, prediction_error
+from grounded.fit.result import Fit, FittedValue, PredictionError
 
 __all__ = ["Fit", "FittedValue", "PredictionError", "fit", "prediction_error"]

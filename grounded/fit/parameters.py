@@ -1,207 +1,357 @@
-"""fit: estimate the parameters of a model from trials, by maximum likelihood of the innovations.
+"""fit: estimate the parameters of a model from trials, as a diagnosis does that has no candidates.
 
-The last quarter of the time is held out: the model before and after the fit predicts it, one step
-and a second ahead. The final values are then fitted to all of the data.
+Sensor faults are corrected (`sound_data`), the parameters are shifted under the whole of their
+priors, and what the trials do not identify stays as it was (`limits`). A delay of inputs that is
+fitted is the effect `delay`, as in a diagnosis. The errors before and after are those of the
+`ruler`: every group of trials is predicted with values from the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
+from grounded.diagnosis.hypotheses.search import (
+    CRUDE,
+    TO_THE_TOP,
+    HypothesisSearch,
+    Start,
+    undefined,
+)
+from grounded.diagnosis.likelihood.data import Data, entire
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.intervals import FAR, level
+from grounded.diagnosis.likelihood.linearise import thresholds
+from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.diagnosis.sound_data import sound_data
+from grounded.diagnosis.validation.choose import WITHIN
+from grounded.diagnosis.validation.limits import counted_once, held
+from grounded.diagnosis.validation.ruler import Ruler
+from grounded.effects import Effect, Library
+from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError, type_of
-from grounded.estimate import Measurement, NoiseStd, Record, of_states
-from grounded.estimate.record import part, records_of
-from grounded.fit.prediction import PredictionError, prediction_error
-from grounded.fit.result import Fit, least_known, report, unidentified
-from grounded.fit.search import ROUNDS, SearchEnd, data_of, first_search, search_parameters
-from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
+from grounded.errors import GroundedError, list_of, nearest, type_of
+from grounded.fit.result import Fit, Found, PredictionError, errors_of, nothing, report
 from grounded.frozen import Array
-from grounded.model import Model
+from grounded.model import Model, Param
 from grounded.progress import Stages, interruptible
-from grounded.share import Share, share_of
+from grounded.share import share_of
 from grounded.task import Task
 from grounded.trial import Trial
+
+Latency = Literal["known", "common", "each"] | Mapping[str, tuple[int, ...]]
+GRID = 21  # values of a threshold that are tried
+LEVEL = 0.05  # [nats] difference that is none
+MOST_STATES = 50  # with twice as many, 200 steps take minutes
+BOUNDS = (
+    "to fit a parameter, give bounds, Param(value, unit, low, high), or a prior, "
+    "Param(value, unit, std=s)"
+)
 
 
 @steady()
 def fit(
     model: Model | Task,
-    trials: Sequence[Trial | Record],
+    trials: Sequence[Trial],
     names: Sequence[str] | None = None,
     *,
     latency: Array | None = None,
     fit_latency: Latency = "known",
-    measurement: Measurement | None = None,
-    filters: Mapping[str, float] | None = None,
-    hold_out: float = 0.25,
-    horizon_s: float = 1.0,
-    rng: np.random.Generator | None = None,
+    hidden: Sequence[str] = (),
+    one_message: Sequence[str] = (),
+    interpolated_s: float = 0.0,
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Estimate the parameters of a model from trials, with confidence intervals.
 
     Args:
-        model: the model with start values and bounds of its n states and m inputs; a `Task` also
-            gives the latency.
-        trials: real trials, or records with separate clocks for measurements and commands.
+        model: the model with start values, bounds and priors of its n states and m inputs; a `Task`
+            also gives the latency.
+        trials: real trials of one time step; a state that no sensor shows is NaN.
         names: parameters to fit; None for all uncertain ones.
         latency: (m,) transport delay of each input [s], fixed or the start value; None for zero,
             or the task's.
         fit_latency: "known" (fixed), "common" (fit one value for all inputs), "each", or
             {name: inputs}: each of these, for the inputs with these indices.
-        measurement: what the records measure; None for the states themselves.
-        filters: time constants [s] of low-pass filters in sensors by state, as
-            `Preflight.filters`.
-        hold_out: share of the time that is held out to judge the fit.
-        horizon_s: prediction horizon on held-out time [s].
-        rng: draws the records used to estimate the noise if there are very many.
-        engine: workers for the records' likelihoods; the result does not depend on them.
+        hidden: states without a sensor whose start is known, such as memories of adopted effects.
+        one_message: states that are logged in one message, so that all or none of them are late.
+        interpolated_s: standard deviation of times [s] because the states were interpolated.
+        engine: workers of the likelihood; the result does not depend on them.
         progress: called with a line on the stage, the time taken and the time left.
 
     Returns:
         A `Fit`: values with intervals, the model with these values, and prediction errors on
-        held-out time before and after.
+        held-out trials before and after.
 
     Raises:
         Interrupted: on Ctrl-C, with the values so far.
-        GroundedError: for an unknown or constant parameter, trials that do not match the model or
-            are too short, or a model with too many states.
+        GroundedError: for an unknown or constant parameter, trials that do not match the model, are
+            too short or unusable, or a model with too many states.
     """
     if not isinstance(model, Model | Task):
         raise GroundedError(
             "fit(model, trials) takes a Model or a Task and a list of Trials, got "
             f"{type_of(model)} and {type_of(trials)}"
         )
+    logged = list_of([trials] if isinstance(trials, Trial) else trials, Trial, "trials")
     if isinstance(names, str) or not isinstance(names, Sequence | None):
         raise GroundedError(f"names must be a list of parameters, got {names!r:.60}")
-    if isinstance(model, Task):
-        latency = model.latency if latency is None else latency
-        model = model.model
-    if model.n > MOST_STATES:
+    given = model.model if isinstance(model, Task) else model
+    if given.n > MOST_STATES:
         raise GroundedError(
-            f"model '{model.name}' has {model.n} states; a fit filters the trials with at most "
+            f"model '{given.name}' has {given.n} states; a fit filters the trials with at most "
             f"{MOST_STATES}, since a step costs their cube: fit the parameters in a model of the "
             "part that they belong to, and copy them into this one"
         )
-    delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
-    measurement = of_states(model) if measurement is None else measurement
-    logged: Any = [trials] if isinstance(trials, Trial) else trials
-    whole = isinstance(logged, Sequence) and all(isinstance(trial, Trial) for trial in logged)
-    share = share_of(logged) if whole else Share(logged, "")
-    records, given = records_of(model, share.trials), model
-    if filters:
-        from grounded.fit.filtered import behind_filters
-
-        model, records, measurement = behind_filters(model, records, measurement, filters)
-    unknowns = unknowns_of(model, names, delay, fit_latency)
-    if max(r.steps for r in records) < 3:
+    delayed = _delayed(given, fit_latency)
+    asked = _asked(given, names, bool(delayed))
+    if max((trial.known_steps for trial in logged), default=0) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
-    rng = np.random.default_rng(0) if rng is None else rng
-    asked, tick = unknowns, Stages(progress, _done)
-    tied: dict[str, list[str]] = {}  # of what is held, those that are identified since
-    before: list[str] = []
-    copied = model.system.how != "differenced"
-    with interruptible(lambda: tick.so_far), running(engine, copied=copied):
-        while True:
-            found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
-            if tied:
-                tied[[*tied][-1]] += [n for n in before if n not in unidentified(found.params)]
-            least = least_known(model, found)
-            if least is None or unknowns.k == 1:
-                return _of(found.beside(asked, tied).of_share(share.sentence), given)
-            before = [name for name in unidentified(found.params) if name != least]
-            tied[least] = []
-            unknowns = unknowns.less(unknowns.names.index(least))
+    # the data of a diagnosis; what is not asked for is constant
+    share, tick = share_of(logged), Stages(progress, _done)
+    tick("instruments")
+    data, looked = sound_data(
+        model,
+        counted_once(share.trials)[0],
+        hidden=hidden,
+        one_message=one_message,
+        interpolated_s=interpolated_s,
+    )
+    late = data.latency.copy() if latency is None else np.array(latency, float)
+    for inputs in delayed.values():
+        late[list(inputs)] = late[inputs[0]]
+    kept = asked if names is not None else {n for n in asked if data.model.params[n].uncertain}
+    data = replace(data, model=_only(given, kept), latency=late)
+    with (
+        np.errstate(all="ignore"),
+        interruptible(lambda: tick.so_far),
+        running(engine, copied=not simulated(given)),
+    ):
+        found = _identified(data, delayed, tick)
+        if isinstance(found, GroundedError):
+            return nothing(given, data, asked, delayed, found)
+        tick("predict")
+        return report(given, asked, found, looked.findings).of_share(share.sentence)
 
 
-def _of(found: Fit, model: Model) -> Fit:
-    """Return the fit for the original model, without the states added for filtered sensors."""
-    if found.model.n == model.n:
-        return found
-    values = {name: found.model.params[name].value for name in model.param_names}
-    return replace(found, model=model.with_values(values))
+def prediction_error(
+    model: Model | Task, trials: Sequence[Trial], *, hidden: Sequence[str] = ()
+) -> PredictionError:
+    """Return the open-loop prediction errors of a model on trials, as it is.
+
+    Args:
+        model: n states, m inputs; a `Task` also gives the latency.
+        trials: real trials.
+        hidden: states without a sensor whose start is known.
+
+    Raises:
+        GroundedError: if a trial does not match the model, or the model is not finite there.
+    """
+    with np.errstate(all="ignore"):
+        search = HypothesisSearch(sound_data(model, trials, hidden=hidden)[0], ())
+        found = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
+        if not found:
+            raise undefined(search.predictor)
+        return errors_of(Ruler(search.predictor), found[0])
 
 
-CLIMBS = 0.8  # share of a fit that its rounds take
+class Alone(HypothesisSearch):
+    """The search of a fit: of effects it has the delays that are asked for, which cost nothing."""
+
+    def paid(self, h: Hypothesis) -> float:
+        """Return the price of all effects of a hypothesis [nats]."""
+        return 0.0
+
+
+def _identified(
+    data: Data, delayed: Mapping[str, tuple[int, ...]], tick: Stages
+) -> Found | GroundedError:
+    """Search, holding one after the other what the trials do not identify."""
+    given = data.model
+    while True:
+        late = [_delay(data, inputs) for inputs in delayed.values()]
+        search = Alone(data, late, tick)
+        found = _searched(search, late, tick)
+        if found is None:
+            return undefined(search.predictor)
+        model = held(search.predictor, found, less_noise=1.0)
+        if model is not data.model:
+            data = replace(data, model=model)
+            continue
+        search, best, crude = _with_all(search, found, late, tick)
+        free = Predictor(replace(search.data, model=given))
+        done = Found(search, _centred(search, best), crude, free, delayed)
+        # trials that disagree, or a model that is wrong, may show less than the information says
+        lost = [n for n in done.told if n in data.model.uncertain and not done.told[n].known]
+        if not lost:
+            return done
+        params = data.model.params
+        surest = min(lost, key=lambda n: params[n].spread / max(abs(params[n].value), 1e-9))
+        data = replace(data, model=_only(data.model, {*data.model.uncertain} - {surest}))
+
+
+def _searched(search: Alone, late: Sequence[Effect], tick: Stages) -> Fitted | None:
+    """Return the likeliest fit with all unknowns free; None if the model is nowhere finite."""
+    data = search.data
+    many = bool(len(calibrated(data)))
+    h = Hypothesis(shift=np.zeros(data.model.system.k), spread=CRUDE) if many else Hypothesis()
+    for effect in late:
+        h = h.plus(effect, {"d": 0.0})
+    crude = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
+    starts: list[Start] = [search.fresh(h), *((h, one.noise, one.track) for one in crude)]
+    found = search.refined(starts, TO_THE_TOP)
+    if not found:
+        return None
+    best = max(found, key=search.score)
+    _tell(tick, best, data)
+    for j, grid in _far_off(search, best):
+        tried = [(_at(best, data, j, value), best.noise, best.track) for value in grid]
+        best = max(search.refined([best, *tried], TO_THE_TOP, rivals=True), key=search.score)
+    if crude:
+        search.structures(search.exact_null())
+    search.structures(best)
+    free = [f for f in search.fits.values() if f.hypothesis.names == h.names]
+    best = _supported(search, [f for f in free if f.hypothesis.spread == h.spread])
+    search.settled([best])
+    return search.latest(best)
+
+
+def _supported(search: Alone, fits: Sequence[Fitted]) -> Fitted:
+    """Return the likeliest of the fits that predict held-out trials as well as any (`choose`).
+
+    They differ in their noise. Coloured noise can absorb what a model lacks, and with it what the
+    parameters should explain: it is likelier, and predicts worse.
+    """
+    ruler = Ruler(search.predictor)
+    if not ruler.held_out or len(fits) == 1:
+        return max(fits, key=search.score)
+    best = max(fits, key=ruler.score)
+    near = [f for f in fits if (gain := ruler.gain(f, best)).mean <= WITHIN * gain.scatter]
+    return max(near or [best], key=search.score)
+
+
+def _with_all(
+    search: Alone, fit: Fitted, late: Sequence[Effect], tick: Stages
+) -> tuple[Alone, Fitted, Fitted | None]:
+    """Return the fit and that of the model as given, under its noise, on all runs."""
+    few, more, own = search.data, entire(search.data), fit.noise.structure
+    crude = search.fits.get((own, 0.0, ())) or search.fits.get((Structure(), 0.0, ()))
+    if more is few:
+        return search, fit, crude
+    tick("fit", f" to all {more.steps} steps")
+    every = Alone(more, late, tick)
+    found = [
+        every.refined([(one.hypothesis, one.noise, every.fresh(one.hypothesis)[2])], TO_THE_TOP)
+        for one in (fit, crude)
+        if one is not None
+    ]
+    if not found[0]:
+        return search, fit, crude
+    return every, found[0][0], found[1][0] if found[1:] and found[1] else None
+
+
+def _far_off(search: Alone, fit: Fitted) -> list[tuple[int, Array]]:
+    """Return the unknowns towards which the likelihood does not rise from afar, with a grid each.
+
+    These are delays and thresholds, in the units of `moved`.
+    """
+    data, effects = search.data, fit.hypothesis.effects
+    found = [(k, np.array(effect.free[0].grid)) for k, effect in enumerate(effects)]
+    for j in thresholds(search.predictor, fit):
+        i = calibrated(data)[j - len(effects)]
+        ends = np.array([*data.model.params.values()][i].reach) - data.model.values[i]
+        low, high = np.clip(ends / param_scale(data.model)[i], -FAR, FAR).tolist()
+        found.append((j, np.linspace(low, high, GRID)))
+    return found
+
+
+def _at(fit: Fitted, data: Data, j: int, value: float) -> Hypothesis:
+    """Return a fit's hypothesis with another value of unknown j."""
+    h, which = fit.hypothesis, calibrated(data)
+    shift = np.zeros(0) if h.shift is None else h.shift[which] / param_scale(data.model)[which]
+    now = np.concatenate([h.theta, shift])
+    return moved(data, h, np.where(np.arange(len(now)) == j, value - now, 0.0))
+
+
+def _centred(search: Alone, fit: Fitted) -> Fitted:
+    """Return a fit with each threshold amid the values that are as likely: no sample is there."""
+    for j in thresholds(search.predictor, fit):
+        move = sum(level(search.predictor, fit, j, LEVEL)) / 2
+        unit = np.arange(fit.gram.shape[-1]) == j
+        start = (moved(search.data, fit.hypothesis, move * unit), fit.noise, fit.track)
+        (there,) = refine(search.predictor, [start], iterations=1, fixed_noise=True) or [fit]
+        if there.peak > fit.peak - LEVEL:
+            fit = replace(there, settled=fit.settled, fine=fit.fine)
+    return fit
+
+
+def _tell(tick: Stages, fit: Fitted, data: Data) -> None:
+    """Report a stage, and set the text for an interruption."""
+    shift = fit.hypothesis.shift
+    values = data.model.values if shift is None else data.model.values + shift
+    told = ", ".join(
+        f"{name} = {value:.5g} {param.unit}"
+        for (name, param), value in zip(data.model.params.items(), values, strict=True)
+        if param.uncertain
+    )
+    tick.so_far = f"so far, not converged yet: {told}"
+    tick(f"fit, {data.steps} steps")
 
 
 def _done(stage: str, time: int) -> float:
-    """Return the least share of a fit that is done when a stage begins for the k-th time."""
-    return CLIMBS * min(time - 1, ROUNDS) / ROUNDS if stage.startswith("fit") else 0.0
+    return 0.0  # how long a fit takes is not known
 
 
-MOST_STATES = 50  # with twice as many, 200 steps take minutes
+def _delay(data: Data, inputs: Sequence[int]) -> Effect:
+    """Return the effect that changes the delay of some inputs, which is the same for all."""
+    name = "delay:" + "+".join(data.model.input_names[j] for j in inputs)
+    known = float(data.latency[inputs[0]])
+    return delay_again(Library().effect(name, data.model, data.scales), known, known)
 
 
-def _fitted(
-    model: Model,
-    records: Sequence[Record],
-    measurement: Measurement,
-    unknowns: Unknowns,
-    hold_out: float,
-    horizon_s: float,
-    rng: np.random.Generator,
-    tick: Stages,
-) -> Fit:
-    """Search on a part of the time, judge on the rest, then fit the values to all of it."""
-    train, test = split_in_time(records, hold_out, horizon_s, measurement)
-    first = first_search(data_of(model, train, measurement, unknowns), rng, tick)
-    before, after, last = None, None, first
-    whole = data_of(model, records, measurement, unknowns)
-    if first.data.steps < whole.steps and np.isfinite(first.climb.at.loglik):
-        if test:
-            before, after = judged(model, test, measurement, unknowns, first, horizon_s)
-        last = search_parameters(whole, first.climb.at.theta, first.noise, rng, tick)
-    return report(model, unknowns, last, before, after)
+def _delayed(model: Model, fit_latency: Latency) -> dict[str, tuple[int, ...]]:
+    """Return the inputs of each delay that is fitted, by its name."""
+    choices: dict[str, dict[str, tuple[int, ...]]] = {
+        "known": {},
+        "common": {"latency": tuple(range(model.m))},
+        "each": {f"latency:{name}": (j,) for j, name in enumerate(model.input_names)},
+    }
+    if not isinstance(fit_latency, str):
+        return dict(fit_latency)
+    if fit_latency not in choices:
+        raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
+    return choices[fit_latency]
 
 
-def split_in_time(
-    records: Sequence[Record], share: float, horizon_s: float, measurement: Measurement
-) -> tuple[list[Record], list[Record]]:
-    """Split records into a training and a held-out part.
+def _asked(model: Model, names: Sequence[str] | None, more: bool) -> tuple[str, ...]:
+    """Return the names of the parameters to fit.
 
-    Long records are split in time. Short ones, and those whose state is not fully measured, are
-    kept whole, and some of them are held out.
+    Raises:
+        GroundedError: for a name that is not an uncertain parameter, or nothing to fit.
     """
-    train, test = [], []
-    if any(i < 0 for i in measurement.states):
-        horizon_s = np.inf
-    long = [r for r in records if share * (r.times[-1] - r.times[0]) > 1.5 * horizon_s]
-    if share > 0 and len(long) * 2 >= len(records):
-        for record in records:
-            edge = round((1 - share) * record.steps)
-            train.append(part(record, 0, edge) if record in long else record)
-            if record in long:
-                test.append(part(record, edge, record.steps))
-        return train, test
-    every = round(1 / share) if share > 0 else 0
-    if every and len(records) >= every:
-        test = list(records[every - 1 :: every])
-        return [r for r in records if r not in test], test
-    return list(records), []
+    chosen = model.uncertain if names is None else tuple(names)
+    for name in chosen:
+        if name not in model.params:
+            raise GroundedError(
+                f"'{name}' is not a parameter of model '{model.name}': "
+                + nearest(name, model.params)
+            )
+        if not model.params[name].uncertain:
+            raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
+    if not chosen and not more:
+        raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
+    return chosen
 
 
-def judged(
-    model: Model,
-    test: Sequence[Record],
-    measurement: Measurement,
-    unknowns: Unknowns,
-    found: SearchEnd,
-    horizon_s: float,
-) -> tuple[PredictionError, PredictionError]:
-    """Return held-out prediction errors of the model before and after, each with its own noise."""
-
-    def error(theta: Array, noise: NoiseStd) -> PredictionError:
-        p, latency = unknowns.unpack(theta)
-        there = model.with_values(dict(zip(model.param_names, p.tolist(), strict=True)))
-        return prediction_error(
-            there, test, horizon_s, latency=latency, measurement=measurement, noise=noise
-        )
-
-    return error(unknowns.start, found.start_noise), error(found.climb.at.theta, found.noise)
+def _only(model: Model, kept: Collection[str]) -> Model:
+    """Return the model with all parameters constant but some."""
+    params = {n: p if n in kept else Param(p.value, p.unit) for n, p in model.params.items()}
+    return replace(model, params=params)

@@ -1,34 +1,43 @@
-"""The result of a fit: values with intervals, and a sentence that says how it ended.
-
-The covariance of the unknowns is estimated in two ways:
-
-    information I = W'W,            covariance I^-1                 (noise as modelled)
-    sandwich    I^-1 (sum_b g_b g_b') I^-1,   g_b = W_b' eps_b      (blocks b of time)
-
-The sandwich does not assume that innovations are independent within a block. The larger of the two
-is reported. If I is zero in a direction, the data do not identify it, and the unknowns that take
-part in it have an infinite standard deviation. An unknown at a bound is held there.
-Source: White, Estimation, Inference and Specification Analysis (1994); Newey & West (1987).
-"""
+"""The result of a fit: values with intervals, and a sentence that says how it ended."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from grounded.estimate import NoiseStd
-from grounded.fit.point import Linear
-from grounded.fit.prediction import PredictionError
-from grounded.fit.search import SearchEnd, likelihood_interval, quiet
-from grounded.fit.unknowns import Unknowns
+from grounded.accounts.finding import Finding
+from grounded.diagnosis.error_report import Identifiable
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.intervals import standard_deviations
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.parts import Estimate
+from grounded.diagnosis.validation.choose import CLAIM, SCATTERS
+from grounded.diagnosis.validation.gain import LEAST, Gain
+from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
+from grounded.diagnosis.validation.ruler import Ruler
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, document, listed
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionError:
+    """Root mean square errors per channel; NaN for a channel never seen at a window's end."""
+
+    names: tuple[str, ...]
+    one_step: Array  # (ny,) in the channels' units
+    ahead: Array  # (ny,) after `horizon_s`
+    horizon_s: float  # [s]
+    windows: int  # number of windows of `horizon_s`
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,55 +69,20 @@ class Fit(Result):
     params: Mapping[str, FittedValue]
     model: Model  # the model with the fitted values
     latency: Array  # (m,) [s]
-    noise: NoiseStd
-    loglik: float
-    status: str  # converged, still rising, or why it stopped
+    loglik: float  # minus infinity if nothing was fitted
+    status: str  # converged, or why it stopped
     sentence: str
-    before: PredictionError | None  # on held-out time; None if there was too little data for that
-    after: PredictionError | None
     samples: int
-    covariance: Array = field(repr=False)  # (k, k), in the order of params
+    nats: float = 0.0  # log evidence over the values as given
+    before: PredictionError | None = None  # of held-out trials; None if none could be held out
+    after: PredictionError | None = None
+    gain: Gain | None = None  # of the held-out errors, and the same the other way round
+    loss: Gain | None = None
+    preflight: tuple[Finding, ...] = ()  # findings about the sensors
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)  # (k, k)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
-
-    def beside(self, asked: Unknowns, tied: Mapping[str, Sequence[str]]) -> Fit:
-        """Return the fit with the unknowns added that were held because they are unidentified.
-
-        Args:
-            asked: all unknowns.
-            tied: of each held one, those that the data tell once it is held.
-        """
-        lost = [i for i, name in enumerate(asked.names) if name not in self.params]
-        if not lost:
-            return self
-        params, covariance = dict(self.params), np.zeros((asked.k, asked.k))
-        kept = np.delete(np.arange(asked.k), lost)
-        covariance[np.ix_(kept, kept)] = self.covariance
-        for i in lost:
-            start, low, high = (float(a[i]) for a in (asked.start, asked.low, asked.high))
-            params[asked.names[i]] = FittedValue(
-                start, np.inf, low, high, asked.units[i], False, start
-            )
-        for held, others in tied.items():
-            for name in others:
-                both = (*params[name].only_with, held)
-                params[name] = replace(params[name], only_with=both)
-        alone = [asked.names[i] for i in lost if not tied.get(asked.names[i])]
-        sentence = self.sentence
-        if alone:
-            sentence += f"; the data do not identify {', '.join(alone)}, held as before"
-        for held in (name for name, others in tied.items() if others):
-            sentence += (
-                f"; the data tell only combinations of {listed([held, *tied[held]])}: {held} is "
-                "held as before, and what is fitted of the others is right only if that is"
-            )
-        return replace(
-            self,
-            params={name: params[name] for name in asked.names},
-            covariance=covariance,
-            sentence=sentence,
-        )
 
     def of_share(self, sentence: str) -> Fit:
         """Return the fit with a sentence added on which share of the trials it used; "": all."""
@@ -116,11 +90,16 @@ class Fit(Result):
 
     @property
     def helps(self) -> bool:
-        """Whether held-out time is predicted better by more than TIE.
+        """Whether the values are likelier and predict held-out trials better (`choose`)."""
+        better = self.gain is None or (self.gain.pays(SCATTERS) and not self.gain.ruins)
+        return self.nats >= CLAIM and better
 
-        True if none was held out; False if nothing could be fitted.
-        """
-        return bool(np.isfinite(self.loglik)) and _change(self.before, self.after) < -TIE
+    @property
+    def worse(self) -> bool:
+        """Whether held-out trials are predicted worse than before, by as much as matters."""
+        if self.gain is None or self.loss is None:
+            return False
+        return (self.loss.pays(SCATTERS) and self.loss.mean > LEAST) or self.gain.ruins
 
     @property
     def at_bounds(self) -> tuple[str, ...]:
@@ -130,11 +109,6 @@ class Fit(Result):
         """
         known = {n: e for n, e in self.params.items() if e.identified and n in self.model.params}
         return tuple(n for n, e in known.items() if self.model.params[n].at_bound(e.value))
-
-    @property
-    def worse(self) -> bool:
-        """Whether held-out time is predicted worse than before by more than TIE."""
-        return _change(self.before, self.after) > TIE
 
     def summary(self) -> str:
         """Return the status and the values with their standard deviations."""
@@ -161,226 +135,162 @@ class Fit(Result):
         return found
 
 
-def unidentified(params: Mapping[str, FittedValue]) -> list[str]:
-    """Return the names of the unknowns that the data do not tell."""
-    return [name for name, e in params.items() if not e.identified]
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search found, with the parameters held that the trials do not identify."""
+
+    search: HypothesisSearch
+    best: Fitted
+    crude: Fitted | None  # with the values as given; None if it is not finite
+    free: Predictor  # with all parameters free that were asked for
+    delayed: Mapping[str, tuple[int, ...]]  # the inputs of each fitted delay
+
+    @cached_property
+    def scales(self) -> Array:
+        """The unit of each unknown: of delays, then of the parameters' shifts, (C,)."""
+        data, h = self.search.data, self.best.hypothesis
+        shifts = param_scale(data.model)[calibrated(data)] if h.spread else np.zeros(0)
+        return np.concatenate([np.ones(len(h.theta)), shifts])
+
+    @cached_property
+    def sure(self) -> tuple[Array, Array]:
+        """The standard deviation and half-width of the interval of each unknown, (C,) each."""
+        search, folds = self.search, self.search.data.folds
+        found = standard_deviations(search.predictor, self.best, folds, search.tempering.factor)
+        return self.scales * found[0], self.scales * found[1]
+
+    @cached_property
+    def at(self) -> dict[str, int]:
+        """Where each delay and each parameter that was fitted is among the unknowns."""
+        data, h = self.search.data, self.best.hypothesis
+        names = [data.model.param_names[i] for i in calibrated(data)] if h.spread else []
+        return {name: k for k, name in enumerate((*self.delayed, *names))}
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """The value of every parameter of the model."""
+        model, shift = self.search.data.model, self.best.hypothesis.shift
+        values = model.values + (0.0 if shift is None else shift)
+        return dict(zip(model.param_names, values.tolist(), strict=True))
+
+    @cached_property
+    def told(self) -> dict[str, Identifiable]:
+        """How well the trials identify each parameter that was asked for."""
+        known = {
+            name: Estimate(self.values[name], float(self.sure[0][k]))
+            for name, k in self.at.items()
+            if name in self.values
+        }
+        return {one.parameter: one for one in identifiable(self.free, self.best, known)}
 
 
-def least_known(model: Model, found: Fit) -> str | None:
-    """Return the unidentified unknown with the narrowest relative prior; None if there is none."""
-    if not np.isfinite(found.loglik):
-        return None
-
-    def sure(name: str) -> float:
-        param = model.params.get(name)
-        return 0.0 if param is None else param.spread / max(abs(param.value), 1e-9)
-
-    lost = unidentified(found.params)
-    return min(lost, key=sure) if lost else None
+def errors_of(ruler: Ruler, fit: Fitted) -> PredictionError:
+    """Return the held-out errors of a fit one step and, at most, a second ahead."""
+    found, last = ruler.errors(fit), len(ruler.steps) - 1
+    rms = found.rms[:, ruler.shown]
+    windows = int(found.count[last].max(axis=-1).sum())
+    names, horizon = tuple(ruler.names), ruler.steps[-1] * ruler.data.dt
+    return PredictionError(names, rms[0], rms[last], horizon, windows)
 
 
 def report(
     model: Model,
-    unknowns: Unknowns,
-    last: SearchEnd,
-    before: PredictionError | None,
-    after: PredictionError | None,
+    asked: Sequence[str],
+    found: Found,
+    findings: Sequence[Finding] = (),
 ) -> Fit:
     """Build the `Fit` of a finished search.
 
     Args:
         model: the model with start values.
-        unknowns: what was fitted.
-        last: the end of the search.
-        before: prediction error of the start model on held-out time; None if none was held out.
-        after: prediction error of the model of the first search on held-out time.
+        asked: the parameters that were to be fitted.
+        found: the end of the search.
+        findings: what the sensors show by themselves.
     """
-    at = last.climb.at
-    params, wide = _estimates(unknowns, last)
-    p, latency = unknowns.unpack(at.theta)
-    return Fit(
-        params=params,
-        model=model.with_values(dict(zip(model.param_names, p.tolist(), strict=True))),
-        latency=latency,
-        noise=last.noise,
-        loglik=at.loglik,
-        status=last.status,
-        sentence=_sentence(unknowns, params, wide, last)
-        + "; held-out time is predicted no better than before" * (_change(before, after) >= 0),
-        before=before,
-        after=after,
-        samples=at.count,
-        covariance=wide.covariance,
-    )
-
-
-TIE = 0.01  # relative change of held-out errors that is not significant
-
-
-def _change(before: PredictionError | None, after: PredictionError | None) -> float:
-    """Return the mean log ratio of errors, after over before, at the longest known horizon.
-
-    It is minus infinity if nothing was held out, and infinity if predictions diverge.
-    """
-    if before is None or after is None:
-        return -np.inf
-    far = bool(np.isfinite(before.ahead).any())
-    was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
-    told = np.isfinite(was) & (was > 0)
-    if not told.any():
-        return -np.inf
-    if not np.isfinite(now[told]).all():
-        return np.inf
-    return float(np.log(np.maximum(now[told], 1e-300) / was[told]).mean())
-
-
-def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedValue], Uncertainty]:
-    at, scanned, worth = found.climb.at, np.zeros(unknowns.k, dtype=bool), 1.0
-    if not np.isfinite(at.loglik):
-        k = unknowns.k
-        wide = Uncertainty(np.full(k, np.inf), np.zeros((k, k)), ())
-    else:
-        scanned = quiet(found.data, found.climb.slopes) | found.thresholds
-        smooth, scanned = ~scanned, scanned & np.isfinite(unknowns.scale)
-        wide = beside_bounds(found.climb.slopes, smooth, unknowns, at.theta)
-        worth = inflation(found.climb.slopes, smooth)
-    params: dict[str, FittedValue] = {}
-    for i, name in enumerate(unknowns.names):
-        value, std = float(at.theta[i]), float(wide.std[i])
-        low, high = value - 1.96 * std, value + 1.96 * std
-        if scanned[i]:
-            low, high = likelihood_interval(found.data, at, i, worth)
-            std = (high - low) / (2 * 1.96)
-        range_ = unknowns.high[i] - unknowns.low[i]
-        std = np.inf if high - low >= range_ else std
-        known = bool(np.isfinite(std) and std < range_ / FLAT)
-        low, high = max(low, float(unknowns.low[i])), min(high, float(unknowns.high[i]))
-        start = float(unknowns.start[i])
-        params[name] = FittedValue(value, std, low, high, unknowns.units[i], known, start)
-    return params, wide
-
-
-def _sentence(
-    unknowns: Unknowns, params: Mapping[str, FittedValue], wide: Uncertainty, found: SearchEnd
-) -> str:
-    if not np.isfinite(found.climb.at.loglik):
-        return f"nothing was fitted: {found.status}; check units, signs and start values"
-    parts = [found.status]
-    unknown = unidentified(params)
-    if unknown:
-        parts.append("the data do not identify " + ", ".join(unknown))
-    for group in wide.together:
-        if len(group) > 1:
-            names = ", ".join(unknowns.names[i] for i in group)
-            parts.append(f"only a combination of {names} is identified")
-    edge = _edge(unknowns, found.climb.at.theta)
-    held = [unknowns.names[i] for i in np.flatnonzero(edge) if params[unknowns.names[i]].identified]
-    if held:
-        parts.append("at a bound: " + ", ".join(held))
-    return "; ".join(parts)
-
-
-def _edge(unknowns: Unknowns, theta: Array) -> NDArray[np.bool_]:
-    """Return which unknowns (k,) ended at a bound."""
-    return np.asarray(np.isclose(theta, unknowns.low) | np.isclose(theta, unknowns.high))
-
-
-FLAT = np.sqrt(12)  # width of a uniform distribution in standard deviations
-NULL = 1e-10  # eigenvalue, relative to the largest of the scaled information, that counts as zero
-LOADING = 0.05  # component of a null direction above which an unknown takes part in it
-
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """Standard deviations (k,), infinite if not identified, and groups of tied unknowns."""
-
-    std: Array
-    covariance: Array  # (k, k) of the identified ones; zero rows elsewhere
-    together: tuple[tuple[int, ...], ...]  # groups of which only a combination is identified
-
-
-def beside_bounds(
-    slopes: Linear, free: NDArray[np.bool_], unknowns: Unknowns, theta: Array
-) -> Uncertainty:
-    """Return the uncertainty if some unknowns ended at a bound.
-
-    Those at a bound are held for the uncertainty of the others; an unknown that is only tied with
-    one of them thus counts as identified. Their own uncertainty is computed with the others free,
-    or, if the others could compensate for it, with them held.
-
-    Args:
-        slopes: derivatives at the end of a climb.
-        free: unknowns that the derivatives apply to, (k,).
-        unknowns: the unknowns with their bounds.
-        theta: values at the end of the climb, (k,).
-    """
-    edge, most = _edge(unknowns, theta), (unknowns.high - unknowns.low) / FLAT
-    found = uncertainty(slopes, free & ~edge)
-    std, covariance = found.std.copy(), found.covariance.copy()
-    for i in np.flatnonzero(free & edge & (np.diag(slopes.N) > 0)):
-        alone = np.arange(len(free)) == i
-        both = uncertainty(slopes, free & (~edge | alone)).std[i]
-        std[i] = both if both < most[i] else uncertainty(slopes, alone).std[i]
-        covariance[i, i] = std[i] ** 2
-    return replace(found, std=std, covariance=covariance)
-
-
-def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:
-    """Return the standard deviations at the end of a climb.
-
-    Args:
-        slopes: derivatives there.
-        free: unknowns that the derivatives apply to, (k,); the others get an infinite std.
-    """
-    N = slopes.N
-    k = len(N)
-    use = np.flatnonzero(free & (np.diag(N) > 0))
-    std, covariance = np.full(k, np.inf), np.zeros((k, k))
-    if len(use) == 0:
-        return Uncertainty(std, covariance, ())
-    scale = 1 / np.sqrt(np.diag(N)[use])
-    values, vectors = np.linalg.eigh(N[np.ix_(use, use)] * np.outer(scale, scale))
-    null = values < NULL * values[-1]
-    together = [
-        tuple(int(i) for i in use[np.abs(vectors[:, j]) > LOADING]) for j in np.flatnonzero(null)
+    search, best, data = found.search, found.best, found.search.data
+    params, (std, half) = dict[str, FittedValue](), found.sure
+    for name in asked:
+        param, start = model.params[name], model.params[name].value
+        (low, high), k = param.reach, found.at.get(name)
+        if k is None:
+            params[name] = FittedValue(start, np.inf, low, high, param.unit, False, start)
+            continue
+        value, e, w = found.values[name], float(std[k]), float(half[k])
+        low, high, given = max(low, value - w), min(high, value + w), (*found.told[name].given,)
+        params[name] = FittedValue(value, e, low, high, param.unit, True, start, given)
+    latency = data.latency.copy()
+    for k, (name, inputs) in enumerate(found.delayed.items()):
+        q, start = best.hypothesis.effects[k].free[0], float(data.latency[inputs[0]])
+        value, e, w = start + float(best.hypothesis.theta[k]), float(std[k]), float(half[k])
+        sure = e <= UNKNOWN * (q.high - q.low) / np.sqrt(12)
+        low = max(value - w, 0.0) if sure else 0.0
+        high = value + w if sure else start + q.high
+        params[name] = FittedValue(value, e if sure else np.inf, low, high, "s", bool(sure), start)
+        latency[list(inputs)] = value
+    # held-out errors by the ruler of the diagnosis
+    more: dict[str, Any] = {}
+    ruler = Ruler(search.predictor)
+    if found.crude is not None and ruler.held_out:
+        ruler.beside(found.crude)
+        more |= {"before": errors_of(ruler, found.crude), "after": errors_of(ruler, best)}
+        more |= {"gain": ruler.gain(found.crude, best), "loss": ruler.gain(best, found.crude)}
+    covariance, at = np.zeros((len(params), len(params))), [found.at.get(name) for name in params]
+    rows = [k for k, i in enumerate(at) if i is not None]
+    picked = [i for i in at if i is not None]
+    covariance[np.ix_(rows, rows)] = (best.covariance * np.outer(found.scales, found.scales))[
+        np.ix_(picked, picked)
     ]
-    lost = {i for group in together for i in group}
-    said = ~null
-    inverse = (vectors[:, said] / values[said]) @ vectors[:, said].T * np.outer(scale, scale)
-    inside = _larger(inverse, _meat(slopes, use))
-    covariance[np.ix_(use, use)] = inside
-    std[use] = np.sqrt(np.maximum(np.diag(inside), 0.0))
-    for i in lost:
-        std[i] = np.inf
-        covariance[i, :] = covariance[:, i] = 0.0
-    return Uncertainty(std, covariance, tuple(together))
+    status = "converged" if best.settled else "still rising"
+    made = Fit(
+        params=params,
+        model=model.with_values(found.values),
+        latency=latency,
+        loglik=best.loglik,
+        status=status,
+        sentence=status,
+        samples=int(data.seen[1:].sum()),
+        nats=np.inf if found.crude is None else search.score(best) - search.score(found.crude),
+        preflight=tuple(findings),
+        covariance=covariance,
+        **more,
+    )
+    return replace(made, sentence="; ".join(_said(made)))
 
 
-def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
-    """Return the factor by which log-likelihood differences are too large, >= 1.
-
-    It is the mean ratio of sandwich to information. If innovations are correlated (quantised
-    encoders, effects that the model lacks), log-likelihoods differ by more than they should, and
-    the drop that defines an interval must be larger (Kent, Biometrika 69, 1982).
-    """
-    use = np.flatnonzero(free & (np.diag(slopes.N) > 0))
-    if len(use) == 0:
-        return 1.0
-    N = slopes.N[np.ix_(use, use)]
-    inverse = np.linalg.pinv(N, rcond=NULL, hermitian=True)
-    each = float(np.trace(inverse @ _meat(slopes, use))) / int(np.linalg.matrix_rank(N))
-    return max(1.0, each)
-
-
-def _meat(slopes: Linear, use: NDArray[np.int64]) -> Array:
-    """Return the sum over blocks of g_b g_b', with the correction for few blocks."""
-    count, scores = len(slopes.scores), slopes.scores[:, use]
-    return np.asarray(scores.T @ scores * count / max(count - 1, 1))
+def nothing(
+    model: Model,
+    data: Data,
+    asked: Sequence[str],
+    delayed: Mapping[str, tuple[int, ...]],
+    why: GroundedError,
+) -> Fit:
+    """Return the `Fit` of a search that could not begin: all values as they were."""
+    params = {}
+    for name in asked:
+        p = model.params[name]
+        params[name] = FittedValue(p.value, np.inf, *p.reach, p.unit, False, p.value)
+    for name, inputs in delayed.items():
+        start = float(data.latency[inputs[0]])
+        params[name] = FittedValue(start, np.inf, 0.0, np.inf, "s", False, start)
+    said = f"nothing was fitted: {why}"
+    return Fit(params, model, data.latency, -np.inf, "diverged", said, int(data.seen[1:].sum()))
 
 
-def _larger(inverse: Array, meat: Array) -> Array:
-    """Return the modelled covariance, widened for each unknown to the sandwich's variance."""
-    robust = inverse @ meat @ inverse
-    ratio = np.diag(robust) / np.maximum(np.diag(inverse), 1e-300)
-    widen = np.sqrt(np.maximum(ratio, 1.0))
-    return np.asarray(inverse * np.outer(widen, widen))
+def _said(found: Fit) -> list[str]:
+    """Return the parts of the sentence: how it ended, what is not identified or at a bound."""
+    parts = [found.status]
+    lost = [name for name, e in found.params.items() if not e.identified]
+    tied = {one: [n for n, e in found.params.items() if one in e.only_with] for one in lost}
+    if alone := [name for name in lost if not tied[name]]:
+        parts.append(f"the data do not identify {', '.join(alone)}, held as before")
+    parts += [
+        f"the data tell only combinations of {listed([one, *others])}: {one} is held as before, "
+        "and what is fitted of the others is right only if that is"
+        for one, others in tied.items()
+        if others
+    ]
+    if found.at_bounds:
+        parts.append("at a bound: " + ", ".join(found.at_bounds))
+    if not found.helps:
+        parts.append("the values before are as likely, or predict held-out trials as well")
+    return parts

@@ -182,10 +182,8 @@ def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) ->
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     """Return the task's model with parameters fitted to all trials without gaps.
 
-    Sensor errors found in the trials are corrected first. The fitted values are rejected if they
-    predict held-out time worse than the model's own values.
+    The fitted values are rejected if they predict held-out trials worse than the model's own.
     """
-    from grounded.accounts.sound_trials import sound_trials
     from grounded.fit import fit
 
     names = task.model.state_names
@@ -199,8 +197,7 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
         )
         for t in whole
     ]
-    looked = sound_trials(task, lifted, memory)
-    found = fit(task, looked.trials, filters=looked.filters)
+    found = fit(task, lifted, hidden=memory)
     return task.model if found.worse else found.model
 
 

@@ -209,7 +209,7 @@ def test_a_diagnosis_stops_at_them_and_names_the_delay():
     said = str(stopped.value)
     assert holds(said, "t0001", "clocks", "[log.state.x]", "[log.state.r]", "before thrust")
     assert "t0000" not in said and stopped.value.then.arguments == ("t0001",)
-    judge_clocks(craft(), trials[:1])
+    judge_clocks(craft(), trials[:1], range(4))
 
 
 def test_short_runs_gaps_and_commands_that_never_change_tell_nothing():
@@ -232,6 +232,6 @@ def test_one_swing_of_several_that_looks_early_is_not_the_clock(monkeypatch, odd
     monkeypatch.setattr("grounded.accounts.commands.answers_early", lambda *_: next(early))
     if told:
         with pytest.raises(GroundedError, match="clocks"):
-            judge_clocks(model, trials)
+            judge_clocks(model, trials, range(2))
     else:
-        judge_clocks(model, trials)
+        judge_clocks(model, trials, range(2))

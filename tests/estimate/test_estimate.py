@@ -23,7 +23,6 @@ from grounded.estimate.extended import (
     filter_batch,
     recursion,
     relinked,
-    sensitivity,
     smooth,
     variance_slopes,
 )
@@ -136,32 +135,6 @@ def test_a_state_that_nothing_measures_is_smoothed_halfway_up_its_disturbances()
     blocks = (half @ spread @ half.T).reshape(31, n, 31, n)
     expected = blocks[np.arange(31), :, np.arange(31)]
     assert np.allclose(found.covariance, expected, rtol=1e-5, atol=1e-12)
-
-
-def test_sensitivities_of_the_innovations_match_differences():
-    _, trials = simulated(car, np.random.default_rng(1), CAR_NOISE, B=2, T=40)
-    batch, measurement = batched(car, trials)
-    base = filter_batch(batch, measurement, CAR_NOISE, ModelSteps(car.system, car.values, batch))
-    F = np.stack(
-        [car.system.sensitivities(base.x[t], batch.u[t], car.values, DT)[2] for t in range(40)]
-    )
-    W = sensitivity(base, F)
-    for name in ("a2", "tau_delta", "L"):
-        i = car.param_names.index(name)
-        h = 1e-5
-        moved = np.zeros_like(W[..., 0])
-        for sign in (1, -1):
-            x, shift = base.x_prior[0].copy(), np.zeros_like(base.e)
-            p = car.values.copy()
-            p[i] += sign * h
-            for t in range(41):  # the same gains, another model
-                e = measurement.innovation(batch.y[t], x)
-                e = np.where(batch.seen[t], e, 0.0)
-                shift[t] = (base.gains.whitener[t] @ e[..., None])[..., 0]
-                x = x + np.einsum("bci,bc->bi", base.gains.k[t], shift[t])
-                x = car.system.step(x, batch.u[t], p, DT) if t < 40 else x
-            moved += sign * shift / (2 * h)
-        assert np.allclose(W[..., i], moved, atol=2e-3 * np.abs(moved).max())
 
 
 CAR_NOISE = NoiseStd(

@@ -196,7 +196,8 @@ def test_a_fit_and_a_diagnosis_on_a_cluster_give_the_same_bits(cluster, tmp_path
     (tmp_path / "lag.py").write_text(LAG)  # as in a workspace: no worker can import it
     model = load_module(tmp_path, "lag.py").model
     trials, engine = runs_of(model, 12, 100), Engine(name="dask", address=cluster[0])
-    monkeypatch.setattr(sys.modules["grounded.fit.point"], "SMALL", 0)
+    blocks = sys.modules["grounded.diagnosis.likelihood.refine"]
+    monkeypatch.setattr(blocks, "MOST_NUMBERS", 1.0)
     one, many = (fit(model, trials, engine=e) for e in (None, engine))
     assert one.to_json() == many.to_json() and one.loglik == many.loglik
     assert np.array_equal(one.covariance, many.covariance)

@@ -1,8 +1,7 @@
-"""Thresholds on the records they act on, progress, and Ctrl-C, in fit and diagnose."""
+"""Progress, Ctrl-C, workers and very many runs, in fit and diagnose."""
 
 import re
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +9,7 @@ import pytest
 from grounded import forked
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.engine import Engine
-from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.fit import fit
-from grounded.fit.point import fall, point
-from grounded.fit.search import data_of
-from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.progress import Interrupted, Stages
 from grounded.trial import Trial
@@ -32,7 +27,6 @@ MODEL = Model(
     params={"gain": Param(2.0, "m/s", 0.5, 5.0), "dead": Param(0.3, "1", 0.0, 0.8)},
     derivative=lag,
 )
-NOISE = NoiseStd(np.array([0.005]), np.array([0.01]), 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -50,19 +44,16 @@ def trials():
     return found
 
 
-def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
-    records = [record_of(MODEL, trial) for trial in trials]
-    unknowns = unknowns_of(MODEL, None, np.zeros(1), "known")
-    data = data_of(MODEL, records, of_states(MODEL), unknowns)
-    at = point(data, NOISE, np.array([2.4, 0.35]))
-    for value in (0.1, 0.3, 0.36, 0.5):
-        there = point(data, NOISE, np.array([2.4, value]))
-        assert fall(data, at, 1, value) == pytest.approx(
-            at.loglik - there.loglik, abs=0.02, rel=1e-4
-        )
-    batch = data.batch(at.theta)
-    assert data.batch(at.theta) is batch and batch.count == at.count
-    assert replace(data, records=data.records[:1]).batch(at.theta).count < at.count
+def test_all_runs_count_though_the_search_takes_only_some(trials, monkeypatch):
+    whole = fit(MODEL, trials)
+    monkeypatch.setattr(sys.modules["grounded.diagnosis.likelihood.data"], "MOST_NUMBERS", 900.0)
+    monkeypatch.setattr(sys.modules["grounded.diagnosis.likelihood.data"], "SESSION", 2)
+    stages = []
+    few = fit(MODEL, trials, progress=stages.append)
+    assert few.samples == whole.samples and any("all" in stage for stage in stages)
+    for name, e in whole.params.items():
+        assert few.params[name].value == pytest.approx(e.value, abs=e.std)
+        assert few.params[name].std == pytest.approx(e.std, rel=0.3)
 
 
 SHARES = (0.01, 0.1, 0.3)
@@ -153,14 +144,7 @@ def test_a_diagnosis_is_the_same_with_one_worker_and_with_two(trials):
 
 def test_a_fit_is_the_same_with_one_worker_and_with_three(trials, monkeypatch):
     monkeypatch.setattr(forked, "WORTH_S", 1e-9)
-    parts = sys.modules["grounded.fit.point"]
-    monkeypatch.setattr(parts, "PART", 2)
-    monkeypatch.setattr(parts, "SMALL", 0)
+    monkeypatch.setattr(sys.modules["grounded.diagnosis.likelihood.refine"], "MOST_NUMBERS", 1.0)
     one, three = (fit(MODEL, trials, engine=Engine(n)) for n in (1, 3))
     assert one.to_json() == three.to_json() and one.loglik == three.loglik
     assert np.array_equal(one.covariance, three.covariance)
-    monkeypatch.setattr(parts, "SMALL", 1_000_000)
-    whole = fit(MODEL, trials)
-    for name, value in whole.params.items():
-        assert one.params[name].value == pytest.approx(value.value, abs=0.1 * value.std)
-        assert one.params[name].std == pytest.approx(value.std, rel=0.05)

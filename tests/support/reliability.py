@@ -324,6 +324,7 @@ CALL = re.compile(r"^(?:\d+ +)?(\w+)\(")
 START, STOP = "/grounded-marker-start", "/grounded-marker-stop"
 TRACED = f"""
 import os, sys
+import filelock  # what Python reads of a library is not the store's
 from grounded.errors import GroundedError
 from grounded_trials.store.store import Store
 os.path.exists({START!r})
@@ -335,6 +336,9 @@ except GroundedError as error:
 os.path.exists({STOP!r})
 print("added")
 """
+
+
+NEVER_FAIL = ("brk", "mmap", "munmap", "mremap", "mprotect", "getpid", "gettid", "geteuid")
 
 
 def system_calls() -> list[tuple[str, int]]:
@@ -354,7 +358,7 @@ def system_calls() -> list[tuple[str, int]]:
             counts[match[1]] = counts.get(match[1], 0) + 1
             if STOP in line:
                 break
-            if inside and match[1] not in ("brk", "mmap", "munmap", "mremap", "mprotect"):
+            if inside and match[1] not in NEVER_FAIL:
                 found.append((match[1], counts[match[1]]))
             inside |= START in line
     return found

@@ -43,13 +43,16 @@ def differenced(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return seen
 
 
-def logs(folder: Path, masses: list[float], shown=noisy) -> Workspace:
-    """A workspace of a cart whose trials were driven with these masses [kg]."""
+def logs(
+    folder: Path, masses: list[float], shown=noisy, steps: int = 40, alike: int = 1
+) -> Workspace:
+    """A workspace of a cart driven with these masses [kg], the first few by the same commands."""
     w, rng = Workspace(make(folder).folder), np.random.default_rng(0)
     names = (w.base_model.state_names, w.base_model.input_names)
     for k, mass in enumerate(masses):
         robot = w.task.with_model(w.base_model.with_values({"mass": mass}))
-        force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)
+        if not 0 < k < alike:
+            force = np.repeat(rng.uniform(-4, 4, (steps // 8, 1)), 8, axis=0)
         run = simulate(robot.problem(exact=True), robot.policy(force, None, None))
         seen = shown(run.states, rng)
         write_trial(folder / f"{k}.mcap", Trial(seen, force, DT, *names), {"kind": "data"})
@@ -59,8 +62,8 @@ def logs(folder: Path, masses: list[float], shown=noisy) -> Workspace:
 
 @pytest.fixture
 def misled(tmp_path: Path) -> Workspace:
-    """Every fourth trial, which judges a fit, is of the model as it is; the others are not."""
-    return logs(tmp_path / "w", [1.4, 1.4, 1.4, 1.0] * 2)
+    """One motion alone was driven with another mass, three times: no other trial confirms it."""
+    return logs(tmp_path / "w", [1.4] * 3 + [1.0] * 7, alike=3)
 
 
 def claimed(w: Workspace, after: float = 0.1, named: Sequence[str] = ()) -> None:
@@ -100,7 +103,7 @@ def test_parameters_are_fitted_without_a_speed_that_follows_from_positions(tmp_p
 def test_values_that_predict_worse_are_never_written(misled):
     before = misled.config.file.read_text()
     found = misled.fit()
-    assert not found.fit.helps and found.fit.params["mass"].value > 1.2
+    assert not found.fit.helps and found.fit.params["mass"].value > 1.05
     assert found.then == NextCommand("diagnose")  # nobody has yet
     with pytest.raises(GroundedError) as refused:
         misled.fit(apply=True)
@@ -129,7 +132,7 @@ def test_trials_of_before_a_change_of_the_robot_can_be_left_out(tmp_path):
 
 
 def test_the_fit_after_a_diagnosis_of_some_trials_is_of_the_same_trials(misled):
-    some = ["t0001", "t0002", "t0003", "t0004"]
+    some = ["t0001", "t0004", "t0005", "t0006"]
     claimed(misled, named=some)
     asked = NextCommand("fit", ("--trials", ",".join(some)))
     assert misled.status().then == asked

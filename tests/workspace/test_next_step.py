@@ -1,5 +1,6 @@
 """The command to type next is one, wherever it is asked; and what `adopt` does with a diagnosis."""
 
+import math
 import re
 import shlex
 from dataclasses import replace
@@ -621,13 +622,13 @@ def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_ex
     assert effect["d"] == pytest.approx(found["value"], rel=1e-6)
     # times are known to the rows of the logs, and to what was interpolated between them
     exact = w.fit().to_json()["params"]["delay_force_d"]
-    for unsure, key, more in (
-        ((0.05, 0.0), "rows_s", 0.05),
-        ((0.0, 0.002), "interpolated_s", 1.96 * 0.002),
+    half = exact["high"] - exact["value"]
+    for unsure, key, wider in (
+        ((0.05, 0.0), "rows_s", half + 0.05),
+        ((0.0, 0.002), "interpolated_s", math.hypot(half, 1.96 * 0.002)),
     ):
         monkeypatch.setattr(fitting, "unsure_times", lambda *_, unsure=unsure: unsure)
         wide = w.fit().to_json()
         known = wide["params"]["delay_force_d"]
         assert wide[key] == max(unsure)
-        assert known["low"] == pytest.approx(exact["low"] - more)
-        assert known["high"] == pytest.approx(exact["high"] + more)
+        assert known["high"] == pytest.approx(exact["value"] + wider)

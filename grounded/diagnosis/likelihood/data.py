@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -262,6 +262,15 @@ def prepare(
         exact=exact,
         groups=tuple(_signals(model, used, hidden).groups()),
     )
+
+
+def entire(data: Data) -> Data:
+    """Return the data with all runs, also those that `prepare` left out because there are many."""
+    if not data.skipped or simulated(data.model):
+        return data
+    state_at, step_at, valid, trial_of = _cut(data.lengths, LONGEST_RUN)
+    all_ = {"state_at": state_at, "step_at": step_at, "valid": valid, "trial_of": trial_of}
+    return replace(data, **all_, skipped=0)
 
 
 def _signals(model: Model, used: Sequence[tuple[Trial, int]], hidden: Sequence[str]) -> Signals:

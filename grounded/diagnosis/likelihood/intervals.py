@@ -17,14 +17,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.linearise import gains_of, linearise
+from grounded.diagnosis.likelihood.linearise import gains_of, linearise, thresholds
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
+from grounded.diagnosis.likelihood.step import room
 from grounded.filter import kalman
 from grounded.frozen import Array
 
@@ -35,6 +40,9 @@ LONG = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
 # single one, an interval would double by the last bit
 CHANCE, CLEAR = 0.02, 0.005
+DROP = 3.67  # [nats] within which a threshold has its 95 % interval
+FAR = 12**0.5  # standard deviations of the prior between two bounds, and the farthest move
+HALVINGS, ZOOMS, PARTS = 10, 3, 4  # of the widest move; then in parts between two of them
 LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
 
 
@@ -60,11 +68,45 @@ def standard_deviations(
             scatter = np.sqrt((len(some) - 1) * some.var(axis=0))
             std = np.maximum(std, scatter)
             half = np.maximum(half, _student(len(some) - 1) * scatter)
+    for j in thresholds(predictor, fit):
+        half[j] = np.abs(level(predictor, fit, j, DROP / worth)).max()
+        std[j] = half[j] / NORMAL
     smeared = np.hypot(
         between_steps(fit.hypothesis, predictor.data.dt, len(std)),
         between_samples(fit.hypothesis, predictor.data, len(std)),
     )
     return np.hypot(std, smeared), np.hypot(half, NORMAL * smeared)
+
+
+def level(predictor: Predictor, fit: Fitted, j: int, drop: float) -> tuple[float, float]:
+    """Return how far unknown j may move, down and up, until the fit falls by `drop` nats.
+
+    The unknowns are those of `moved`. Noise and track stay as they are; room ends at the bounds.
+    """
+    data, h = predictor.data, fit.hypothesis
+    unit = np.arange(fit.gram.shape[-1]) == j
+
+    def within(moves: Any) -> Any:
+        """Return whether the fit is within `drop` after each move, (N,)."""
+        tried = [replace(moved(data, h, move * unit), spread=0.0) for move in moves]
+        starts = [(one, fit.noise, fit.track) for one in tried]
+        found = refine(predictor, starts, iterations=1, fixed_noise=True)
+        if len(found) < len(starts):  # one could not be filtered
+            return np.zeros(len(moves), bool)
+        return np.array([fit.loglik - one.loglik <= drop for one in found])
+
+    sides = []
+    for sign, ends in zip((-1.0, 1.0), room(data, h, len(unit)), strict=True):
+        near, far = 0.0, min(abs(float(ends[j])), FAR)
+        steps = far * 2.0 ** np.arange(-HALVINGS, 1)
+        for _ in range(ZOOMS if far > 0 else 0):
+            beyond = np.flatnonzero(~within(sign * steps))
+            if not len(beyond):
+                break
+            near, far = [near, *steps][beyond[0]], steps[beyond[0]]
+            steps = np.linspace(near, far, PARTS + 1)[1:]
+        sides.append(sign * far)
+    return sides[0], sides[1]
 
 
 def between_steps(h: Hypothesis, dt: float, count: int) -> Array:

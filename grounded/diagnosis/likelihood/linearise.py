@@ -20,8 +20,8 @@ sign within half a step.
 
 A threshold (the throttle below which a motor stalls) has zero derivative, since a small change
 moves no sample across it. If a parameter's derivative is zero at every sample, a finite difference
-over a few per cent of its size is used instead. So a wrong threshold is found like any other wrong
-parameter, and is not attributed to an effect.
+that is wide enough for some sample is used instead. So a wrong threshold is found like any other
+wrong parameter, and is not attributed to an effect.
 
 A run starts at the measured state. A state that was not measured at the start (a speed that is not
 logged, a sensor that had dropped out) gets a wide prior about the track, and each pass moves the
@@ -314,14 +314,28 @@ def _by_parameter(
 
     size = SLIGHT if 2 * start < sum(param.reach) else -SLIGHT
     slope = model.difference(reached(size), after) / size
-    if not slope.any():
-        slope = model.difference(reached(PART), reached(-PART)) / (2 * PART)
+    for part in SECANTS:
+        if slope.any():
+            break
+        slope = model.difference(reached(part), reached(-part)) / (2 * part)
     return np.asarray(slope)
 
 
 SLIGHT = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
 SOME = 10  # samples that show at once of most parameters that they have a slope
 PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
+SECANTS = (PART, 2 * PART, 4 * PART, 8 * PART)  # the same, wider while no sample is between
+
+
+def thresholds(predictor: Predictor, fit: Fitted) -> list[int]:
+    """Return the unknowns of a fit that are thresholds: parameters without a slope anywhere."""
+    model, h = predictor.data.model, fit.hypothesis
+    if not h.spread:
+        return []
+    x, u = predictor.flat(fit.track[:-1], predictor.inputs(h))
+    f_p = model.system.sensitivities(x, u, predictor.params(h), predictor.data.dt)[2]
+    found = np.flatnonzero(~f_p[..., calibrated(predictor.data)].any(axis=(0, 1)))
+    return (len(h.theta) + found).tolist()
 
 
 def sensitivities(
@@ -337,13 +351,15 @@ def sensitivities(
     flat = np.flatnonzero(~few & (param_scale(model) > 0))
     flat = flat[~f_p[:, :, flat].any(axis=(0, 1))] if len(flat) else flat
     for i in flat:
-        size = PART * param_scale(model)[i]
-        ends = []
-        for sign in (-1, 1):
-            moved = p.copy()
-            moved[i] += sign * size
-            ends.append(model.system.step(x, u, moved, dt))
-        f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * size)
+        for part in SECANTS:
+            ends = []
+            for sign in (-1, 1):
+                moved = p.copy()
+                moved[i] += sign * part * param_scale(model)[i]
+                ends.append(model.system.step(x, u, moved, dt))
+            f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * part * param_scale(model)[i])
+            if f_p[:, :, i].any():
+                break
     return f_x, f_u, f_p
 
 

@@ -5,9 +5,8 @@ and its errors where its values were not fitted (`ruler`, by group of trials). T
 steps:
 
     1. A set is *supported* if each of its causes is: with it the set is likelier (CLAIM nats), and
-       predictions are better by more than their standard error, as much as matters (LEAST, and
-       SHARE of what the set gains), and not worse over whole trials. A cause that a guard refuses
-       is not supported.
+       predictions are better by more than their standard error and as much as matters (LEAST, and
+       SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets within WITHIN standard errors of the reference, the smallest is chosen
        (the one-standard-error rule of Breiman et al. 1984, and of projection predictive selection,
@@ -126,7 +125,7 @@ class Rule:
             return False
         more = self.gain(less.errors, option.errors)
         matters = more.mean >= SHARE * max(self.gained(option), 0.0)
-        return not self.held_out or (matters and more.pays(SCATTERS) and not more.ruins)
+        return not self.held_out or (matters and more.pays(SCATTERS))
 
     def _as_good(self, option: Option, best: Option) -> bool:
         """Check whether a set predicts as well as the best, within its error or what matters."""

@@ -404,14 +404,19 @@ def with_measured_filters(model: Model, findings: Iterable[Finding]) -> Model:
     return replace(model, params=params) if seen & {*params} else model
 
 
-def held(predictor: Predictor, fit: Fitted) -> Model:
+def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Model:
     """Return the model with parameters held constant that can't be identified even with less noise.
 
     If only a combination of several is identifiable (a mass and a gain), the one with the widest
     relative prior stays free.
+
+    Args:
+        predictor: evaluates hypotheses on the data.
+        fit: the hypothesis beside which they are identified, and its noise.
+        less_noise: factor by which the variance of the noise may still fall.
     """
     model = predictor.data.model
-    H = _information(predictor, fit) * QUIETER
+    H = _information(predictor, fit) * less_noise
     names = [model.param_names[i] for i in calibrated(predictor.data)]
     sure = np.array([model.params[n].spread / max(abs(model.params[n].value), 1e-9) for n in names])
     free = list(range(len(names)))

@@ -1,6 +1,7 @@
 """Checks of a trial that came back: did its candidate drive it, and in the model's units?
 
-who_drove    START HERE: compares the logged commands with what the policy sends on these states
+whose_run    START HERE: whose run a trial is
+who_drove    compares the logged commands with what the policy sends on these states
 other_scale  finds the scale of a state with which they agree
 clipped      finds commands that were cut inside their limits
 smoothed     finds the filter of a program that logs its states as measured

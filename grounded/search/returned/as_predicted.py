@@ -14,6 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.accounts.judge import contradicted
+from grounded.accounts.table import Account
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.candidate import Candidate
@@ -41,9 +43,10 @@ def far(own: Candidate, trial: Trial) -> Array:
     return found
 
 
-def apart(own: Candidate, trial: Trial) -> float:
-    """Return how far a trial is from its prediction [nats], summed over the states."""
-    return float(np.nansum(np.log(np.fmax(far(own, trial), NEAR))))
+def apart(own: Candidate, trial: Trial, but: Sequence[str] = ()) -> float:
+    """Return how far a trial is from its prediction [nats], summed over the states `but` some."""
+    counts = ~np.isin(trial.state_names, but)
+    return float(np.nansum(np.log(np.fmax(far(own, trial), NEAR))[counts]))
 
 
 def like_predicted(own: Candidate, trial: Trial) -> bool:
@@ -90,20 +93,8 @@ def odd_columns(
         nearer, now = apart(own, mended), far(own, mended)
         if not (nearer < least and now[which].max() < ALIKE and np.median(as_it_is[rest]) < TELLS):
             continue
-        if by == -1 and not _moves_better(model, trial, mended):
+        fault = Account("sign", tuple(which), -1.0)
+        if by == -1 and not contradicted(model, mended, range(model.n), fault):
             continue
         best, least = (tuple(names), float(by)), nearer
     return best
-
-
-def _moves_better(model: Model, trial: Trial, mended: Trial) -> bool:
-    """Return whether the model predicts a trial's motion clearly better without a fault."""
-    from grounded.accounts.judge import CLEAR, STARTS
-    from grounded.accounts.motion import Ahead
-
-    before, after = (Ahead(model, one, range(model.n), STARTS) for one in (trial, mended))
-    if not before.enough or not after.enough:
-        return False
-    ones = np.ones(model.m)
-    with np.errstate(all="ignore"):
-        return before.plain(ones).score - after.plain(ones).score > CLEAR

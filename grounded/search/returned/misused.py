@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any, TypeVar
 
 import numpy as np
 
+from grounded.accounts.table import unit_named
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import multiplied
-from grounded.search.returned.other_scale import CENTI, NEARLY, UNITS, units_tried
+from grounded.search.returned.other_scale import CENTI, NEARLY, units_tried
 from grounded.search.returned.who_drove import (
     CLEAR,
     DECISIVE,
@@ -46,6 +49,7 @@ ELSEWHERE = (
     "read another message, estimate or frame? Pass `runner.action` the signals that are logged"
 )
 DIGITS = 1e-4  # largest difference of commands, relative to their size, that rounding makes
+Found = TypeVar("Found", bound=tuple[Any, ...])
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
 
 
@@ -74,8 +78,8 @@ class Way:
 
 def misused(
     task: Task, own: Candidate, trial: Trial, plain: Following, *, acts: bool = False
-) -> str:
-    """Return what the program passed to its candidate that reproduces the commands, and the remedy.
+) -> tuple[float, Way] | None:
+    """Return what the program passed to its candidate that reproduces the commands, or None.
 
     Args:
         task: the task of the candidate.
@@ -85,22 +89,22 @@ def misused(
         acts: whether other commands than those held before a run are sent elsewhere in its log.
 
     Returns:
-        The end of a sentence about its commands; "" if nothing reproduces them.
+        What is left of the commands, relative to their size, and the way that leaves it.
     """
     late, most, found = latest(task), min(LEAVES * plain.error, NEARLY), []
     held = np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
-    over = bool(held.all()) and not acts
+    over, moved = bool(held.all()) and not acts, np.abs(trial.inputs - own.policy.past).max(axis=0)
     for way in ways(task.model, own, unsent=bool(held[0]), over=over):
         fit = follows(way.policy, way.passed(trial), late)
-        if fit is None or not (fit.alike and fit.error < most):
+        if fit is None or not fit.alike or (error := _share(fit, moved)) >= most:
             continue
         if evidence(plain, fit) > DECISIVE and _tells(plain, fit):
             if way.policy.gain is None and own.policy.gain is not None and not _beside(trial, fit):
                 way = replace(way, said=f"they are near the feed-forward of {own.id}, {ELSEWHERE}")
-            found.append((fit.error, way))
+            found.append((error, way))
     least = min((error for error, _ in found), default=0.0)
     near = [(error, way) for error, way in found if error <= SAME * least + FINE]
-    return likeliest(near).said if near else ""
+    return likeliest(near) if near else None
 
 
 def without_feedback(own: Candidate, trial: Trial, ran: Following) -> bool:
@@ -122,12 +126,18 @@ def without_feedback(own: Candidate, trial: Trial, ran: Following) -> bool:
     return bool(alone.max(initial=0.0) < DIGITS and apart > 10 * DIGITS)
 
 
-def likeliest(found: Sequence[tuple[float, Way]]) -> Way:
-    """Return the likeliest of some ways, each with the difference of the commands that it leaves.
+def likeliest(found: Sequence[Found]) -> Found:
+    """Return the likeliest of (what is left of the commands, the way that leaves it, ...).
 
     At the limits one state may explain as much as all, but a program passes all in one unit.
     """
-    return min(found, key=lambda one: (-one[1].changed, one[0]))[1]
+    return min(found, key=lambda one: (-one[1].changed, one[0]))
+
+
+def _share(fit: Following, moved: Array) -> float:
+    """Return what is left of commands, relative to how far the one that moved most did, (m,)."""
+    ratio = moved / (fit.fine / FINE)
+    return fit.error / float(min(ratio.max(), 1.0)) if moved.any() else fit.error
 
 
 def _tells(plain: Following, fit: Following) -> bool:
@@ -244,12 +254,8 @@ def _unit(model: Model, names: Sequence[str], factor: float) -> str:
     """Return `in degrees`, or by which number they were multiplied."""
     if factor == -1.0:
         return "with the opposite sign"
-    named = {(units, 1 / by): unit for units, by, unit in UNITS}
-    own = {model.states[one] for one in names}
-    for (units, by), unit in named.items():
-        if np.isclose(by, factor, rtol=1e-6) and own <= set(units):
-            return f"in {unit}"
-    return f"times {factor:.4g}"
+    unit = unit_named((model.states[one] for one in names), factor)
+    return f"in {unit}" if unit else f"times {factor:.4g}"
 
 
 def _held(model: Model, policy: Policy) -> str:

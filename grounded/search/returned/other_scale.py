@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.accounts.table import unit_named
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
@@ -34,15 +35,6 @@ THOUSAND, PERCENT, CENTI = (1e-3, 1e3), (1e-2, 1e2), 1e-2
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 IN_DEGREES = ("deg", "deg/s")  # units that may be in radians
 LENGTHS = (("m", "m/s"), ("m",), ("m/s",))  # units of what one wheel measures
-UNITS = (  # units of the model, factor from the log's unit, and the log's unit
-    (ANGULAR[0], np.pi / 180, "degrees"),
-    (IN_DEGREES, 180 / np.pi, "radians"),
-    (LENGTHS[0], THOUSAND[0], "mm"),
-    (LENGTHS[0], CENTI, "cm"),
-    (LENGTHS[0], THOUSAND[1], "km"),
-    (("1",), PERCENT[0], "percent"),
-    (("1",), PERCENT[1], "fractions of 1, not percent"),
-)
 NEARLY = 0.1  # largest difference of commands with another unit, relative to an input's size
 EXACT, CLOSE = 0.01, 0.05  # the same for a unit that is certain, and for any factor
 # largest share of the original difference left by a unit, and by any factor (many are tried)
@@ -144,8 +136,10 @@ def _any_factor(
 
 def any_offset(
     task: Task, own: Candidate, trial: Trial, names: Sequence[str], plain: Following | None
-) -> tuple[str, float] | None:
+) -> tuple[str, float, float] | None:
     """Return the state in `names` and the offset without which a trial is a candidate's run.
+
+    With it, what is left of the commands then, relative to their size.
 
     A position's weak gain may hide an offset: the trial then counts as a run of the candidate, but
     follows it far better without the offset. `plain` compares its commands as they are.
@@ -163,7 +157,7 @@ def any_offset(
         if _farther(own, trial, mended) is None:
             continue
         if fit and fit.alike and _left(fit) < best and evidence(plain, fit) > DECISIVE:
-            best, found = _left(fit), (name, float(f"{by:.3g}"))
+            best, found = _left(fit), (name, float(f"{by:.3g}"), fit.error)
     return found
 
 
@@ -317,14 +311,7 @@ def of_full_scale(task: Task, names: Sequence[str], by: float) -> str:
     return part and f"{part} of {with_unit(f'{full:g}', task.model.inputs[names[0]])}"
 
 
-def unit_named(model: Model, names: Sequence[str], by: float) -> str:
+def unit_by_factor(model: Model, names: Sequence[str], by: float) -> str:
     """Return the unit of signals in a log that a factor converts to the model's; "" if unknown."""
     own = {**model.states, **model.inputs}
-    return next(
-        (
-            unit
-            for units, factor, unit in UNITS
-            if np.isclose(by, factor, rtol=1e-6) and all(own[name] in units for name in names)
-        ),
-        "",
-    )
+    return unit_named((own[name] for name in names), 1 / by) if names else ""

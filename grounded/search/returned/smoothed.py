@@ -35,6 +35,7 @@ class Smoothed:
     names: tuple[str, ...]
     share: float  # of the last value, a
     lag_s: float  # by which a steady motion is seen late [s]
+    left: float  # rms difference of the commands on these, relative to their size
 
     def told(self, own: Candidate) -> str:
         """Return what its commands are and the remedy, as the end of a sentence."""
@@ -75,7 +76,7 @@ def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:
             if left[k] < best:
                 best, share = float(left[k]), float(SHARES[k])
                 lag = share / (1 - share) * trial.dt
-                found = Smoothed(tuple(policy.state_names[i] for i in group), share, lag)
+                found = Smoothed(tuple(policy.state_names[i] for i in group), share, lag, best)
     return found
 
 

@@ -17,8 +17,8 @@ from grounded.model import Model
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import odd_columns
-from grounded.search.returned.other_scale import other_units, unit_named, units_tried
-from grounded.search.returned.who_drove import suspicion
+from grounded.search.returned.other_scale import other_units, unit_by_factor, units_tried
+from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 
@@ -40,7 +40,7 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
         return f"{listed(unknown)} {'is' if len(unknown) == 1 else 'are'} NaN from the start"
     seen = suspicion(task, whole, own, candidates)
     names, by = ((), 1.0) if seen.other else other_units(task, whole, own, seen.ran)
-    if unit := unit_named(task.model, names, by):  # the columns may agree with each other
+    if unit := unit_by_factor(task.model, names, by):  # the columns may agree with each other
         ours = {**task.model.states, **task.model.inputs}
         units = " and ".join(dict.fromkeys(ours[name] for name in names))
         return (

@@ -30,9 +30,8 @@ from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.diagnosing import _chosen
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import diagnosable, read_diagnosis
+from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, read_diagnosis
 from grounded_trials.workspace.next_step import to_adopt
 from small_tasks import DT, pushed_cart
 
@@ -351,8 +350,8 @@ def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
         assert done.code == 0, done.err
     workspace = Folder(tmp_path / "ws")
     assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
-    chosen = _chosen(workspace, ()).trials
-    known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in chosen]
+    used = chosen(workspace).trials
+    known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in used]
     assert known == [[41, 41], [41, 31], [41, 0]]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import grounded as gr
 from grounded.onboard import Runner
-from grounded.search.returned.other_scale import other_units, unit_named
+from grounded.search.returned.other_scale import other_units, unit_by_factor
 from grounded.search.returned.who_drove import follows, latest
 
 MODEL = gr.Model(
@@ -56,7 +56,7 @@ def test_lengths_in_another_unit_are_found_though_all_columns_agree(units, named
     names, by = found(TASK, candidate, robot(candidate, units))
     assert names == ("x", "v")
     assert by == pytest.approx(1 / units)
-    assert unit_named(MODEL, names, by) == named
+    assert unit_by_factor(MODEL, names, by) == named
     with pytest.raises(gr.GroundedError, match=f"are in {named}"):
         gr.learn(TASK, lambda c: robot(c, units))
     assert gr.learn(

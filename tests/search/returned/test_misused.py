@@ -9,7 +9,8 @@ from facts import holds
 from grounded.onboard import Runner
 from grounded.search.ask_tell import Search
 from grounded.search.returned.misused import misused
-from grounded.search.returned.who_drove import follows, latest, suspicion
+from grounded.search.returned.who_drove import follows, latest
+from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
 from small_tasks import rover_task
 
@@ -67,8 +68,9 @@ def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
     task, made = waiting
     trial = driven(task, made, times=lambda t: 1.7e9 + t)
     plain = follows(made.policy, trial, latest(task))
-    assert "past the end" in misused(task, made, trial, plain)
-    assert "past the end" not in misused(task, made, trial, plain, acts=True)
+    _, way = misused(task, made, trial, plain)
+    assert "past the end" in way.said
+    assert misused(task, made, trial, plain, acts=True) is None
 
 
 def test_feedback_on_another_pose_is_not_called_no_feedback(waiting):
@@ -98,5 +100,5 @@ def test_other_commands_are_no_misuse(waiting):
         smooth = np.array([np.convolve(column, np.ones(10) / 4, "valid") for column in noise.T]).T
         trial = replace(driven(task, made), inputs=np.clip(smooth, task.low, task.high))
         plain = follows(made.policy, trial)
-        assert not plain.alike and misused(task, made, trial, plain) == ""
+        assert not plain.alike and misused(task, made, trial, plain) is None
         assert holds(suspicion(task, trial, made, [made]).why, "other units", "not in s")

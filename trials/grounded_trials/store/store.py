@@ -243,15 +243,18 @@ class Store:
         Raises:
             GroundedError: if the folder can't be written.
         """
-        from filelock import FileLock
-
-        lock = FileLock(self.folder / ".lock", mode=0o644)
         try:
+            from filelock import FileLock, has_fcntl
+
             self.folder.mkdir(parents=True, exist_ok=True)
+            if os.name == "posix" and not has_fcntl:  # else any file would count as a lock
+                raise NotImplementedError
+            # without a fallback to lock files, which a killed process would leave behind
+            lock = FileLock(self.folder / ".lock", mode=0o644, fallback_to_soft=False)
             lock.acquire(poll_interval=POLL_S)
-        except OSError as error:
-            raise self._unwritable(error) from None
-        except NotImplementedError:
+        except (ImportError, NotImplementedError, OSError) as error:
+            if isinstance(error, OSError) and error.errno not in (errno.ENOSYS, errno.ENOTSUP):
+                raise self._unwritable(error) from None
             raise GroundedError(
                 f"{self.folder} can't be locked, as its file system has no file locks: move the "
                 "workspace to a local disk"

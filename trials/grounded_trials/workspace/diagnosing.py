@@ -17,12 +17,11 @@ from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.progress import duration
 from grounded.result import begun
-from grounded.share import Share, share_of
+from grounded.share import Share
 from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import diagnosable, write_diagnosis
-from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, write_diagnosis
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
@@ -84,8 +83,8 @@ def diagnose_in(
     }
     library = (library or Library()).without(without)
     planner = workspace.planner
-    share = _chosen(workspace, trials)
-    second = _chosen(workspace, compare) if compare else Share([], "")
+    share = chosen(workspace, trials)
+    second = chosen(workspace, compare) if compare else Share([], "")
     used, others = share.trials, second.trials
     told = filter(None, [share.sentence, second.sentence])
     memory = planner.plan.model.state_names[planner.task.model.n :]
@@ -247,7 +246,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
 
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
-    used = _chosen(workspace, trials).trials
+    used = chosen(workspace, trials).trials
     lifted, together = [planner.lift(trial) for trial in used], one_message(workspace)
     found = sound_trials(planner.plan, lifted, memory, one_message=together)
     return where_to_mend(workspace, used, found.findings)
@@ -257,7 +256,7 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
     from grounded.accounts.kinematics import unheld
 
-    return unheld(workspace.planner.task.model, _chosen(workspace, trials).trials)
+    return unheld(workspace.planner.task.model, chosen(workspace, trials).trials)
 
 
 def unwritten_in(workspace: Folder) -> list[str]:
@@ -273,36 +272,6 @@ def unwritten_in(workspace: Folder) -> list[str]:
         "state: what is found stands in for your robot's equations. Write these first, and "
         "diagnose again"
     ]
-
-
-def _chosen(workspace: Folder, names: Sequence[str]) -> Share:
-    """Return the trials to diagnose, or a share of them.
-
-    States that were filled in by a smoother are no evidence: NaN again.
-
-    Raises:
-        GroundedError: for an angle in degrees that was unwrapped in radians. The plan's model with
-            an adopted delay of that sensor has no rows that show it.
-    """
-    from grounded.accounts.sound_trials import stop_at_folded
-
-    used, model = diagnosable(workspace), workspace.base_model
-    names = named_trials(workspace, names, [trial.id for trial in used])
-    share = share_of([trial for trial in used if not names or trial.id in names])
-    stop_at_folded(model, share.trials)
-    guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
-    measured = [
-        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
-        for trial in share.trials
-    ]
-    return replace(share, trials=measured)
-
-
-def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
-    """Set the states that a trial did not measure to NaN."""
-    states = trial.states.copy()
-    states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
-    return replace(trial, states=states)
 
 
 def _probe(

@@ -10,6 +10,7 @@ verdict refers to the model and the trials of its time; effects adopted since ar
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import listed
+from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.wording import ranges
@@ -81,14 +83,48 @@ def _with_limit(found: Diagnosis) -> Diagnosis:
 def diagnosable(workspace: Folder) -> list[Trial]:
     """Return the trials in order of arrival, each up to the first missing or unbounded number.
 
-    A fit needs complete states. A diagnosis does not, so a sensor dropout only costs its own
-    samples, not the rest of the trial.
+    A sensor dropout only costs its own samples, not the rest of the trial.
 
     Raises:
         GroundedError: if a stored file is damaged.
     """
     cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
     return [trial for trial in cut if trial.steps >= LEAST_STEPS]
+
+
+def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
+    """Return the trials to fit or to diagnose, or a share of them.
+
+    States that were filled in by a smoother are no evidence: NaN again.
+
+    Args:
+        workspace: the workspace.
+        names: short names of the trials; empty: all usable ones.
+
+    Raises:
+        GroundedError: if there is none, or one of those named can't be used; for an angle in
+            degrees that was unwrapped in radians. The plan's model with an adopted delay of that
+            sensor has no rows that show it.
+    """
+    from grounded.accounts.sound_trials import stop_at_folded
+
+    used, model = diagnosable(workspace), workspace.base_model
+    names = named_trials(workspace, names, [trial.id for trial in used])
+    share = share_of([trial for trial in used if not names or trial.id in names])
+    stop_at_folded(model, share.trials)
+    guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
+    measured = [
+        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
+        for trial in share.trials
+    ]
+    return replace(share, trials=measured)
+
+
+def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
+    """Set the states that a trial did not measure to NaN."""
+    states = trial.states.copy()
+    states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
+    return replace(trial, states=states)
 
 
 def left_out(workspace: Folder) -> list[str]:
@@ -271,23 +307,7 @@ def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
     """
     try:
         kept = read_document(workspace.reports / FIT)
-        used = fittable(workspace, trials)
+        used = chosen(workspace, trials).trials
     except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
         return False
     return kept.get("helps") is False and _made_from(workspace, used).items() <= kept.items()
-
-
-def fittable(workspace: Folder, names: Sequence[str] = ()) -> list[Trial]:
-    """Return stored trials of this model, each up to its first non-finite sample.
-
-    Args:
-        workspace: the workspace.
-        names: short names of the trials to return; empty: all that have at least 3 such steps.
-
-    Raises:
-        GroundedError: if there is none, or one of those named can't be used.
-    """
-    trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
-    found = [trial.until(T) for trial, T in trials if T >= 3]
-    chosen = named_trials(workspace, names, ids_of(found))
-    return [trial for trial in found if not chosen or trial.id in chosen]

@@ -13,7 +13,8 @@ import pytest
 from facts import holds
 from grounded.errors import GroundedError
 from grounded.search.feedback.sample_age import sample_age
-from grounded.search.returned.who_drove import evidence, follows, suspicion
+from grounded.search.returned.who_drove import evidence, follows
+from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial

@@ -9,7 +9,7 @@ from facts import holds
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded.search.returned.other_scale import other_units, unit_named, units_tried
+from grounded.search.returned.other_scale import other_units, unit_by_factor, units_tried
 from grounded.search.returned.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -115,9 +115,9 @@ def test_centimetres_are_tried_and_are_no_percent():
     )
     tried = {(tuple(names), factor) for names, factor in units_tried(cart)}
     assert {(("x", "v"), 1e-2), (("x",), 1e-2)} <= tried
-    assert unit_named(cart, ("x", "v"), 1e-2) == "cm"
-    assert unit_named(cart, ("throttle",), 1e-2) == "percent"
-    assert unit_named(cart, ("x", "throttle"), 1e-2) == ""
+    assert unit_by_factor(cart, ("x", "v"), 1e-2) == "cm"
+    assert unit_by_factor(cart, ("throttle",), 1e-2) == "percent"
+    assert unit_by_factor(cart, ("x", "throttle"), 1e-2) == ""
     assert holds(units_told(cart_task(), ("x", "v"), 1e-2, mapped=True), "100 times", "cm", "0.01")
 
 
@@ -161,7 +161,7 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
     np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
-    assert holds(str(refused.value), "ran c0001", "force", "57.2958", "in radians")
+    assert holds(str(refused.value), "ran c0001", "force", "57.2958", "in rad/s")
 
 
 @pytest.mark.parametrize("before", [0.0, 0.7])

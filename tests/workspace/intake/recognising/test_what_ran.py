@@ -15,7 +15,7 @@ from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Plant
-from grounded.search.returned.who_drove import suspicion
+from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial

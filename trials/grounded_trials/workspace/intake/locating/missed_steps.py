@@ -73,8 +73,10 @@ def _apart(policy: Policy, trial: Trial, past: Array) -> Array:
     return np.asarray(np.sqrt((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
 
 
-def begins_late(log: Recording, policy: Policy) -> float:
-    """Return by how much a log begins after a policy's run did [s]; 0 if it does not.
+def begins_late(log: Recording, policy: Policy) -> tuple[int, float]:
+    """Return by how many steps a log begins after a policy's run did, 0 if it does not.
+
+    With it, what is left of the commands, relative to their size.
 
     Its commands are then those of later steps, each with the gains of its own step.
 
@@ -82,38 +84,41 @@ def begins_late(log: Recording, policy: Policy) -> float:
         log: the log in which no run of the policy was found.
         policy: the policy, for the states and inputs of the log.
     """
-    return 0.0 if _waits(log) else _step_at(log, policy, log.first) * policy.dt
+    return (0, 1.0) if _waits(log) else _step_at(log, policy, log.first)
 
 
-def other_clock(log: Recording, policy: Policy) -> str:
-    """Return that a program began with a later step, since its clock ran before; or "".
+def other_clock(log: Recording, policy: Policy) -> tuple[str, int, float] | None:
+    """Return that a program began with a later step, since its clock ran before; or None.
 
     Args:
         log: the log in which no run of the policy was found, which begins before it.
         policy: the policy, for the states and inputs of the log.
 
     Returns:
-        A clause about its commands, and what to pass.
+        A clause about its commands, and what to pass; the step; and what is left of the commands.
     """
     if not _waits(log) or not log.openings:
-        return ""
+        return None
     begins = log.on_step(policy, log.openings[0])
-    step = _step_at(log, policy, begins)
+    step, _ = _step_at(log, policy, begins)
     fit = acted_on(log, policy.after(step), begins) if step else None
     if fit is None or not fit.throughout:
-        return ""
+        return None
     since = "it was started"
     if abs(begins - step * policy.dt) < 1.5 * policy.dt:
         since = "the log began"
-    return (
+    said = (
         f"its first command, {begins:.2f} s after the log began, is that of step {step} "
         f"({step * policy.dt:.3g} s), and the others follow: pass `runner.action` the seconds "
         f"since the run began, not since {since}"
     )
+    return said, step, fit.left
 
 
-def _step_at(log: Recording, policy: Policy, begins: float) -> int:
-    """Return the step that a policy's first command in a log is of; 0 if that is unclear.
+def _step_at(log: Recording, policy: Policy, begins: float) -> tuple[int, float]:
+    """Return the step that a policy's first command in a log is of, 0 if that is unclear.
+
+    With it, the median difference of the commands, relative to their size.
 
     Args:
         log: the log.
@@ -122,7 +127,7 @@ def _step_at(log: Recording, policy: Policy, begins: float) -> int:
     """
     trial = log.trial_from(begins)
     if trial is None:
-        return 0
+        return 0, 1.0
     past = policy.past if trial.start_inputs is None else trial.start_inputs
     most = min(trial.finite_steps, policy.horizon)
 
@@ -136,7 +141,8 @@ def _step_at(log: Recording, policy: Policy, begins: float) -> int:
     stride = max(1, policy.horizon // COARSE)
     best = min(range(0, policy.horizon, stride), key=left)
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
-    return best if best > 0 and left(best) < min(ALIKE, BY_FAR * left(0)) else 0
+    known = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
+    return best if known else 0, left(best)
 
 
 def _waits(log: Recording) -> bool:

@@ -12,9 +12,7 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import listed
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import (
-    suspicion,
-)
+from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
 from grounded.trial import interpolate_gaps
 from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell

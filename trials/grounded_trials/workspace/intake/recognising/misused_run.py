@@ -19,12 +19,12 @@ from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import Clipped, clipped
 from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
-from grounded.search.returned.other_scale import other_units
 from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import Commanded, commanded, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
+from grounded_trials.workspace.intake.locating.missed_steps import other_clock
 from grounded_trials.workspace.intake.locating.run_start import (
     BATCH,
     TRIED,
@@ -32,40 +32,62 @@ from grounded_trials.workspace.intake.locating.run_start import (
     Start,
     least_of,
 )
+from grounded_trials.workspace.intake.recognising.stories import Kind, Story, scored
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
 ORIGIN = 0.05  # share of the commands' difference that offsets of states may leave
 MOSTLY = 0.9  # least share of the steps in which cut commands are near what is logged
 MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
+SMOOTHED = 1.0  # [nats] that a filter costs before a log is seen
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
 
-def exactly_misused(log: Recording, task: Task, own: Candidate) -> str:
-    """Return how a program misused its candidate, if its commands are that to the last digits.
+def misuses(log: Recording, task: Task, own: Candidate, found: Start | None) -> Iterator[Story]:
+    """Yield the stories by which a program misused its candidate.
+
+    Args:
+        log: a log whose commands are not the candidate's.
+        task: the task with the control step.
+        own: the candidate.
+        found: the start that fits best, if any.
+    """
+    yield from exactly_misused(log, task, own)
+    if clock := other_clock(log, own.policy):
+        said, step, error = clock
+        rest = replace(own, predicted_states=own.predicted_states[step:])
+        if run := log.trial_from(log.on_step(own.policy, log.openings[0])):
+            yield scored(Kind.PROGRAM, said, rest, run, error)
+    yield from cut_in(log, own, found)
+    if log.whole.inputs.any():
+        yield from misused_in(log, task, own)
+    yield from other_origin(log, task.model, own)
+
+
+def exactly_misused(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
+    """Yield how a program misused its candidate, if its commands are that to the last digits.
 
     Args:
         log: a log in which no run of the candidate was found.
         task: the task with the control step.
         own: the candidate.
-
-    Returns:
-        The end of a sentence about its commands; "" if nothing reproduces them.
     """
     first, every = _steps_of(log, own)
     misuses = ways(task.model, own, unsent=False)
     tried = [(*one, way) for way in misuses for one in _begins(every, way)]
-    found = list[tuple[float, Way]]()
+    found = list[tuple[float, Way, Trial]]()
     for _, k, way in sorted(tried, key=lambda one: one[0])[:ALL]:
         at = first + k * log.dt
-        left = _left(log, own, way, at)
-        if left < EXACT and not _rather_logged(log, task, own, way, at):
-            found.append((left, way))
-    return likeliest(found).said if found else ""
+        left, run = _left(log, own, way, at), log.trial_from(at)
+        if left < EXACT and run and apart(own, run) <= apart(own, way.passed(run)):
+            found.append((left, way, run))  # else rather the log is wrong
+    if found:
+        left, way, run = likeliest(found)
+        yield scored(Kind.PROGRAM, way.said, own, run, left)
 
 
-def misused_in(log: Recording, task: Task, own: Candidate) -> str:
-    """Return how the robot's program misused its candidate, and the remedy; or "".
+def misused_in(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
+    """Yield how the robot's program misused its candidate, and the remedy.
 
     Args:
         log: a log in which no run of the candidate was found: its commands don't tell where.
@@ -77,17 +99,15 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> str:
         if trial := log.trial_from(begins):
             run = trial.until(min(trial.finite_steps, task.horizon))
             plain = follows(own.policy, run, latest(task))
-            if plain and not plain.beyond and (told := misused(task, own, run, plain, acts=acts)):
-                return told
-            if (cut := clipped(own, run)) and _was_sent(own, cut, log):
-                return f"they are {cut.told(own)}"
+            if plain and not plain.beyond and (one := misused(task, own, run, plain, acts=acts)):
+                yield scored(Kind.PROGRAM, one[1].said, own, run, one[0])
             if found := smoothed(task.model, own, run):
-                return f"they are {found.told(own)}"
-    return ""
+                said = f"they are {found.told(own)}"
+                yield scored(Kind.PROGRAM, said, own, run, found.left, price=SMOOTHED)
 
 
-def other_origin(log: Recording, model: Model, own: Candidate) -> str:
-    """Return that a program passed its candidate states from another origin than the logged ones.
+def other_origin(log: Recording, model: Model, own: Candidate) -> Iterator[Story]:
+    """Yield that a program passed its candidate states from another origin than the logged ones.
 
     That is, two or more of them.
 
@@ -98,23 +118,21 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> str:
         log: a log whose commands are not the candidate's.
         model: with the units of the states.
         own: the candidate.
-
-    Returns:
-        The end of a sentence about its commands; "" if no offsets explain them.
     """
     policy, n = own.policy, model.n
     if policy.gain is None or (policy.state_names, policy.input_names) != log.names:
-        return ""
-    starts, runs = [log.first, *log.openings[:TRIED]], list[Commanded]()
+        return
+    starts, runs = [log.first, *log.openings[:TRIED]], list[tuple[Trial, Commanded]]()
     for begins in dict.fromkeys(log.on_step(policy, one) for one in starts):
         trial = log.trial_from(begins)
         if trial is not None and min(trial.finite_steps, policy.horizon) >= least_of(
             policy.horizon
         ):
-            runs.append(commanded(policy, trial))
+            runs.append((trial, commanded(policy, trial)))
     # from the right start, its own commands may be nearer than any offset makes those of another
-    nearest = min((float(np.median(np.abs(r.sent - r.asked) / r.size)) for r in runs), default=0.0)
-    for run in runs:
+    each = [float(np.median(np.abs(r.sent - r.asked) / r.size)) for _, r in runs]
+    nearest = min(each, default=0.0)
+    for trial, run in runs:
         free = (run.sent > policy.low) & (run.sent < policy.high)
         free &= (run.asked > policy.low) & (run.asked < policy.high)
         off = ((run.sent - run.asked) / run.size)[free]
@@ -133,16 +151,16 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> str:
             for i, (name, unit) in enumerate(model.states.items())
             if does[i]
         ]
-        return (
+        said = (
             f"they are what {own.id} sends on states from another origin, {listed(told)} beside "
             "those in the log: does its program set a zero of its own, or take them from another "
             "frame? Pass `runner.action` the states as they are logged"
         )
-    return ""
+        yield scored(Kind.PROGRAM, said, own, trial, left, price=0.5 * does.sum())
 
 
-def cut_in(log: Recording, own: Candidate, found: Start | None) -> str:
-    """Return that a program cut its candidate's commands inside their limits, wherever it began.
+def cut_in(log: Recording, own: Candidate, found: Start | None) -> Iterator[Story]:
+    """Yield that a program cut its candidate's commands inside their limits, wherever it began.
 
     Multiplied by any large number, commands that a cut holds at one value are at their limit, as
     the policy's may be: another unit, it seemed. In the run they follow the policy below the cut.
@@ -151,9 +169,6 @@ def cut_in(log: Recording, own: Candidate, found: Start | None) -> str:
         log: a log whose commands are not the candidate's.
         own: the candidate.
         found: the start that fits best, if any.
-
-    Returns:
-        The end of a sentence about its commands; "" if they were not cut.
     """
     starts = [*([found.seconds] if found else []), log.first, *log.openings[:TRIED]]
     for begins in dict.fromkeys(log.on_step(own.policy, one) for one in starts):
@@ -164,10 +179,11 @@ def cut_in(log: Recording, own: Candidate, found: Start | None) -> str:
             low, high = cut.bounds(own)
             within = replace(own.policy, low=low, high=high)
             sent, fit = commanded(within, run), follows(within, run, 0)
-            near = (np.abs(sent.asked - sent.sent) <= NEAR * sent.size).all(axis=1)
-            if near.mean() >= MOSTLY or (fit and fit.alike):
-                return f"they are {cut.told(own)}"
-    return ""
+            off = (np.abs(sent.asked - sent.sent) / sent.size).max(axis=1)
+            if (off <= NEAR).mean() >= MOSTLY or (fit and fit.alike):
+                said, error = f"they are {cut.told(own)}", float(np.median(off))
+                yield scored(Kind.PROGRAM, said, own, run, error)
+                return
 
 
 def _was_sent(own: Candidate, cut: Clipped, log: Recording) -> bool:
@@ -235,17 +251,3 @@ def _as_passed(log: Recording, way: Way) -> Recording:
             scaled = replace(spec, scale=spec.scale * way.factor, offset=spec.offset * way.factor)
             series[name] = replace(series[name], spec=scaled)
     return replace(log, series=series)
-
-
-def _rather_logged(log: Recording, task: Task, own: Candidate, way: Way, at: float) -> bool:
-    """Return whether the log is rather wrong than the program.
-
-    With its states mended, it is as predicted; or, if no feedback is seen in it, it is in its
-    place, with states in another unit.
-    """
-    if (trial := log.trial_from(at)) is None:
-        return False
-    if way.policy.gain is None and own.policy.gain is not None:
-        plain = follows(own.policy, trial.until(task.horizon), latest(task))
-        return other_units(task, trial, own, plain) != ((), 1.0)
-    return bool(way.names) and apart(own, way.passed(trial)) < apart(own, trial)

@@ -205,8 +205,6 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
         trial: its run.
         old: mean age of each state's samples when commands were sent [s], (n,).
     """
-    from grounded.fit.prediction import rms  # a slow import
-
     task, delayed = workspace.task, [str(one["name"]) for one in _delays(workspace)]
     allowed = {n for name in delayed for n in name.partition(":")[2].split("+")}
     states = trial.states[: task.horizon + 1]
@@ -220,7 +218,10 @@ def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> 
         by, what = ("by its commands", "velocities") if np.ptp(old) else (by, what)
     error = task.model.difference(states, task.target[: len(states)])
     moved_on = task.model.difference(states[1:], states[:-1]) / task.dt
-    off, speed = (rms(e) for e in (error, moved_on))
+    off, speed = (
+        np.sqrt(np.nansum(e**2, axis=0) / np.isfinite(e).sum(axis=0).clip(1))
+        for e in (error, moved_on)
+    )
     fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0  # not past inputs
     counts = fed & (task.reward.state > 0) & (old > 0) & (old * speed > LEADS * off)
     told = [i for i in np.flatnonzero(counts) if task.model.state_names[i] not in allowed]

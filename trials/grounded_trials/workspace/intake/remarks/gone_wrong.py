@@ -35,14 +35,13 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.lagging import EARLIER, lagging
+from grounded_trials.workspace.intake.remarks.lagging import lagging
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.read_before import paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
-    from grounded.search.returned.by_motion import Exchanged
     from grounded.search.returned.reversed_input import Reversed
 
 FAR = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
@@ -83,13 +82,6 @@ def gone_wrong(
     if found:
         return _is_it_wired(workspace, trial, found)
     odd = _unlike_its_runs(workspace, trial, tried) if tried is not None else ""
-    if tried is not None and (odd or astray) and (swap := _exchanged(workspace, run)):
-        shown = f", and {ranges(swap.shown)} with them as sent" * bool(swap.shown)
-        return Asked(
-            f"{swap.said}{shown}. Were their plugs, or their channels, exchanged? Then `discard "
-            f"{trial.id}`, swap them back and run {trial.candidate} again; if not, `propose` goes "
-            "on"
-        )
     if odd:
         return Asked(odd)
     if tried is None or not (others and astray and STRAYED * usual < missed < math.inf):
@@ -99,15 +91,6 @@ def gone_wrong(
         "cost otherwise: did it run as it should? If not (a motor, a sensor, somebody in the way), "
         f"`discard {trial.id}` and run {tried.candidate.id} again; if it did, `propose` goes on"
     )
-
-
-def _exchanged(workspace: Folder, run: Trial) -> Exchanged | None:
-    """Return which two inputs acted in each other's place in a run, unlike in the ones before."""
-    from grounded.search.returned.by_motion import exchanged
-
-    ran = [one for one in workspace.task_trials() if one.candidate and one.id != run.id]
-    before = [one.until(workspace.task.horizon) for one in ran[-EARLIER:]]
-    return exchanged(workspace.planner, run, before)
 
 
 def _unlike_its_runs(workspace: Folder, trial: Trial, tried: Tried) -> str:

@@ -43,6 +43,7 @@ class Fault:
         kind: that of the account: unit, sign, exchange, dead, offset, axes, pace or clock.
         inputs: the inputs that are in another unit.
         factor: how many times too large these are, below 1 too small.
+        names: all columns that are at fault, but exchanged ones.
     """
 
     said: str
@@ -52,6 +53,7 @@ class Fault:
     factor: float = 1.0
     robot: str = ""
     kind: str = ""
+    names: tuple[str, ...] = ()
 
     def told(self, trial: Trial, *, own: bool) -> str:
         """Return the warning; `own` is for a trial that was written by grounded, not a log."""
@@ -67,7 +69,8 @@ class Fault:
         if not self.mend:
             return self.said
         again = f"then discard {trial.id} and ingest the log again" if trial.id else ""
-        return f"{self.said}. {self.mend}, {again or 'and ingest it again'}"
+        end = "" if self.said.endswith("?") else "."
+        return f"{self.said}{end} {self.mend}, {again or 'and ingest it again'}"
 
 
 def log_faults(workspace: Folder, trial: Trial) -> tuple[Fault, ...]:
@@ -134,7 +137,8 @@ def _fault(workspace: Folder, known: Trial, told: Told) -> Fault:
         said, how = clause(model, told, log=False), mend(model, told)
     sent = tuple(n for n in names_of(model, account.columns) if n in model.inputs)
     should = f"write {_units(model, names_of(model, account.columns))}" * (account.kind == "unit")
-    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind)
+    every = tuple(names_of(model, account.columns))
+    return Fault(said, how, should, sent, abs(account.factor), kind=account.kind, names=every)
 
 
 def _with_limits(task: Task, known: Trial, fault: Fault) -> Fault:
