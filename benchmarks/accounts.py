@@ -27,7 +27,6 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 
 DEGREES, RPM = 180 / np.pi, 30 / np.pi
-Derivative = Callable[..., dict[str, Array]]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ search       chooses what to run next from stored trials
 solve        optimal control in the model, and the bias that makes the model replay a trial
 compile      differentiates and compiles a model written in NumPy
 diagnosis    finds what the model lacks; `effects` lists candidates; `challenge` makes blind tests
-instruments  checks sensors by their own signals, without a model of the dynamics
+accounts     judges how a log came about, and corrects what its sensors and commands show
 estimate     estimates states and noise from measurements; `fit` estimates parameters from trials
 models       models that come with grounded; `adapters` wraps models of other software
 experiments  the paper's studies

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import onboard
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
 from grounded.onboard import FORMAT, NUMBERS, Runner, misfit
@@ -267,8 +268,6 @@ def load(
     Raises:
         GroundedError: if the file is not a candidate, or is for another robot or task.
     """
-    from grounded import onboard
-
     if Path(path).suffix == ".mcap":
         return onboard.Runner(_proposed(Path(path), states, inputs, task))
     try:
@@ -282,8 +281,6 @@ def _proposed(
 ) -> Policy:
     """Read a policy with the reader registered for the file's suffix, with the checks of `load`."""
     from importlib.metadata import entry_points
-
-    from grounded import onboard
 
     readers = [p for p in entry_points(group="grounded.policies") if p.name == path.suffix[1:]]
     if not readers:

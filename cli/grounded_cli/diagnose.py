@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.errors import GroundedError
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, chosen_trials, parallel
 from grounded_cli.console.terminal import (
@@ -77,7 +78,6 @@ def command(
     candidate whose trial would tell them apart.
     """
     workspace = open_workspace()
-    from grounded.errors import GroundedError
     from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
     from grounded_trials.workspace.last_diagnosis import left_out
 

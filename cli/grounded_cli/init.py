@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.result import listed
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import (
@@ -127,7 +128,6 @@ def _ask(guess: Guess) -> str:
 
 
 def _tell(begun: Begun) -> None:
-    from grounded.result import listed
     from grounded_trials.logs.inspection.guessed_table import estimating
 
     what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why

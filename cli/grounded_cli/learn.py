@@ -20,6 +20,7 @@ from grounded_cli.console.terminal import (
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_cli.status import summary
+from grounded_trials.wording import ranges
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -89,8 +90,6 @@ def narrated(workspace: Workspace, trials: int | None = None) -> Status:
         status = workspace.learn(trials, progress=tell, each=each)
     now = {t.candidate.id: t.verdict() for t in status.standing.history}
     if sure := [n for n, then in told.items() if (then, now.get(n)) == ("maybe better", "better")]:
-        from grounded_trials.wording import ranges
-
         remark("note", f"{ranges(sure)}: maybe better when run, better by what repeats told since")
     for note in status.notes:
         remark("note", note)

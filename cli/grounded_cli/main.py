@@ -21,6 +21,10 @@ from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
+from grounded.errors import GroundedError, nearest
+from grounded_cli.console.workspace_option import given, next_line
+from grounded_trials.wording import placed
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
 
 import click
@@ -91,8 +95,6 @@ class LazyGroup(click.Group):
         name = args[0]
         if name in COMMANDS or name.startswith("-"):
             return super().resolve_command(ctx, args)
-        from grounded.errors import nearest
-
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -110,13 +112,8 @@ class LazyGroup(click.Group):
             text = f"{error.message} Did you mean {' or '.join(map(repr, meant))}?"
             raise click.NoSuchOption(error.option_name, text, ctx=error.ctx) from None
         except Exception as error:
-            from grounded.errors import GroundedError
-
             if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.console.workspace_option import given, next_line
-            from grounded_trials.wording import placed
-
             then = "" if error.then is None else f"\n{next_line(error.then)}"
             raise GroundedError(f"{placed(str(error), given())}{then}") from None
 
@@ -243,7 +240,6 @@ def _run() -> tuple[int, str]:
     except Exception as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class
             return 130, INTERRUPTED
-        from grounded.errors import GroundedError
         from grounded_cli.console.terminal import ALARM, style
 
         if isinstance(error, OSError) and error.strerror:

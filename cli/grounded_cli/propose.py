@@ -11,6 +11,7 @@ import click
 from grounded.result import begun, listed, measured_alike, with_error
 from grounded.search.candidate import BY_STEP, LITTLE, UNLIKE, run_or_stop
 from grounded.search.step.step_size import Step
+from grounded.trial import mean_trial
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import LABEL, field, number, progress, remark, show, show_json
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
@@ -179,7 +180,6 @@ def _so_far(
     which is the model's own error if it exceeds the scatter of the runs, if that is known.
     """
     from grounded.search.certainty import cost_of_start, planned_before
-    from grounded.trial import mean_trial
     from grounded_trials.workspace.off_target import began_elsewhere
 
     text = f"{number(best.utility)} by {best.candidate.id}{noise_share(best)}"

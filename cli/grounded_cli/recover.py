@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from grounded.errors import GroundedError, NextCommand
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, progress, say, show, show_json
 from grounded_cli.console.workspace_option import open_workspace, typed
@@ -96,7 +97,6 @@ def _of_foreign(found: Recovery, target: str) -> NextCommand:
 
     It is data, unless a candidate waits for its trial, which this log may be.
     """
-    from grounded.errors import GroundedError, NextCommand
     from grounded_trials.formats.message_path import parse_path
     from grounded_trials.logs.log_table import log_mapping
     from grounded_trials.workspace.candidates.search_state import standing_in
@@ -116,7 +116,6 @@ def _of_foreign(found: Recovery, target: str) -> NextCommand:
 
 def _next(found: Recovery) -> str:
     """Return the lines that say what to do with the file."""
-    from grounded.errors import NextCommand
     from grounded_trials.store.own_files import CANDIDATE
 
     target = str(found.target)

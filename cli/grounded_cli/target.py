@@ -15,7 +15,7 @@ from grounded_cli.console.workspace_option import in_workspace, next_line, open_
 from grounded_trials.wording import extent, misread, with_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from grounded.frozen import Array
     from grounded_trials import Workspace
@@ -203,7 +203,7 @@ def command(
     if rest:
         sentence(
             f"[task] start is new, where {seen} rests: "
-            f"{', '.join(f'{name} = {number(value)}' for name, value in rest.items())}. If runs "
+            f"{_equal(rest)}. If runs "
             "begin elsewhere, change it and draw the target again"
         )
     each, at_end = usual_weights(model, columns), () if ended is None else ended.columns
@@ -218,16 +218,13 @@ def command(
         ("input_change", "0.04 / (range of [limits])^2"),
     ):
         if (weights := reward.get(kind, {})) != before.get(kind, {}):
-            told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
-            sentence(f"[reward] {kind} is new, {by}: {told}")
+            sentence(f"[reward] {kind} is new, {by}: {_equal(weights)}")
         elif kind == "state" and weights and weights != suggested:
-            told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
-            usual = ", ".join(f"{name} = {number(weight)}" for name, weight in suggested.items())
             remark(
                 "note",
                 f"[reward] state is kept, since its weights are not those that the target before "
-                f"this one gave: {told}. This one gives {usual}; to have these, delete the line "
-                "and draw the target again",
+                f"this one gave: {_equal(weights)}. This one gives {_equal(suggested)}; to have "
+                "these, delete the line and draw the target again",
             )
     noisy = {} if ended is None else {n: (s, ended.weights[n]) for n, s in ended.noise.items()}
     for name, (deviation, weight) in noisy.items():
@@ -292,6 +289,10 @@ def command(
     show(f"\n{next_line(then)}")
 
 
+def _equal(by_name: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {number(value)}" for name, value in by_name.items())
+
+
 def _tell_undo(
     old: TaskTable,
     before: dict[str, dict[str, float]],
@@ -301,7 +302,7 @@ def _tell_undo(
     """Say what a new target replaced, in a workspace with candidates, and how to go back."""
     was = [f"horizon = {old.horizon}"] * (old.horizon != steps)
     was += [
-        f"[reward] {kind}: {', '.join(f'{name} = {number(w)}' for name, w in weights.items())}"
+        f"[reward] {kind}: {_equal(weights)}"
         for kind, weights in before.items()
         if weights != reward.get(kind)
     ]

@@ -14,7 +14,7 @@ from grounded.figures.body import Part, Pose
 from grounded.frozen import Array
 
 SHOWN = 3  # geom groups from here on are hidden, as in MuJoCo's viewer
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 0, 2, 3, 4, 5, 6, 7  # mjtGeom
+SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 2, 3, 4, 5, 6, 7  # mjtGeom
 THIN = 0.012  # radius of a rod, as a fraction of the model's extent
 LEAST = 1e-6  # [m] smallest half edge of a box
 

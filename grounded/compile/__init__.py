@@ -10,6 +10,7 @@ in which a function passes through them: `trace` (run once on expressions, diffe
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -26,8 +27,11 @@ from grounded.compile.problem import (
     Swarm,
     System,
     deepest,
-    history_depths,
 )
+from grounded.compile.run import jit
+from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace
@@ -42,7 +46,6 @@ __all__ = [
     "Swarm",
     "System",
     "deepest",
-    "history_depths",
     "system_of",
 ]
 MAX_COMPILED = 30_000  # operations of a model and its derivatives, about 7 s of compiling
@@ -84,16 +87,13 @@ def system_of(
 
 
 def system_from(signature: Signature, integrator: Integrator, derivatives: bool = True) -> System:
-    """The System of a function that is called so; also in another process, see `Interpreted`."""
-    from grounded.compile.run import jit
-    from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
-
+    """The System of a function that is called so."""
     if signature.jacobian is not None:
         note = "not compiled: it is run as it is, with the derivatives that come with it"
-        return _differenced(signature, integrator, note)
+        return DifferencedSystem(signature, integrator, note)
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
-        return _differenced(signature, integrator, f"not compiled, {found}")
+        return DifferencedSystem(signature, integrator, f"not compiled, {found}")
     trouble = jit.trouble()
     if trouble:
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
@@ -115,7 +115,10 @@ def system_from(signature: Signature, integrator: Integrator, derivatives: bool 
     return CompiledSteps(signature, found, integrator, note)
 
 
-def _differenced(signature: Signature, integrator: Integrator, note: str) -> System:
-    from grounded.compile.run.differenced import DifferencedSystem
+def _again(system: Interpreted) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """In another process it is made again from the function: code and caches stay here."""
+    return system_from, (system.signature, system.integrator)
 
-    return DifferencedSystem(signature, integrator, note)
+
+for engine in (CompiledSteps, CompiledSystem, DifferencedSystem, TracedSystem):
+    copyreg.pickle(engine, _again)

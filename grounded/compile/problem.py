@@ -26,7 +26,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,6 +215,26 @@ class Descent:
     lines: Array  # (i, 4): cost, predicted change, alpha (0: none was accepted), mu
 
 
+class Samples(NamedTuple):
+    """Where N steps are differentiated, see `System.linearise`."""
+
+    x: Array  # (N, n)
+    u: Array  # (N, m)
+    p: Array  # (k,)
+    dt: float
+    smoothing: float = 0.0
+    limits: Limits | None = None
+
+
+class Controls(NamedTuple):
+    """u_t = clip(ubar_t + alpha k_t + K_t (z_t - zbar_t)), see `System.rollout`."""
+
+    ubar: Array  # (H, m)
+    K: Array | None = None  # (H, m, nz)
+    zbar: Array | None = None  # (H, nz) or (H+1, nz)
+    k: Array | None = None  # (H, m)
+
+
 @dataclass(frozen=True, eq=False)
 class Swarm:
     """The runs of one rollout call, one for each alpha: z (A, H+1, nz), u (A, H, m), cost (A,)."""
@@ -276,7 +296,6 @@ class System(ABC):
         """Where the user's function makes a number that is not finite, x (n,), u (m,); or ""."""
         return ""
 
-    @abstractmethod
     def linearise(
         self,
         x: Array,
@@ -291,6 +310,11 @@ class System(ABC):
         `limits` of the inputs, low and high (m,): derivatives that are differenced are taken
         inwards there, as a simulator may clamp what lies beyond.
         """
+        return self.slopes(Samples(x, u, p, dt, smoothing, limits))
+
+    @abstractmethod
+    def slopes(self, at: Samples) -> tuple[Array, Array]:
+        """What `linearise` returns."""
 
     @abstractmethod
     def sensitivities(
@@ -298,7 +322,6 @@ class System(ABC):
     ) -> tuple[Array, Array, Array]:
         """f_x (N, n, n), f_u (N, n, m) and f_p (N, n, k)."""
 
-    @abstractmethod
     def rollout(
         self,
         problem: Problem,
@@ -313,6 +336,12 @@ class System(ABC):
         ubar (H, m), K (H, m, nz), zbar (H, nz) or (H+1, nz), k (H, m), alphas (A,) or one of 1.
         Differences of angles wrap.
         """
+        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
+        return self.runs(problem, Controls(ubar, K, zbar, k), steps)
+
+    @abstractmethod
+    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
+        """What `rollout` returns, a run for each of alphas (A,)."""
 
     @abstractmethod
     def backward(
@@ -325,16 +354,6 @@ class System(ABC):
         more: its arrays may be used again.
         """
 
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: DescentOptions,
-    ) -> Descent | None:
-        """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
-
-        From the rollout of ubar (H, m) or of ubar + K (z - zbar).
-        """
+    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
+        """The loop of `ddp.solve` from a first rollout; None where it is left to `ddp`."""
         return None

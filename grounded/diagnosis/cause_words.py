@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.report import Changed, Estimate, TrialValue
+from grounded.diagnosis.parts import Changed, Estimate, TrialValue
 from grounded.model import Model
 from grounded.result import (
     figure,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.parts import Unconfirmed
 from grounded.diagnosis.verdict import parameters_off, tied, told_apart
 from grounded.model import all_at_bounds
 from grounded.result import listed, number

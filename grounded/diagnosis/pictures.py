@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.diagnosis.error_report import Credit, RulerRow, furthest
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosed
 from grounded.diagnosis.tables import larger, weighed_beside
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, listed, measured, measured_alike, number, percent, shown
@@ -61,7 +61,7 @@ def _same(error: RulerRow, one: str, other: str) -> bool:
     return bool(known) and all(math.isclose(a[n], b[n], rel_tol=APART) for n in known)
 
 
-def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
+def gap_figures(diagnosis: Diagnosed) -> list[Figure]:
     """Return the figures of a diagnosis, most important first; none if no cause can be named."""
     if diagnosis.no_cause:
         return []
@@ -69,7 +69,7 @@ def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
     return [figure for figure in found if figure is not None]
 
 
-def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
+def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
     """Return the prediction errors without and with the diagnosis, in each state's unit."""
     errors = diagnosis.prediction_error
     if not errors:
@@ -142,7 +142,7 @@ def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ..
     return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
-def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
+def credit_figure(diagnosis: Diagnosed, channels: int = 1) -> Figure | None:
     """Return how much larger errors are without each effect and without calibration.
 
     Args:
@@ -162,7 +162,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
 
 
 def worth_figure(
-    diagnosis: Diagnosis, groups: Sequence[tuple[Sequence[str], str]]
+    diagnosis: Diagnosed, groups: Sequence[tuple[Sequence[str], str]]
 ) -> Figure | None:
     """Return the prediction errors without each cause, for some states.
 
@@ -217,7 +217,7 @@ def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
     return without / whole if whole > 0 else 0.0
 
 
-def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:
+def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosed) -> list[Bars]:
     """Return the combined error of some states a second ahead, with all causes and all but each.
 
     If effects were adopted before, also that of the model without them.
@@ -250,7 +250,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     return [Bars(f"{title}: error {error.horizon_s:.3g} s ahead", bars)]
 
 
-def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
+def _second_ahead(diagnosis: Diagnosed) -> RulerRow | None:
     errors = diagnosis.prediction_error
     horizons = [e for e in errors if not e.whole_trial]
     if horizons and horizons[0].horizon_s > CREDIT_S / 2:  # a slow process
@@ -269,7 +269,7 @@ def _improved(error: RulerRow) -> list[str]:
     return sorted(gain, key=lambda name: -gain[name])
 
 
-def where_figure(diagnosis: Diagnosis) -> Figure | None:
+def where_figure(diagnosis: Diagnosed) -> Figure | None:
     """Return the shares of the gap by channel, time and region, and the evidence for effects."""
     where = diagnosis.where
     by_channel = [
@@ -302,7 +302,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     return Figure("gap", title, caption.strip(), tuple(panels))
 
 
-def _evidence_words(diagnosis: Diagnosis) -> str:
+def _evidence_words(diagnosis: Diagnosed) -> str:
     """What the lengths and colours of the bars of evidence mean."""
     beside = weighed_beside(diagnosis) - {*diagnosis.effects}
     tied = listed([r.effect for r in diagnosis.ranking[:MOST] if r.effect in beside])
@@ -318,7 +318,7 @@ def _evidence_words(diagnosis: Diagnosis) -> str:
     )
 
 
-def _ahead(diagnosis: Diagnosis) -> str:
+def _ahead(diagnosis: Diagnosed) -> str:
     """Return the horizon at which errors by channel are measured, as text."""
     row = furthest(diagnosis.prediction_error)
     return f" {row.horizon_s:.3g} s ahead, rms" if row else ", rms"
@@ -331,7 +331,7 @@ def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, .
     )
 
 
-def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
+def _ranking(diagnosis: Diagnosed) -> tuple[Bar, ...]:
     named = set(diagnosis.effects)
     return tuple(
         Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.effect in named else "other")
@@ -339,7 +339,7 @@ def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
     )
 
 
-def _shrinkage(diagnosis: Diagnosis) -> Bars:
+def _shrinkage(diagnosis: Diagnosed) -> Bars:
     gap = diagnosis.gap
     ahead = f" {gap.horizon_s:.3g} s ahead" if math.isfinite(gap.horizon_s) else ""
     rows = (

@@ -17,7 +17,7 @@ from grounded.diagnosis.error_report import (
 from grounded.result import listed, measured_alike, number
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Agreement
+    from grounded.diagnosis.parts import Agreement
 
 NAMED = 3  # channels named in one sentence
 MATTERS = 0.05  # share of the crude model's error below which a remaining error is given as a share

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from html import escape
-from typing import TYPE_CHECKING
 
+from grounded.accounts.finding import Finding
 from grounded.diagnosis.cause_words import OWN, give_or_take, times_of
 from grounded.diagnosis.error_report import CALIBRATION, TIMES, RulerRow, furthest
+from grounded.diagnosis.parts import Diagnosed, Estimate, Ranked
 from grounded.diagnosis.ruler_words import told_row
 from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
-
-if TYPE_CHECKING:
-    from grounded.accounts.finding import Finding
-    from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
 
 Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
@@ -24,7 +21,7 @@ WITHOUT = "without: how much larger errors are without it, in the mean over stat
 EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
-def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
+def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the held-out prediction errors, in the units of the states.
 
     Args:
@@ -86,7 +83,7 @@ def _cell(row: RulerRow, column: str, name: str) -> str:
     return figure(value, 3) if math.isfinite(value) else "-"
 
 
-def credit_of(diagnosis: Diagnosis, effect: str) -> str:
+def credit_of(diagnosis: Diagnosed, effect: str) -> str:
     """Return how much larger errors are without a cause, `+7 %` or `2.4 times`; "" if unknown."""
     return next((larger(c.times) for c in diagnosis.credit if c.of == effect), "")
 
@@ -127,7 +124,7 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     return lines
 
 
-def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cells], Cells]:
+def effect_table(diagnosis: Diagnosed, *, rivals: bool = True) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the effects that were compared, the claimed ones first.
 
     Every claimed effect and every tied one has a row; rivals fill the table up to EFFECTS rows. The
@@ -158,7 +155,7 @@ def effect_table(diagnosis: Diagnosis, *, rivals: bool = True) -> tuple[list[Cel
     return rows, ("effect (*: claimed)", "without", *evidence, "value")
 
 
-def of_rivals(diagnosis: Diagnosis) -> str:
+def of_rivals(diagnosis: Diagnosed) -> str:
     """Say what the evidence of an effect that was not claimed means; "" if there is none."""
     beside = weighed_beside(diagnosis)
     if all(row.effect in beside for row in diagnosis.ranking):
@@ -170,7 +167,7 @@ def of_rivals(diagnosis: Diagnosis) -> str:
     return f"alone: in place of what is claimed, its {text}; beside that, it gains too little"
 
 
-def of_delays(diagnosis: Diagnosis) -> str:
+def of_delays(diagnosis: Diagnosed) -> str:
     """Say where the +- of times comes from, if it is not from the noise.
 
     The rows of a log may not tell when a command was sent, and states may be interpolated. "" if
@@ -198,7 +195,7 @@ def in_between(seconds: float) -> str:
     )
 
 
-def weighed_beside(diagnosis: Diagnosis) -> set[str]:
+def weighed_beside(diagnosis: Diagnosed) -> set[str]:
     """Return the effects whose evidence is what is lost without them: claimed or tied with these.
 
     That of the other ranked effects is what they gain alone.
@@ -238,7 +235,7 @@ def _value(e: Estimate) -> str:
     return give_or_take(e) if e.std else with_unit(figure(e.value, 3), e.unit)
 
 
-def as_html(diagnosis: Diagnosis, everything: str) -> str:
+def as_html(diagnosis: Diagnosed, everything: str) -> str:
     """Return HTML for a notebook: verdict, sensors, errors and effects; the rest is folded.
 
     Args:

@@ -22,7 +22,7 @@ from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import Part, RulerRow
 from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
 from grounded.diagnosis.next_trial import LOG, LOST
-from grounded.diagnosis.report import Ranked, Unconfirmed
+from grounded.diagnosis.parts import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region

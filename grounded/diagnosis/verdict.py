@@ -33,7 +33,7 @@ from grounded.diagnosis.error_report import (
     furthest,
     runaway,
 )
-from grounded.diagnosis.report import (
+from grounded.diagnosis.parts import (
     Agreement,
     Changed,
     Estimate,

@@ -25,7 +25,8 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
-from grounded.diagnosis.report import Diagnosis, Estimate, NoiseLevels, Ranked, Score, TrialGroup
+from grounded.diagnosis.parts import Estimate, NoiseLevels, Ranked, Score, TrialGroup
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import objection, open_noise
 from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import Compared, by_trial

@@ -84,7 +84,6 @@ class Scales:
     Args:
         low: smallest value of each state and input, by name.
         high: largest value, likewise.
-        quantiles: (21,) quantiles of the absolute values of each signal, by name.
         dt: control step [s].
         duration: longest trial [s].
         slowest: slowest time constant of the model that a trial is long enough to excite [s].
@@ -92,7 +91,6 @@ class Scales:
 
     low: Mapping[str, float] = field(default_factory=dict)
     high: Mapping[str, float] = field(default_factory=dict)
-    quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     dt: float = 0.05
     duration: float = 10.0
     slowest: float = 0.0
@@ -422,17 +420,15 @@ def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:
 
 def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:
     """Return the sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
-    low, high, quantiles = {}, {}, {}
+    low, high = {}, {}
     for names, values in ((model.state_names, states), (model.input_names, inputs)):
         for i, name in enumerate(names):
             column = values[np.isfinite(values[:, i]), i]
             if not len(column):
                 continue
             low[name], high[name] = (float(q) for q in np.quantile(column, [0.002, 0.998]))
-            marks = np.quantile(np.abs(column), np.linspace(0, 1, 21))
-            quantiles[name] = tuple(float(q) for q in marks)
     slowest = _slowest(model, np.nan_to_num(states), np.nan_to_num(inputs), dt, duration)
-    return Scales(low, high, quantiles, dt, duration, slowest)
+    return Scales(low, high, dt, duration, slowest)
 
 
 def _slowest(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> float:

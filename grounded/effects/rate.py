@@ -10,7 +10,7 @@ acts on the mean rate of each quarter of a step, so the limit can end within a s
 be much shorter than a step. A step that does not reach the limit is the model's own.
 
 No rate is added to a position or an angle whose rate is another state by definition, since no force
-can do that. Errors of its sensors are found by `grounded.instruments`; a gear is a `rate_gain`. But
+can do that. Errors of its sensors are found by `grounded.accounts`; a gear is a `rate_gain`. But
 two wheels of unequal size turn a vehicle in proportion to its speed, unseen by their encoders.
 """
 

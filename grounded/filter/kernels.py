@@ -18,6 +18,7 @@ import numpy as np
 
 from grounded.compile.emit.llvm_text import declarations, splat
 from grounded.compile.run import jit
+from grounded.compile.run.arguments import call
 from grounded.filter.lanes import Pass
 
 LARGEST = 16  # channels; beyond, NumPy
@@ -58,8 +59,6 @@ def run(
         values: arrays by name, made contiguous; None where there is none.
         out: arrays that are written, contiguous, or None.
     """
-    from grounded.compile.run.arguments import call
-
     words: dict[str, Any] = {
         key: 0 if value is None else np.ascontiguousarray(value, float)
         for key, value in values.items()

@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.choose import CLAIM, SCATTERS
 from grounded.diagnosis.validation.gain import LEAST, Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable

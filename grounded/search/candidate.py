@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from grounded.figures.figure import Curve, Figure, Panel, legend
 from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
-from grounded.result import Result, document, figure, percent
+from grounded.result import Result, document, figure, percent, shown
 from grounded.trial import Trial
 
 Way = Literal[
@@ -37,9 +38,21 @@ UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their 
 PART = 0.3  # share of a gain or loss due to different start states from which on it is reported
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
-if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
-    from grounded.search.starts import Starts
+
+class StartCosts(Protocol):
+    """What the start states of runs cost, by the model; see `Starts`."""
+
+    def owed(self, one: Tried, other: Tried) -> float:
+        """Return the part of the difference of two mean utilities that is due to the starts."""
+        ...
+
+    def cost(self, tried: Tried) -> float:
+        """Return what the starts of a candidate's runs cost on average."""
+        ...
+
+    def costs(self, tried: Tried) -> Array:
+        """Return what the start of each of a candidate's runs cost, (runs,)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,10 +207,18 @@ class Candidate(Result):
         )
 
     def figures(self) -> Sequence[Figure]:
-        """Return the figure of the predicted run."""
-        from grounded.search.pictures import candidate_figure
-
-        return (candidate_figure(self),)
+        """Return the figure of the predicted states and inputs over time."""
+        columns = [*zip(self.policy.state_names, self.predicted_states.T, strict=True)]
+        columns += zip(self.policy.input_names, self.predicted_inputs.T, strict=True)
+        panels = []
+        for name, values in columns:
+            times = np.arange(len(values), dtype=np.float64) * self.policy.dt
+            curve = Curve(times, values, "predicted", "predicted")
+            unit = shown(self.units.get(name, ""))
+            title = f"{name} [{unit}]" if unit else name
+            panels.append(Panel(title, "time [s]", unit, (curve,), kind="time"))
+        title = f"{self.id}: predicted utility {figure(self.predicted_utility)}"
+        return (Figure("candidate", title, "", tuple(panels), legend(panels[:1])),)
 
 
 def run_or_stop(gain: float, best: Tried) -> str:
@@ -235,7 +256,7 @@ class Tried(Result):
     unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
-    starts: Starts | None = None  # what the start states of its runs cost, by the model
+    starts: StartCosts | None = None  # what the start states of its runs cost, by the model
 
     @cached_property
     def utility(self) -> float:

@@ -24,6 +24,7 @@ from grounded.search.standing import LOST, Ending, Proposal, Standing, wild
 from grounded.search.step.directions import base_columns, direction
 from grounded.search.step.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
+from grounded.solve.bias import ground
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
@@ -84,8 +85,6 @@ class About:
         own = planner.lift(begun_at(planner.task, incumbent.trials, said))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         matched = options.match_inputs and way != "recorded inputs"
-        from grounded.solve.bias import ground
-
         self.grounding = ground(plan, own, match_inputs=matched)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         # without a bias: independent of noise and start

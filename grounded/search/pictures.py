@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule, legend
+from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded.result import figure
-from grounded.search.candidate import Candidate, Tried
-from grounded.search.standing import Standing
+from grounded.search.candidate import Tried
 
 STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
 MOST = 300  # most candidates that are drawn
@@ -24,7 +24,25 @@ OPEN = {  # labels of undecided verdicts
 NEAR = 4  # with more candidates than this, the better two thirds get a panel of their own
 
 
-def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
+class Drawn(Protocol):
+    """What is drawn of a `Standing`."""
+
+    @property
+    def history(self) -> tuple[Tried, ...]:
+        """All candidates with their trials."""
+        ...
+
+    @property
+    def incumbent(self) -> Tried | None:
+        """The best so far."""
+        ...
+
+    def verdict(self, tried: Tried) -> str:
+        """Return the verdict on a candidate."""
+        ...
+
+
+def search_figure(now: Drawn, optimum: float | None = None) -> Figure | None:
     """Draw the utility of each candidate with the model's prediction, and the step sizes.
 
     Args:
@@ -83,7 +101,7 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
 
 
 def _utility(
-    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None
+    now: Drawn, tried: list[Tried], number: dict[str, int], optimum: float | None
 ) -> Panel:
     dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
     rules, bands = [], []
@@ -178,7 +196,7 @@ def _undecided(verdicts: Sequence[str]) -> list[Key]:
     return [Key("predicted", " or ".join(names), "ring")] if names else []
 
 
-def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
+def _steps(now: Drawn, shown: list[Tried], number: dict[str, int]) -> Panel:
     """Draw the damping of each step, or alpha if a step was shortened or none was damped."""
     steps = [t for t in shown if t.candidate.iteration > 0]  # not the model's own policy
     damped = any(t.candidate.damping > 0 for t in steps)
@@ -201,20 +219,3 @@ def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
         whole=True,
         y_range=(low - 0.5, high + 0.5) if damped else (min(low, -1.0) - 0.4, 0.6),
     )
-
-
-def candidate_figure(candidate: Candidate) -> Figure:
-    """Draw the predicted states and inputs of a candidate over time."""
-    policy = candidate.policy
-    columns = [*zip(policy.state_names, candidate.predicted_states.T, strict=True)]
-    columns += zip(policy.input_names, candidate.predicted_inputs.T, strict=True)
-    shown = {name: unit for name, unit in candidate.units.items() if unit != "1"}
-    panels = []
-    for name, values in columns:
-        times = np.arange(len(values), dtype=np.float64) * policy.dt
-        curve = Curve(times, values, "predicted", "predicted")
-        unit = shown.get(name, "")
-        title = f"{name} [{unit}]" if unit else name
-        panels.append(Panel(title, "time [s]", unit, (curve,), kind="time"))
-    title = f"{candidate.id}: predicted utility {figure(candidate.predicted_utility)}"
-    return Figure("candidate", title, "", tuple(panels), legend(panels[:1]))

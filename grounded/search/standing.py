@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import NextCommand
+from grounded.figures.figure import Figure
 from grounded.result import Result, document, figure, html_table, percent, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
 from grounded.search.certainty import (
@@ -38,6 +39,7 @@ from grounded.search.certainty import (
     runs_needed,
     runs_to_show,
 )
+from grounded.search.pictures import search_figure
 from grounded.search.scatter import Repeats
 from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
@@ -45,7 +47,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
     from grounded.search.planner import Planner
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
@@ -170,7 +171,21 @@ class Standing(Result):
     def table(self) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
         """Return (rows, header) of all candidates, as `grounded status` prints them."""
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
-        return [_row(one, self.verdict(one)) for one in self.history], header
+        return [self.row(one) for one in self.history], header
+
+    def row(self, tried: Tried) -> tuple[str, ...]:
+        """Return a candidate's row of the table."""
+        return (
+            tried.candidate.id,
+            str(tried.candidate.iteration),
+            f"{tried.candidate.alpha:g}",
+            figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
+            figure(tried.promised),
+            figure(tried.utility),
+            spread(tried.standard_error),
+            str(len(tried.trials)),
+            self.verdict(tried),
+        )
 
     def _repr_html_(self) -> str:
         """Return the candidates as a table and the phase as a sentence, for Jupyter."""
@@ -182,8 +197,6 @@ class Standing(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
-        from grounded.search.pictures import search_figure
-
         found = search_figure(self)
         return () if found is None else (found,)
 
@@ -219,20 +232,6 @@ class Proposal(Result):
         )
         best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
         return known | best if made else known
-
-
-def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
-    return (
-        tried.candidate.id,
-        str(tried.candidate.iteration),
-        f"{tried.candidate.alpha:g}",
-        figure(tried.candidate.damping, 2) if tried.candidate.base else "-",
-        figure(tried.promised),
-        figure(tried.utility),
-        spread(tried.standard_error),
-        str(len(tried.trials)),
-        verdict,
-    )
 
 
 def standing(

@@ -33,7 +33,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.compile import Backward, Descent, DescentOptions, Problem, Status
-from grounded.compile.problem import CEILING, FLOOR, GROWTH, LARGE_MU, LEAST, SEARCH_FLOOR
+from grounded.compile.problem import (
+    CEILING,
+    FLOOR,
+    GROWTH,
+    LARGE_MU,
+    LEAST,
+    SEARCH_FLOOR,
+    Controls,
+)
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
@@ -91,8 +99,9 @@ def solve(
     """
     options = options or DescentOptions()
     _check(problem, ubar, K, zbar)
-    found = problem.system.descend(problem, ubar, K, zbar, options)
-    return _solution(problem, found or descended(problem, ubar, K, zbar, options))
+    first = Controls(ubar, K, zbar)
+    found = problem.system.descend(problem, first, options)
+    return _solution(problem, found or descended(problem, first, options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +112,10 @@ class _State:
     mu: float
 
 
-def descended(
-    problem: Problem, ubar: Array, K: Array | None, zbar: Array | None, options: DescentOptions
-) -> Descent:
+def descended(problem: Problem, first: Controls, options: DescentOptions) -> Descent:
     """The loop of `solve`; a compiled system has the same in one kernel (`System.descend`)."""
-    first = problem.system.rollout(problem, ubar, K, zbar)
-    state = _State(first.z[0], first.u[0], float(first.cost[0]), 0.0)
+    run = problem.system.rollout(problem, *first)
+    state = _State(run.z[0], run.u[0], float(run.cost[0]), 0.0)
     lines: list[tuple[float, float, float, float]] = []
     gains: Backward | None = None
 
@@ -232,20 +239,17 @@ def sweep(
     problem: Problem,
     z: Array,
     u: Array,
-    damping: Array | None = None,
     mu: float = 0.0,
     into: Backward | None = None,
 ) -> Sweep:
-    """Sweeps back along z (H+1, nz), u (H, m) with damping (m,) + mu * problem.input_scale.
+    """Sweeps back along z (H+1, nz), u (H, m) with damping mu * problem.input_scale.
 
     mu grows tenfold after each failure; when it passes 1e10 the failed sweep is returned, with
     `ok` False: the trajectory or the model holds no finite numbers. `into`: see `System.backward`.
     """
-    base = np.zeros(problem.system.m) if damping is None else np.asarray(damping, float)
-    scale = problem.input_scale
     gains = into
     while True:
-        gains = problem.system.backward(problem, z, u, base + mu * scale, gains)
+        gains = problem.system.backward(problem, z, u, mu * problem.input_scale, gains)
         if gains.failed_at < 0 or mu >= CEILING:
             return Sweep(gains, mu)
         mu = max(FLOOR, GROWTH * mu)

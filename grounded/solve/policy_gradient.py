@@ -13,7 +13,6 @@ utility. theta is one of
 
     open loop    the inputs ubar (H, m) themselves
     feedback     ubar (H, m) and the gains K (H, m, nz) of u = ubar + K (z - zbar)
-    a class      a few named parameters of a function of the user's (`policy_class.py`)
 
 A gradient has a direction and no length. `ascent` measures inputs by the curvature 2 (R + S) of
 their own cost, and takes the length that gains most in the biased model.
@@ -21,9 +20,8 @@ their own cost, and takes the length that gains most in the biased model.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
     from grounded.task import Task
 
-Theta = TypeVar("Theta")
 LENGTHS = 2.0 ** np.arange(3, -25, -1)  # of a step, in units of the scaled gradient
 
 
@@ -128,26 +125,13 @@ def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
         forward = policy.feedforward + length * d
         return replace(policy, feedforward=np.clip(forward, *_room(policy, forward)), gain=gain)
 
-    return best_length(policy, moved, lambda theta: -simulate(problem, theta).utility)
-
-
-def best_length(
-    start: Theta, moved: Callable[[float], Theta], cost: Callable[[Theta], float]
-) -> Theta:
-    """The policy of least cost among the start and what steps of LENGTHS make of it.
-
-    Args:
-        start: theta.
-        moved: theta after a step of some length.
-        cost: of a theta, in the model.
-    """
-    best, lowest = start, cost(start)
+    best, lowest = policy, -simulate(problem, policy).utility
     for length in LENGTHS.tolist():
         candidate = moved(length)
-        found = cost(candidate)
-        if found < lowest:
-            best, lowest = candidate, found
-        elif best is not start:
+        cost = -simulate(problem, candidate).utility
+        if cost < lowest:
+            best, lowest = candidate, cost
+        elif best is not policy:
             break  # shorter ones gain less and less
     return best
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.compile import DescentOptions, Problem, system_of
+from grounded.compile.problem import Controls
 from grounded.solve.ddp import descended
 from problems import problem
 
@@ -32,8 +33,8 @@ def test_the_compiled_loop_takes_the_decisions_of_the_loop_in_numpy(halvings):
         H, m = task.horizon, task.system.m
         u = u0 * np.cos(np.arange(H * m) * 0.1).reshape(H, m)
         options = DescentOptions(max_iterations=most, halvings=halvings, accept=0.3)
-        fast = task.system.descend(task, u, None, None, options)
-        slow = descended(task, u, None, None, options)
+        fast = task.system.descend(task, Controls(u), options)
+        slow = descended(task, Controls(u), options)
         assert (fast.status, fast.cost, fast.failed_at) == (slow.status, slow.cost, slow.failed_at)
         for one in ("lines", "z", "u", "k", "K"):
             assert np.array_equal(getattr(fast, one), getattr(slow, one)), one

@@ -13,7 +13,7 @@ from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.report import Ranked
+from grounded.diagnosis.parts import Ranked
 from grounded.diagnosis.validation.blame import ENOUGH, fewest, loss, still
 from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 from grounded.filter import kalman

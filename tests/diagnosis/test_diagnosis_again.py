@@ -16,7 +16,8 @@ from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.parts import Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.decide import LIKELY
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Gap, Region, Remainder, UtilityPrediction, Where
-from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.parts import Estimate, Made, Ranked, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.result import Document

@@ -8,7 +8,7 @@ import pytest
 
 from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.hypotheses.leftover import Leftover
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.measured import Measured
 
 

@@ -9,7 +9,8 @@ import pytest
 from grounded import Trial
 from grounded.diagnosis.error_report import AT_MOST, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.next_trial import LOG, LOST
-from grounded.diagnosis.report import Agreement, Diagnosis, Verdict
+from grounded.diagnosis.parts import Agreement, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import (
     in_doubt,
     objection,

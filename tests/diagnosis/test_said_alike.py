@@ -7,13 +7,8 @@ import pytest
 
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import Credit
-from grounded.diagnosis.report import (
-    Diagnosis,
-    Estimate,
-    Identifiable,
-    Ranked,
-    Verdict,
-)
+from grounded.diagnosis.parts import Estimate, Identifiable, Ranked, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import EFFECTS, effect_table
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import verdict

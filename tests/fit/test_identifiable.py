@@ -8,7 +8,7 @@ import pytest
 from facts import holding
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation import limits
 from grounded.diagnosis.validation.limits import _jointly
 from grounded.effects import Library

@@ -70,7 +70,7 @@ def test_a_damped_sweep_descends_and_shrinks_with_damping():
     run = task.system.rollout(task, u)
     size = np.inf
     for factor in (0.1, 1.0, 10.0):
-        gains = sweep(task, run.z[0], u, factor * task.input_scale).gains
+        gains = sweep(task, run.z[0], u, factor).gains
         assert gains.d1 < 0 <= gains.d2
         assert np.abs(gains.k).sum() < size
         size = np.abs(gains.k).sum()

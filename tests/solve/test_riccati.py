@@ -90,7 +90,7 @@ def test_heavy_damping_points_along_the_gradient(name):
     m = task.system.m
     u = 0.3 + np.zeros((30, m))
     run = task.system.rollout(task, u)
-    gains = sweep(task, run.z[0], u, np.full(m, 1e9)).gains
+    gains = task.system.backward(task, run.z[0], u, np.full(m, 1e9))
     gradient = np.empty_like(u)
     for i in np.ndindex(*u.shape):
         up, down = u.copy(), u.copy()

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.diagnosis.parts import Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
@@ -234,8 +236,6 @@ def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, A
 
     A case whose logs are refused counts as unknown: nothing is named, and the others go on.
     """
-    from grounded.diagnosis.report import Diagnosis, Verdict
-
     begin, case = time.process_time(), Folder(Path(folder) / name)
     try:
         diagnose_in(case, without=without)

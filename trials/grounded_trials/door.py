@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, needs
 from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.folder import Folder
 
@@ -340,7 +340,6 @@ class Workspace(Folder):
         Raises:
             GroundedError: if the extra `report` is missing.
         """
-        from grounded.errors import needs
         from grounded_trials.report.reporting import watched
 
         needs("jinja2", "report")

@@ -148,9 +148,9 @@ def placed(text: str, folder: str | None) -> str:
     return _NAMED.sub(as_typed, text) if folder is not None else text
 
 
-def folded(command: str, lead: str = "next: ") -> str:
-    """Return a command after its lead, continued with a backslash if wider than the terminal."""
-    lines = [lead]
+def folded(command: str) -> str:
+    """Return a command as the next one, continued with a backslash if wider than the terminal."""
+    lines = ["next: "]
     for word in _WORD.findall(command):
         if len(lines[-1]) + len(word) + 3 > columns() and lines[-1].strip():
             lines[-1] = lines[-1].rstrip() + " \\"

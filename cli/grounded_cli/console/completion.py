@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem, get_completion_class
 
+from grounded.errors import GroundedError
 from grounded_cli.console.terminal import show
 from grounded_cli.console.workspace_option import given
 
@@ -51,7 +52,6 @@ def trials(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[
 
 def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete the effects that the last diagnosis ranked, best first."""
-    from grounded.errors import GroundedError
     from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
     try:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.result import percent
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import (
     field,
@@ -113,8 +114,6 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
 
 def _tell(document: dict[str, Any], verdict: list[str], *, once: bool) -> None:
     """Print what was learned and diagnosed; `once`: no run was repeated, so scatter is unknown."""
-    from grounded.result import percent
-
     first, last = document["utilities"][0], document["utilities"][-1]
     gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
     gain += ", none of them repeated" * once

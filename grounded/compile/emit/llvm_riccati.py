@@ -241,18 +241,6 @@ class _Sweep:
                 v = f.fma(alone, f.load(self.F, j * self.P + at, size), v, size)
             f.store(v, self.v, at, size)
 
-    def _add_feedback(self) -> None:
-        """V += F'K in a loop, for large models."""
-        f, m, size, P = self.f, self.layout.m, self.size, self.P
-        with f.loop(self.layout.nz) as c:
-            start, column = f.at(self.V, f.integer("mul", c, P)), f.at(self.F, c)
-            factors = [f.load_all(column, j * P, size) for j in range(m)]
-            for at in self.cut:
-                row = f.load(start, at, size)
-                for j, factor in enumerate(factors):
-                    row = f.fma(factor, f.load(self.K, j * P + at, size), row, size)
-                f.store(row, start, at, size)
-
     def _state_cost(self, t: str) -> list[tuple[str, str] | None]:
         """(l_z, l_zz) for each entry of z, None where it has no cost."""
         f, layout = self.f, self.layout

@@ -33,11 +33,12 @@ from grounded.compile.kernel_words import (
 from grounded.compile.problem import (
     STATUSES,
     Backward,
+    Controls,
     Descent,
     DescentOptions,
     Integrator,
-    Limits,
     Problem,
+    Samples,
     Swarm,
 )
 from grounded.compile.run import jit
@@ -163,16 +164,9 @@ class CompiledSystem(TracedSystem):
                 words[i] += size
         return z
 
-    def linearise(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float = 0.0,
-        limits: Limits | None = None,
-    ) -> tuple[Array, Array]:
+    def slopes(self, at: Samples) -> tuple[Array, Array]:
         """See `System.linearise`."""
+        x, u, p, dt, smoothing, _ = at
         N, n = len(x), self.n
         f_x, f_u = zeros((N, n, n)), zeros((N, n, self.m))
         library = self._compiled(p, dt).batch()
@@ -215,25 +209,16 @@ class CompiledSystem(TracedSystem):
         POINT.pack_into(words, 0, address(x), address(u), address(p), dt, eps, len(x), *results)
         run(kernel, words)
 
-    def rollout(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None = None,
-        zbar: Array | None = None,
-        k: Array | None = None,
-        alphas: Array | None = None,
-    ) -> Swarm:
+    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
         """See `System.rollout`."""
-        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
-        runs, H, nz = len(steps), problem.horizon, problem.nz
+        runs, H, nz = len(alphas), problem.horizon, problem.nz
         z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
         known, lanes = packed(problem), np.empty(LANES)
-        values = _policy(ubar, K, zbar, k) | {"alphas": lanes}
+        values = _policy(by) | {"alphas": lanes}
         kernel = self._search(problem)[0]["rollout" if runs == 1 else "rollouts"]
         for at in range(0, runs, LANES):
             some = min(LANES, runs - at)
-            lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
+            lanes[:some], lanes[some:] = alphas[at : at + some], alphas[at]
             values |= {"runs": some, "z": z[at:], "u": u[at:], "cost": cost[at:]}
             run(kernel, table(ROLLOUT, known.words, values))
         return Swarm(z, u, cost)
@@ -261,14 +246,7 @@ class CompiledSystem(TracedSystem):
             failed = 0
         return Backward(k, K, float(expected[0]), float(expected[1]), failed)
 
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: DescentOptions,
-    ) -> Descent | None:
+    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
         """See `System.descend`."""
         if self.m > MAX_INPUTS:
             return None
@@ -281,9 +259,9 @@ class CompiledSystem(TracedSystem):
             | {"expected": (2,), "result": (4,), "lines": (most + 1, 4)}
         )
         results["alphas"][:] = 1.0
-        policy = _policy(ubar, K, zbar, None)
-        first = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
-        rollout = table(ROLLOUT, known, at | first | policy)
+        run_0 = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
+        policy = _policy(first)  # the arrays live as long as the kernel runs
+        rollout = table(ROLLOUT, known, at | run_0 | policy)
         sweep = table(SWEEP, known | {"jacobian": jacobian}, at)
         values = at | {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
         values |= {"halvings": int(options.halvings), "max_iterations": most}
@@ -313,13 +291,13 @@ class CompiledSteps(CompiledSystem):
     how = "compiled steps"
     derivatives = False
 
-    linearise = TracedSystem.linearise
+    slopes = TracedSystem.slopes
     sensitivities = TracedSystem.sensitivities
     backward = TracedSystem.backward
     descend = TracedSystem.descend
 
 
-def _policy(ubar: Array, K: Array | None, zbar: Array | None, k: Array | None) -> dict[str, Any]:
+def _policy(by: Controls) -> dict[str, Any]:
     """Words of a policy: those that are not given are null."""
-    given = {"ubar": ubar, "K": None if zbar is None else K, "zbar": zbar, "k": k}
+    given = by._asdict() | {"K": None if by.zbar is None else by.K}
     return {name: 0 if array is None else plain(array) for name, array in given.items()}

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
-from grounded.compile.problem import Limits
+from grounded.compile.problem import Samples
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
 from grounded.foreign import contained
@@ -70,7 +70,7 @@ class DifferencedSystem(Interpreted):
             self._batches = False
             self.note += SLOW
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
-            len(x), len(self.signature.outputs)
+            len(x), len(self.signature.states)
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
@@ -98,21 +98,13 @@ class DifferencedSystem(Interpreted):
                 "jacobian out to difference the step"
             )
 
-    def jacobian(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float,
-        width: int,
-        limits: Limits | None = None,
-    ) -> Array:
+    def jacobian(self, at: Samples, width: int) -> Array:
         """See `Interpreted.jacobian`; by central differences.
 
         Where derivatives come with the model, those by a parameter are taken to one side: half the
         steps, and none with a friction below zero.
         """
+        x, u, p, dt, _, limits = at
         shifted = self.n + self.m
         both, free = np.concatenate([x, u], axis=1), np.full(shifted, np.inf)
         low, high = -free, free.copy()
@@ -123,8 +115,8 @@ class DifferencedSystem(Interpreted):
         size = max(1, CHUNK // (2 * shifted))
         if self.signature.jacobian is not None:
             J[:, :, :shifted], size = self._given(x, u, p, dt), 0
-        for at in range(0, len(x), size) if size else ():
-            some = slice(at, at + size)
+        for first in range(0, len(x), size) if size else ():
+            some = slice(first, first + size)
             J[some, :, :shifted] = self._differences(both[some], p, dt, low, high)
         given = self.signature.jacobian is not None
         base = self.step(x, u, p, dt) if given and width > shifted else None
@@ -200,8 +192,8 @@ class DifferencedSystem(Interpreted):
         self._calls += 1
         try:
             values = self._call([*x.T], [*u.T], p, dt)
-            result = np.empty((len(x), len(self.signature.outputs)))
-            for i, name in enumerate(self.signature.outputs):
+            result = np.empty((len(x), len(self.signature.states)))
+            for i, name in enumerate(self.signature.states):
                 result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
         except Exception:  # whatever it is, the call on one sample tells the user
             return None
@@ -216,25 +208,25 @@ class DifferencedSystem(Interpreted):
     def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The function on one sample; NaN where it leaves the finite numbers."""
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.full(len(self.signature.outputs), np.nan)
+            return np.full(len(self.signature.states), np.nan)
         try:
             values = self._call(x.tolist(), u.tolist(), p, dt)
         except ArithmeticError:
-            return np.full(len(self.signature.outputs), np.nan)
+            return np.full(len(self.signature.states), np.nan)
         except ValueError as error:
             if "math domain error" in str(error) or "nonnegative input" in str(error):
-                return np.full(len(self.signature.outputs), np.nan)
+                return np.full(len(self.signature.states), np.nan)
             raise self._failure(error) from error
         except GroundedError:
             raise
         except Exception as error:
             raise self._failure(error) from error
-        return np.array([self._number(name, values[name]) for name in self.signature.outputs])
+        return np.array([self._number(name, values[name]) for name in self.signature.states])
 
     def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
         with np.errstate(all="ignore"):
             values = self.signature.call(x, u, np.asarray(p, float).tolist(), dt)
-        check_names(values, self.signature.outputs, self.signature.function)
+        check_names(values, self.signature.states, self.signature.function)
         return values
 
     def _number(self, name: str, value: Any) -> float:

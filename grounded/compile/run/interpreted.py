@@ -30,7 +30,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +41,11 @@ from grounded.compile.problem import (
     ROUNDING,
     STOP,
     Backward,
+    Controls,
     Integrator,
-    Limits,
     Problem,
     Queue,
+    Samples,
     Swarm,
     System,
 )
@@ -70,31 +70,13 @@ class Interpreted(System):
         self.source = where(signature.function)
         self.n, self.m, self.k = self.sizes = signature.sizes
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """In another process it is made again from the function: code and caches stay here."""
-        from grounded.compile import system_from
-
-        return system_from, (self.signature, self.integrator)
-
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The user's function: x (N, n), u (N, m), p (k,) -> ds/dt or next state (N, n)."""
 
     @abstractmethod
-    def jacobian(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float,
-        width: int,
-        limits: Limits | None = None,
-    ) -> Array:
-        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width).
-
-        `limits`: see `System.linearise`.
-        """
+    def jacobian(self, at: Samples, width: int) -> Array:
+        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
 
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
         """See `System.fault`; at the state itself, and where a first stage of the step goes."""
@@ -108,26 +90,18 @@ class Interpreted(System):
             except (ArithmeticError, ValueError) as error:
                 kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
                 return f"{raised_at(error, signature.function)}: {kind}{error}"
-            found = np.array([float(values[name]) for name in signature.outputs])
+            found = np.array([float(values[name]) for name in signature.states])
             if not np.isfinite(found).all():
-                name = signature.outputs[int(np.argmin(np.isfinite(found)))]
+                name = signature.states[int(np.argmin(np.isfinite(found)))]
                 return f"{self.source}: {values[name]:g} for '{name}'"
             if self.kind == "step":
                 break
             x = x + 0.5 * dt * found
         return ""
 
-    def linearise(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float = 0.0,
-        limits: Limits | None = None,
-    ) -> tuple[Array, Array]:
+    def slopes(self, at: Samples) -> tuple[Array, Array]:
         """See `System.linearise`."""
-        J = self.jacobian(x, u, p, dt, smoothing, self.n + self.m, limits)
+        J = self.jacobian(at, self.n + self.m)
         f_x, f_u = np.split(J, [self.n], axis=2)
         return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u)
 
@@ -135,7 +109,7 @@ class Interpreted(System):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """See `System.sensitivities`."""
-        J = self.jacobian(x, u, p, dt, smoothing, sum(self.sizes))
+        J = self.jacobian(Samples(x, u, p, dt, smoothing), sum(self.sizes))
         f_x, f_u, f_p = np.split(J, [self.n, self.n + self.m], axis=2)
         return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
 
@@ -152,21 +126,13 @@ class Interpreted(System):
             k4 = self.evaluate(x + dt * k3, u, p, dt, smoothing)
             return np.asarray(x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
 
-    def rollout(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None = None,
-        zbar: Array | None = None,
-        k: Array | None = None,
-        alphas: Array | None = None,
-    ) -> Swarm:
+    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
         """See `System.rollout`."""
 
         def step(x: Array, sent: Array, t: int) -> Array:
             return self.step(x, sent, problem.p, problem.dt, problem.smoothing)
 
-        return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+        return rolled_out(problem, step, by, alphas)
 
     def backward(
         self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
@@ -179,14 +145,11 @@ class Interpreted(System):
 def rolled_out(
     problem: Problem,
     step: Callable[[Array, Array, int], Array],
-    ubar: Array,
-    K: Array | None,
-    zbar: Array | None,
-    k: Array | None,
-    alphas: Array | None,
+    by: Controls,
+    alphas: Array,
 ) -> Swarm:
-    """`System.rollout` with a step from x (A, n), received inputs (A, m) and t to the next x."""
-    alphas = np.ones(1) if alphas is None else np.asarray(alphas, float)
+    """`System.runs` with a step from x (A, n), received inputs (A, m) and t to the next x."""
+    ubar, K, zbar, k = by
     queue, n, runs = problem.queue, problem.system.n, len(alphas)
     z = np.empty((runs, problem.horizon + 1, problem.nz))
     u = np.empty((runs, problem.horizon, problem.system.m))

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile.problem import STAGES, Integrator, Limits
+from grounded.compile.problem import STAGES, Integrator, Samples
+from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
 from grounded.errors import GroundedError
@@ -39,8 +40,6 @@ class TracedSystem(Interpreted):
     @cached_property
     def original(self) -> Interpreted:
         """The function as it is."""
-        from grounded.compile.run.differenced import DifferencedSystem
-
         return DifferencedSystem(self.signature, self.integrator)
 
     def variant(self, p: Array, dt: float) -> Variant:
@@ -84,20 +83,12 @@ class TracedSystem(Interpreted):
                 "Does it use random numbers, keep a memory, or look at the type of its arguments?"
             )
 
-    def jacobian(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float,
-        width: int,
-        limits: Limits | None = None,
-    ) -> Array:
+    def jacobian(self, at: Samples, width: int) -> Array:
         """See `Interpreted.jacobian`; exact."""
+        x, u, p, dt, smoothing, _ = at
         J = np.empty((len(x), self.n, width))
-        for at in range(0, len(x), CHUNK):
-            some = slice(at, at + CHUNK)
+        for first in range(0, len(x), CHUNK):
+            some = slice(first, first + CHUNK)
             with np.errstate(all="ignore"):
                 J[some] = self._chain(x[some], u[some], p, dt, smoothing, width)
         return J

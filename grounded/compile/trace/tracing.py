@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
+from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
@@ -35,14 +36,8 @@ class Signature:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     params: tuple[str, ...]
-    returns: tuple[str, ...] = ()  # names of what it returns; empty: the states
     within: tuple[Integrator, int] | None = None  # a step made of so many steps of a derivative
     jacobian: Callable[..., tuple[Any, Any]] | None = None  # the user's own f_x, f_u of a step
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the returned values, in array order."""
-        return self.returns or self.states
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -97,19 +92,18 @@ class Trace:
         return all(bool(v) == outcome for v, (_, outcome) in zip(found, self.guards, strict=True))
 
 
-def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NODES) -> Trace | str:
+def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
     """The trace, or why there is none, naming file and line.
 
     Args:
         signature: the function and its names.
         p: parameter values (k,) that decide an `if` on parameters; None: every `if` is taken.
         dt: control step [s], which may be part of such a decision.
-        limit: most operations.
 
     Raises:
         GroundedError: for what is wrong with the function on any path: names, a complex result.
     """
-    graph, guards = Graph(limit), []
+    graph, guards = Graph(MAX_NODES), []
 
     def oracle(i: int) -> bool:
         if graph.varies(i):
@@ -135,8 +129,8 @@ def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NOD
         return f"{raised_at(error, signature.function)}: {error}"
     except Exception as error:  # the plain call will tell whether this is the user's mistake
         return f"{raised_at(error, signature.function)}: {type(error).__name__}: {error}"
-    check_names(values, signature.outputs, signature.function)
-    outputs = tuple(_output(graph, name, values[name], signature) for name in signature.outputs)
+    check_names(values, signature.states, signature.function)
+    outputs = tuple(_output(graph, name, values[name], signature) for name in signature.states)
     return Trace(graph, outputs, tuple(guards))
 
 
@@ -180,8 +174,6 @@ class Variant:
         Raises:
             TooLong: when they are more operations than can be compiled.
         """
-        from grounded.compile.trace.derivative import jacobian
-
         variables = self._variables(width)
         column = {v: c for c, v in enumerate(variables)}
         rows = jacobian(self.trace.graph, self.trace.outputs, variables)

@@ -25,7 +25,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import base_columns, linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Likeness
+from grounded.diagnosis.parts import Likeness
 from grounded.effects import Effect, ParamFamily
 from grounded.filter import kalman
 

@@ -27,7 +27,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.report import Likeness
+from grounded.diagnosis.parts import Likeness
 from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily, one_friction
 from grounded.frozen import Array
 

@@ -30,7 +30,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.report import Agreement, Changed, Estimate, TrialValue
+from grounded.diagnosis.parts import Agreement, Changed, Estimate, TrialValue
 from grounded.frozen import Array
 
 CHANCE = 1e-3  # p-value of a common value below which trials disagree, if

@@ -19,7 +19,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Estimate, Likeness, Ranked
+from grounded.diagnosis.parts import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.blame import ENOUGH, MOVED, STILL, Blame, moved_parameters
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import Backward, Problem, Swarm, System, deepest
-from grounded.compile.problem import Limits
+from grounded.compile.problem import Controls, Samples
 from grounded.compile.run.interpreted import linearised, rolled_out, sweep, trajectory_cost
 from grounded.frozen import Array, readonly, wrapped
 from grounded.policy import Policy
@@ -103,18 +103,11 @@ class Corrected(System):
         """See `System.check`."""
         self.base.check(self._own(x), u, p, dt)
 
-    def linearise(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float = 0.0,
-        limits: Limits | None = None,
-    ) -> tuple[Array, Array]:
+    def slopes(self, at: Samples) -> tuple[Array, Array]:
         """See `System.linearise`."""
+        x = at.x
         n, m = self.base.n, self.m
-        f_x, f_u = self.base.linearise(self._own(x), u, p, dt, smoothing, limits)
+        f_x, f_u = self.base.slopes(at._replace(x=self._own(x)))
         F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
         by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
         F[:, n : 2 * n, : 2 * n + m] = np.concatenate([by_x, by_y, by_before], axis=2)
@@ -134,21 +127,13 @@ class Corrected(System):
         by_p[:, : self.base.n] = f_p
         return *self.linearise(x, u, p, dt, smoothing), by_p
 
-    def rollout(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None = None,
-        zbar: Array | None = None,
-        k: Array | None = None,
-        alphas: Array | None = None,
-    ) -> Swarm:
+    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
         """See `System.rollout`."""
 
         def step(x: Array, sent: Array, t: int) -> Array:
             return self.stepped(problem, x, sent, t)
 
-        return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+        return rolled_out(problem, step, by, alphas)
 
     def stepped(self, problem: Problem, x: Array, sent: Array, t: int) -> Array:
         """Return the states after step t of a problem, without its bias.

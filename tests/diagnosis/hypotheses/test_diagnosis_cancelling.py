@@ -8,7 +8,7 @@ from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.effects import Library
 from grounded.models.car import model as car
 

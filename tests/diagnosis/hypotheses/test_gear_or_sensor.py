@@ -11,7 +11,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.hypotheses.lookalike import related
-from grounded.diagnosis.report import Estimate, Ranked
+from grounded.diagnosis.parts import Estimate, Ranked
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import _level, verdict
 from grounded.effects import Library

@@ -12,7 +12,8 @@ from facts import holds
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.next_trial import CHANGED
-from grounded.diagnosis.report import Changed, Diagnosis, Estimate, Made
+from grounded.diagnosis.parts import Changed, Estimate, Made
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.ruler import repeated
 from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
 from grounded.effects import Library

@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.limits import knowable, limits

@@ -11,7 +11,7 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.parts import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.credit import losses, shares

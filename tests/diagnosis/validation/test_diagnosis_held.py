@@ -10,7 +10,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Identifiable
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation import claims as claims_of
 from grounded.diagnosis.validation.blame import Blame
 from grounded.diagnosis.verdict import _causes

@@ -13,8 +13,18 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
-from grounded_trials.formats.schemas import COUNT_LIMIT, DEPTH_LIMIT, NUMBERS
+from grounded_trials.formats.messages import (
+    COUNT_LIMIT,
+    DEPTH_LIMIT,
+    NUMBERS,
+    Array,
+    BadSchema,
+    Field,
+    Number,
+    Struct,
+    Text,
+    Type,
+)
 
 # An unterminated comment or text extends to the end, so that nothing is scanned twice.
 _TOKEN = re.compile(

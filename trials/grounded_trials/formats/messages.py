@@ -97,6 +97,14 @@ class Dynamic:
 
 Type = Number | Text | Array | Struct | Dynamic
 
+DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # nesting of types; items of an array
+_KINDS = {"int": ("i", 1, 2, 4, 8), "uint": ("u", 1, 2, 4, 8), "float": ("f", 4, 8)}
+NUMBERS = {  # by their ROS names: int8 ... float64
+    f"{word}{8 * size}": Number(f"{kind}{size}")
+    for word, (kind, *sizes) in _KINDS.items()
+    for size in sizes
+} | {"bool": Number("b1"), "char": Number("u1")}
+
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -20,17 +20,21 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
-from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
-
-DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # nesting of types; items of an array
-_KINDS = {"int": ("i", 1, 2, 4, 8), "uint": ("u", 1, 2, 4, 8), "float": ("f", 4, 8)}
-NUMBERS = {  # by their ROS names: int8 ... float64
-    f"{word}{8 * size}": Number(f"{kind}{size}")
-    for word, (kind, *sizes) in _KINDS.items()
-    for size in sizes
-} | {"bool": Number("b1"), "char": Number("u1")}
+from grounded_trials.formats.messages import (
+    COUNT_LIMIT,
+    DEPTH_LIMIT,
+    NUMBERS,
+    Array,
+    BadSchema,
+    Field,
+    Number,
+    Struct,
+    Text,
+    Type,
+)
 
 
 def struct_of(schema: Schema) -> Struct:
@@ -45,8 +49,6 @@ def struct_of(schema: Schema) -> Struct:
     if schema.encoding in ("ros1msg", "ros2msg"):
         return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
     if schema.encoding in ("ros2idl", "omgidl"):
-        from grounded_trials.formats.idl_schema import parse_idl
-
         return parse_idl(text, schema.name)
     raise BadSchema(
         f"the schema's language '{schema.encoding}' can't be read; expected ros1msg, ros2msg, "

@@ -68,6 +68,11 @@ class Samples:
         sensor = 0 < self.spec.delay_s <= MIXED_S  # other values of delay_s bridge two clocks
         return int(self.t[0]) + round(self.spec.delay_s * 1e9) * sensor
 
+    def within(self, first: int, last: int) -> tuple[Ints, Floats]:
+        """Return the stamps [ns] and the values from `first` to `last` [ns]."""
+        inside = (self.t >= first) & (self.t <= last)
+        return self.t[inside], self.y[inside]
+
     def max_gap(self, dt: float) -> float:
         """Return the largest distance of two samples between which values are known [s]."""
         if self.spec.max_age_s is not None:

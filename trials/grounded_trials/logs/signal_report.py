@@ -135,8 +135,7 @@ def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> l
     """
     slow: dict[str, list[str]] = {}
     for samples in series:
-        inside = (samples.t >= first) & (samples.t <= last)
-        t, y = samples.t[inside], samples.y[inside]
+        t, y = samples.within(first, last)
         new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
         lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
         if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
@@ -167,8 +166,7 @@ def outliers(series: Sequence[Samples], first: int, last: int) -> list[str]:
     """
     found = []
     for samples in series:
-        inside = (samples.t >= first) & (samples.t <= last)
-        t, y = samples.t[inside], samples.y[inside]
+        t, y = samples.within(first, last)
         if len(y) < LEAST_RUNS:
             continue
         jump = np.abs(np.diff(y))  # in and out again, or a step would count

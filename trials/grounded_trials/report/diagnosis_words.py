@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from grounded.diagnosis.cause_words import ended, furthest_apart, give_or_take, value_of, with_worth
 from grounded.diagnosis.error_report import Correction, Gap
-from grounded.diagnosis.report import Changed, Diagnosis, Estimate
+from grounded.diagnosis.parts import Changed, Estimate
+from grounded.diagnosis.report import Diagnosis
 from grounded.result import begun, listed
 from grounded_trials.wording import (
     ALONE,

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 from grounded.diagnosis.tables import WITHOUT, effect_table, error_table, of_delays
 from grounded.errors import NextCommand
-from grounded.search.candidate import Tried
 from grounded.search.certainty import by_starts, explained, share_of_cost
 from grounded.search.pictures import few
 from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
@@ -29,7 +28,6 @@ from grounded_trials.wording import (
     legend,
     per_second,
     rendered,
-    spread,
     wrapped,
 )
 from grounded_trials.workspace.candidates.proposing import not_counted
@@ -59,7 +57,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     if findings.lost:
         lines = ["left out of this report"]
         for one in findings.lost:
-            lines += _wrapped(f"{one.file}: {one.reason}", "  ")
+            lines += _wrapped(f"{one.file}: {one.reason}")
         parts.append("\n".join(lines))
     parts.append(folded(rendered(findings.then, findings.folder)))
     return "\n\n".join(parts)
@@ -87,18 +85,18 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if not history:
         return "utility\n  no candidate was proposed yet"
     shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
-    rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
+    rows = [(*row[:3], *row[4:]) for row in map(findings.standing.row, shown)]  # without damping
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = [
         "utility",
         table(rows, header),
-        *_wrapped(legend(LEGEND, [t.candidate.iteration for t in shown]), "  "),
+        *_wrapped(legend(LEGEND, [t.candidate.iteration for t in shown])),
     ]
     if left:
         status = rendered(NextCommand("status"), findings.folder)
-        lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
+        lines += _wrapped(f"({left} more between them: {status} shows all)")
     if spark := bars([t.utility for t in history if t.utilities]):
-        lines += ["", *_wrapped(f"{spark}; by candidate, higher is better", "  ")]
+        lines += ["", *_wrapped(f"{spark}; by candidate, higher is better")]
     first, best = findings.first, findings.best
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
@@ -113,24 +111,11 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
                 text += f"; {start}"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
-        lines += _wrapped(text, "  ")
+        lines += _wrapped(text)
     if less := findings.standing.less_in_log:
-        lines += _wrapped(less, "  ")
-    lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}", "  ")
+        lines += _wrapped(less)
+    lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}")
     return "\n".join(lines)
-
-
-def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
-    return (
-        tried.candidate.id,
-        str(tried.candidate.iteration),
-        f"{tried.candidate.alpha:g}",
-        figure(tried.promised),
-        figure(tried.utility),
-        spread(tried.standard_error),
-        str(len(tried.trials)),
-        verdict,
-    )
 
 
 def _trajectories(findings: Findings, table: Table) -> str:
@@ -143,7 +128,7 @@ def _trajectories(findings: Findings, table: Table) -> str:
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
     note = "off: from the desired path; gap: from what the model predicted for that run"
     title = "trajectories, rms over the run"
-    return "\n".join([title, table(rows, header), *_wrapped(note, "  ")])
+    return "\n".join([title, table(rows, header), *_wrapped(note)])
 
 
 def _biases(findings: Findings, table: Table) -> str:
@@ -162,22 +147,22 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         told = f"not diagnosed yet: {rendered(DIAGNOSE, findings.folder)}"
         if not (findings.runs or findings.logs):
             told = "nothing to diagnose yet: no trial and no log of data is stored"
-        return "\n".join(["gap to the model", *_wrapped(told, "  ")])
+        return "\n".join(["gap to the model", *_wrapped(told)])
     lines = ["gap to the model"]
     shown = so_far(diagnosis, since, findings.settled)
     causes, others = verdict_lines(diagnosis)
     for line in (*shown, *(f"- {cause}" for cause in causes), *others):
-        lines += _wrapped(line, "  ")
+        lines += _wrapped(line)
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):
-        lines += _wrapped(f"{title}: {text}", "  ")
+        lines += _wrapped(f"{title}: {text}")
     if diagnosis.prediction_error and not diagnosis.no_cause:
         lines += ["", table(*error_table(diagnosis, whole_trials=False))]
     rows, header = effect_table(diagnosis, rivals=False)
     if rows and not diagnosis.no_cause:
         known = any(row[1] for row in rows)
         notes = "; ".join(filter(None, (WITHOUT * known, of_delays(diagnosis))))
-        lines += ["", table(rows, header), *(_wrapped(notes, "  ") if notes else ())]
+        lines += ["", table(rows, header), *(_wrapped(notes) if notes else ())]
     return "\n".join(lines)
 
 
@@ -196,5 +181,5 @@ def _logs(findings: Findings, table: Table) -> str:
     )
 
 
-def _wrapped(text: str, indent: str) -> list[str]:
-    return wrapped(text, indent, indent + "  ")
+def _wrapped(text: str) -> list[str]:
+    return wrapped(text, "  ", "    ")

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, needs
+from grounded.figures.figure import typeset
 from grounded.result import Result
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
@@ -43,9 +45,6 @@ class Report(Result):
     def _repr_html_(self) -> str:
         """Return the candidates, the diagnosis in three lines and the next command as HTML."""
         from html import escape
-
-        from grounded.figures.figure import typeset
-        from grounded_trials.report.settled import told
 
         findings, diagnosis = self.findings, self.findings.diagnosis
         said: list[str] = []

@@ -11,7 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from grounded.diagnosis.report import Diagnosis, Estimate, Made
+from grounded.diagnosis.cause_words import GIVEN, ended, give_or_take, meaning
+from grounded.diagnosis.parts import Estimate, Made
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
 from grounded.result import begun, listed, number
@@ -226,8 +228,6 @@ class _Known:
 
 def _given(name: str, rests: Mapping[str, Sequence[str]]) -> str:
     """Return a clause on the parameters that a value rests on; "" for none."""
-    from grounded.diagnosis.cause_words import GIVEN
-
     return GIVEN.format(listed(rests[name])) if rests.get(name) else ""
 
 
@@ -235,7 +235,6 @@ def _clause(
     entry: Mapping[str, Any], model: Model, known: _Known, rests: Mapping[str, Sequence[str]]
 ) -> str:
     """Return an adopted effect in words, with its values; those that may be zero are left out."""
-    from grounded.diagnosis.cause_words import meaning
     from grounded.effects import param_name
     from grounded_trials.workspace.adopted import installed_effects
 
@@ -274,7 +273,6 @@ def _rows(
     rests: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter."""
-    from grounded.diagnosis.cause_words import give_or_take
     from grounded.effects import param_name
     from grounded_trials.workspace.adopted import installed_effects
 
@@ -302,8 +300,6 @@ def _rows(
 
 def _at_end(param: Param, value: float) -> str:
     """Return `, at its bound, the data ask for less` of such a value; "" for another."""
-    from grounded.diagnosis.cause_words import ended
-
     at = Estimate(value, stopped=param.stopped(value))
     return "".join(f", {clause}" for clause in ended(at, param.value))
 

@@ -31,9 +31,9 @@ from grounded_trials.logs.inspection.inspect_evidence import (
 from grounded_trials.logs.inspection.inspect_guess import (
     PARTS,
     Guess,
-    clock_of,
     guess_mapping,
     is_simulated,
+    taking,
 )
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.inspect_pairs import rates_among, velocities
@@ -199,14 +199,14 @@ def _begin(
     report = inspect_log(log)
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
-    if all(field.low is None for topic in report.topics for field in topic.fields):
-        there = [field.path for topic in report.topics for field in topic.fields]
+    if all(field.low is None for field in report.numbers):
+        there = [field.path for field in report.numbers]
         words = f"only text in {listed(there[:NAMED])}" if there else "no column but the times"
         raise GroundedError(
             f"{log} holds no numbers, {words}: init needs a log with the robot's states and "
             "commands as numbers"
         )
-    numbers = [field for topic in report.topics for field in topic.fields if field.low is not None]
+    numbers = [field for field in report.numbers if field.low is not None]
     if all(field.low == field.high for field in numbers):
         raise GroundedError(
             f"nothing changes in {log}: each of its {count(len(numbers), 'number')} is the same in "
@@ -357,9 +357,8 @@ def _only_named(report: LogReport, guess: Guess, of: str) -> Guess:
     """Mark a generic skeleton's signal as a guess: only its name and path come from the log."""
     why, own = f"a guess that it is a{'n' * (of == 'input')} {of}", moving(report).get(guess.name)
     if own is not None and own.path != guess.path:
-        topic = next(t for t in report.topics if own in t.fields)
-        clock = clock_of(report, topic)
-        guess = Guess(guess.name, own.path, clock, sure=False, others=(), field=own)
+        bare = Guess(guess.name, "", "", sure=False, others=())
+        return taking(bare, own.path, report, why)
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 
@@ -390,12 +389,11 @@ def _last_number(
     left = [field.path for field in moving(report).values() if field.path not in used]
     if len(lost) != 1 or len(left) != 1 or not {*model.states} <= {*known, *beside}:
         return tuple(inputs)
-    topic, field = next((t, f) for t in report.topics for f in t.fields if f.path == left[0])
     said = Stated.by(report.files).unit(left[0])
     if said and factor_between(said, model.inputs[lost[0]]) is None:
         return tuple(inputs)
-    why, clock = ("no name matches; the only number left",), clock_of(report, topic)
-    one = Guess(lost[0], left[0], clock, sure=False, others=(), field=field, reasons=why)
+    bare = Guess(lost[0], "", "", sure=False, others=())
+    one = taking(bare, left[0], report, "no name matches; the only number left")
     one = as_stated(Stated.by(report.files), model.inputs[lost[0]], one)
     return tuple(one if guess.name == lost[0] else guess for guess in inputs)
 

@@ -16,7 +16,7 @@ from grounded_trials.logs.inspection.inspect_guess import (
     PARTS,
     POSES,
     Guess,
-    clock_of,
+    taking,
 )
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import rates_among
@@ -122,7 +122,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     for name in inputs:
         if name not in found:
-            same = [one for t in log.topics for one in t.fields if _word(one.path) == name]
+            same = [one for one in log.numbers if _word(one.path) == name]
             if same:
                 raise GroundedError(
                     f"'{name}' is constant ({same[0].low:g}) in this log, so it can't be an input "
@@ -239,7 +239,7 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         for topic in log.topics:
             if _says(topic, wanted):
                 return kind, f"{topic.topic} {what}"
-    words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
+    words = {_word(one.path).lower() for one in log.numbers}
     if both:
         return "differential", f"it has the commands {' and '.join(both)}, and a heading"
     if sent := _speed_and_turn(log):
@@ -299,8 +299,7 @@ def _crane(log: LogReport, units: Units) -> Skeleton:
 
 def _headed(log: LogReport) -> bool:
     """Return whether a log has a heading that changes."""
-    moving_paths = (f.path for t in log.topics for f in t.fields if f.low != f.high)
-    return any(HEADING.search(path.lower()) for path in moving_paths)
+    return any(HEADING.search(path.lower()) for path in log.moving)
 
 
 def _two_unnamed(topic: TopicReport) -> tuple[str, ...]:
@@ -311,7 +310,7 @@ def _two_unnamed(topic: TopicReport) -> tuple[str, ...]:
 
 def _both_sides(log: LogReport) -> tuple[str, ...]:
     """Return the names of a left and a right command; () without both, or without a heading."""
-    paths = {f.path for t in log.topics for f in t.fields if f.low != f.high}
+    paths = {*log.moving}
     if not _headed(log):
         return ()
     for left in sorted(paths):
@@ -367,7 +366,7 @@ def encoders(log: LogReport, joints: Joints) -> str:
         for one in topic.fields
     )
     wheels = set(joints) - set(of_arms(joints))
-    moves = {f.path for t in log.topics for f in t.fields if f.low != f.high}
+    moves = {*log.moving}
     turned = [topic for topic in joints if topic in wheels and f"{topic}.position[0]" in moves]
     return "" if driven or not turned else turned[0]
 
@@ -376,15 +375,14 @@ def by_encoders(states: Sequence[Guess], log: LogReport, joints: Joints, r: floa
     """Give x and v of a balancing robot the first wheel's angle and speed, times a radius r [m]."""
     if not (where := encoders(log, joints)):
         return list(states)
-    fields = {f.path: (topic, f) for topic in log.topics for f in topic.fields}
+    moving = {*log.moving}
     wheel, ends, found = joints[where][0], {"x": "position", "v": "velocity"}, []
     for guess in states:
         path = f"{where}.{ends.get(guess.name, '')}[0]"
-        if path in fields and guess.name in ends:
-            topic, field = fields[path]
+        if path in moving and guess.name in ends:
             why = f"of '{wheel}', times the radius r: enter yours here and in model.py"
-            own = Guess(guess.name, path, clock_of(log, topic), False, (), field, (why,), r)
-            guess = own if field.low != field.high else guess
+            bare = Guess(guess.name, "", "", sure=False, others=(), scale=r)
+            guess = taking(bare, path, log, why)
         found.append(guess)
     return found
 
@@ -416,7 +414,7 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
 
 def _car(log: LogReport, units: Units) -> Skeleton:
     """Return the car skeleton: driven by the log's own command, steered in rad or unitless."""
-    numbers = [one.path for topic in log.topics for one in topic.fields]
+    numbers = [one.path for one in log.numbers]
     said = {unit_in_name(path) for path in numbers if "steer" in _word(path).lower()} - {""}
     angle = any(factor_between(unit, "rad") is not None for unit in said)
     part = any(factor_between(unit, "1") is not None for unit in said)

@@ -77,5 +77,5 @@ def _sampled(
 
 def _holds(table: Path, mapping: LogMapping) -> bool:
     """Return whether a table has all states and inputs of [log]: then it is a log, no target."""
-    known = {f.path for t in inspect_log(table).topics for f in t.fields}
+    known = {f.path for f in inspect_log(table).numbers}
     return all(s.path in known for s in (*mapping.states.values(), *mapping.inputs.values()))

@@ -18,6 +18,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
+from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
 from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,
@@ -55,7 +56,6 @@ def encoded_candidate(
             entry of `meta` is reserved.
     """
     from grounded_trials.formats.mcap_whole import Column, whole_file
-    from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
 
     _refuse_faulty(policy)
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)

@@ -18,6 +18,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
+from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter, encode_doubles
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically
 
@@ -58,8 +59,6 @@ class TrialWriter:
         start_states: Mapping[str, float] | None = None,
         start_ns: int = 0,
     ) -> None:
-        from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter
-
         held = None if start_inputs is None else np.asarray(start_inputs, float).tolist()
         table = stated(
             TRIAL,
@@ -103,8 +102,6 @@ class TrialWriter:
 
     def extend(self, trial: Trial) -> None:
         """Add a whole trial, as repeated calls of `append`."""
-        from grounded_trials.formats.mcap_writer import encode_doubles
-
         states, inputs = encode_doubles(trial.states), encode_doubles(trial.inputs)
         with self._writing():
             for k, (state, input) in enumerate(zip_longest(states, inputs)):

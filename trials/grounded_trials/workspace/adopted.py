@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from grounded.effects import param_name
 from grounded.effects.family import (
     Effect,
     Family,
@@ -67,8 +68,6 @@ def settled(
     params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
     """Split parameters into the model's own, and those of effects, which are set in the effects."""
-    from grounded.effects import param_name
-
     own, changed = dict(params), []
     for effect in effects:
         names = {q: param_name(str(effect["name"]), q) for q in effect}

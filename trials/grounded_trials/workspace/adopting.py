@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from grounded.diagnosis.cause_words import wider
-from grounded.diagnosis.report import Diagnosis, Estimate
+from grounded.diagnosis.parts import Estimate
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, listed
 from grounded_trials.store.documents import write_document

@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.report import Estimate, Made, Ranked
+from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.progress import duration
 from grounded.result import begun

@@ -26,7 +26,8 @@ from grounded_trials.workspace.read_before import changed_since
 from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Made
+    from grounded.diagnosis.parts import Made
+    from grounded.diagnosis.report import Diagnosis
     from grounded.fit import Fit
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -157,7 +158,7 @@ def left_out(workspace: Folder) -> list[str]:
 
 def made_from(diagnosis: Diagnosis) -> Made:
     """Return what a diagnosis was made from; of an older version it does not say."""
-    from grounded.diagnosis.report import Made  # slow: most commands find no diagnosis
+    from grounded.diagnosis.parts import Made  # slow: most commands find no diagnosis
 
     return diagnosis.made or Made()
 

@@ -43,11 +43,6 @@ class Placing:
     rms: Array
     runs: Array
 
-    @property
-    def known(self) -> bool:
-        """Whether enough runs began to tell their scatter."""
-        return bool((self.runs >= FEWEST).any())
-
 
 @dataclass(frozen=True)
 class FromStarts:

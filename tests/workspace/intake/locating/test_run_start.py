@@ -620,7 +620,7 @@ def test_what_was_sent_first_holds_before_where_commands_never_rest(w, tmp_path)
 
 
 def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
-    from grounded.diagnosis.report import Estimate, Ranked
+    from grounded.diagnosis.parts import Estimate, Ranked
     from grounded_trials.workspace.diagnosing import _as_known
     from grounded_trials.workspace.folder import Folder
     from grounded_trials.workspace.identity import unsure_times

@@ -42,6 +42,7 @@ from grounded_trials.logs.inspection.inspect_guess import (
     Guess,
     clock_of,
     commands_of,
+    taking,
 )
 from grounded_trials.logs.inspection.inspect_log import LogReport, TopicReport
 from grounded_trials.logs.inspection.inspect_pairs import (
@@ -251,7 +252,7 @@ def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> 
     taken = {guess.path for guess in guesses.values()}
     if name not in guesses or guesses[name].path or guesses[name].others:
         return {}
-    fields = [f for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
+    fields = [f for f in log.numbers if f.low != f.high and f.path not in taken]
     bare = [f.path for f in fields if re.search(r"\.data(\[\d+\])?$", f.path)]
     return {name: replace(guesses[name], others=tuple(bare[:COMBINATIONS]))}
 
@@ -346,7 +347,7 @@ def from_the_rest(
         joints: units of joints' numbers by path, see `joint_units`.
     """
     stated, taken = Stated.by(log.files), {guess.path for guess in guesses}
-    moving = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    moving = log.moving
     left = [p for p in moving if p not in taken and not PARTS.search(p)]
     lost = [guess for guess in guesses if not guess.path and not guess.others]
     fits = {g.name: [p for p in left if _goes_with(stated.unit(p), units[g.name])] for g in lost}
@@ -392,10 +393,8 @@ def _in_logs_order(fits: Mapping[str, list[str]]) -> dict[str, tuple[str, tuple[
 
 
 def _ordered(guess: Guess, path: str, others: tuple[str, ...], log: LogReport) -> Guess:
-    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
     why = f"no name matches; {listed((path, *others))} have a unit that fits, in the log's order"
-    clock = clock_of(log, topic)
-    return replace(guess, path=path, field=field, clock=clock, others=others, reasons=(why,))
+    return taking(replace(guess, others=others), path, log, why)
 
 
 def _offering(guess: Guess, wanted: str, stated: Stated, log: LogReport) -> Guess:
@@ -408,9 +407,8 @@ def _offering(guess: Guess, wanted: str, stated: Stated, log: LogReport) -> Gues
 
 
 def _alone_by_unit(guess: Guess, path: str, log: LogReport) -> Guess:
-    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
     why = "no name matches; of the remaining numbers only this one has a unit that fits"
-    return replace(guess, path=path, field=field, clock=clock_of(log, topic), reasons=(why,))
+    return taking(guess, path, log, why)
 
 
 def _goes_with(said: str, wanted: str) -> bool:

@@ -181,10 +181,9 @@ def _by_words(log: LogReport, inputs: Sequence[Guess], units: Mapping[str, str])
         if len(paths) != 1 or claimed.count(paths[0]) > 1:
             found.append(guess)
             continue
-        why = ("the only command in the log with this word in its name",)
-        topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == paths[0])
-        now = replace(guess, path=paths[0], field=field, clock=clock_of(log, topic), reasons=why)
-        found.append(replace(now, sure=True, others=()))
+        now = replace(guess, sure=True, others=())
+        why = "the only command in the log with this word in its name"
+        found.append(taking(now, paths[0], log, why))
     return found
 
 
@@ -277,12 +276,10 @@ def _only_command(log: LogReport, guess: Guess, unit: str) -> Guess:
     if guess.path or not guess.reasons or len(guess.others) != 1:
         return guess
     path = guess.others[0]
-    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
     if not _may_be(path, unit):
         return guess
-    why = ("no name matches; the only command in the log that changes",)
-    clock = clock_of(log, topic)
-    return replace(guess, path=path, clock=clock, others=(), field=field, reasons=why)
+    why = "no name matches; the only command in the log that changes"
+    return taking(replace(guess, others=()), path, log, why)
 
 
 def commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
@@ -303,7 +300,7 @@ def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ..
     """Return the usual names of a state; north and east only if the log has both."""
     if name == "v" and "u" in states:
         return _BESIDE_U
-    said = {without_unit(f.path).lower().rpartition(".")[2] for t in log.topics for f in t.fields}
+    said = {without_unit(f.path).lower().rpartition(".")[2] for f in log.numbers}
     plane = all(said.intersection(axis) for axis in _COMPASS)
     left = () if plane else {one for axis in _COMPASS for one in axis}
     return tuple(one for one in _MEANINGS.get(name, (name,)) if one not in left)
@@ -427,6 +424,12 @@ def _moving(ranked: list[_Candidate]) -> _Candidate:
 def _alike(path: str, other: str) -> bool:
     """Check whether two numbers have the same name in their messages, or units that may agree."""
     return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
+
+
+def taking(guess: Guess, path: str, log: LogReport, why: str) -> Guess:
+    """Return a guess that takes a number of the log, by its topic's clock, for a reason."""
+    topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
+    return replace(guess, path=path, field=field, clock=clock_of(log, topic), reasons=(why,))
 
 
 def clock_of(log: LogReport, topic: TopicReport) -> str:

@@ -99,6 +99,16 @@ class LogReport:
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
 
     @property
+    def numbers(self) -> list[FieldReport]:
+        """The numbers of all topics."""
+        return [field for topic in self.topics for field in topic.fields]
+
+    @property
+    def moving(self) -> list[str]:
+        """Paths of the numbers that take more than one value."""
+        return [field.path for field in self.numbers if field.low != field.high]
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """Warnings about the log, as sentences for a person."""
         return _remarks(self)

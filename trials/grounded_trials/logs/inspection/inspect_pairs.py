@@ -64,7 +64,7 @@ def paired(
         fits.
     """
     taken = {guess.path for guess in guesses.values()}
-    free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
+    free = [path for path in log.moving if path not in taken]
     own = {name: guesses[name] for name in pair}
     bare = [name for name, guess in own.items() if not guess.path and not guess.others]
     if not bare:
@@ -213,7 +213,7 @@ def agreed(
     in metres.
     """
     stated, (q, w) = signals.stated, (guesses[name] for name in pair)
-    fields = [f.path for t in log.topics for f in t.fields if f.low != f.high]
+    fields = log.moving
     if (q.sure and w.sure) or not (q.path and w.path) or len(fields) > MANY:
         return {}
 

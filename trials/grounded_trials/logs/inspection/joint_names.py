@@ -192,7 +192,7 @@ def wide_joints(
 
     They are probably in degrees, against the ROS conventions.
     """
-    fields = {field.path: field for topic in log.topics for field in topic.fields}
+    fields = {field.path: field for field in log.numbers}
     called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
     found = []
     for one in guesses:

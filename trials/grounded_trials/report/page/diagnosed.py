@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 from grounded.diagnosis.cause_words import give_or_take
 from grounded.diagnosis.error_report import AT_MOST, ChannelParts, Parts, Split, doubt_of
+from grounded.diagnosis.parts import Estimate, TrialValue
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import Diagnosis, Estimate, TrialValue
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import of_delays, of_rivals
 from grounded.diagnosis.verdict import told_apart
 from grounded.result import begun

@@ -25,6 +25,7 @@ from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
 from grounded.result import begun
+from grounded.search.certainty import by_starts, chance, explained, last_improvement, share_of_cost
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_notes import note_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -222,8 +223,6 @@ def _heading(findings: Findings) -> str:
     worse = any(one.after > one.before and not one.is_same for one in rows)
     if worse:
         return "What the runs changed"
-    from grounded.search.certainty import chance, explained
-
     if (two := _first_and_best(findings)) is None or not explained(*two, findings.history):
         return "What improved"
     sure, (first, best) = chance(*two, findings.history), (one.candidate.id for one in two)
@@ -244,8 +243,6 @@ def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    from grounded.search.certainty import by_starts, explained, share_of_cost
-
     rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
     same = first is None or best is None or figure(first.utility) == figure(best.utility)
@@ -312,8 +309,6 @@ def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
         logs = count(len(findings.logs) + findings.left_logs, "log")
         return [Block("text", f"No candidate has been proposed yet; {logs} of data.")]
-    from grounded.search.certainty import last_improvement
-
     sure = last_improvement(findings.history)
     few = len(findings.history) <= OPEN
     rows, header = utility_terms(findings)

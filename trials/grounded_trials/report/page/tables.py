@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
+from grounded.diagnosis.parts import Estimate, Ranked
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import undetermined, weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure

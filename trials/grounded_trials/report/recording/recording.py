@@ -7,7 +7,7 @@
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
     /verdict, /credit         what to run next, why the model was wrong; the share of each cause
-    /paths/crashes/t0007      where a run ended early; see `crashes.py`
+    /paths/crashes/t0007      where a run ended early
     /utilities, /summary      utility by iteration, and a summary in Markdown
 
 There is one timeline, `time`, in seconds since the start of a trial. Numbers are logged as whole
@@ -33,10 +33,9 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.calmed import averaged, window_of
-from grounded_trials.report.figures.paths import crash
+from grounded_trials.report.figures.paths import crash, ended
 from grounded_trials.report.findings import Findings, Run, selection
 from grounded_trials.report.forecast import forecast
-from grounded_trials.report.recording.crashes import LABELS, mark_place, mark_time
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.recording.texts import credit, summary, verdict
 from grounded_trials.report.scene import scene_of
@@ -51,6 +50,9 @@ FINE = 600  # steps above which the bias of a trial is averaged, to keep files s
 Colour = tuple[int, int, int]
 FRAMES = 600  # largest number of poses of a body in an animation
 VERTICES = 1000  # largest number of points of a path in space
+ARM = 0.02  # half the size of a crash's cross, as a fraction of the path's size
+LABELS = 6  # largest number of crashes whose labels are always shown; more show on hovering
+CROSS = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1))  # seen from above, and from the side
 
 
 def write_recording(findings: Findings, path: Path) -> None:
@@ -211,17 +213,49 @@ class _Recorder:
         early = [run for run in self.findings.runs if crash(run) is not None]
         reached = [self.body.path(run.trial.states[: run.trial.finite_steps + 1]) for run in early]
         size = float(np.ptp(np.vstack([points, *reached]), axis=0).max()) if early else 0.0
-        colour, every = COLOURS["model"], list(range(self.task.model.n))
+        every = list(range(self.task.model.n))
         for run in early:
             name, few = run.trial.id, len(early) <= LABELS
-            mark_place(self.stream, f"paths/crashes/{name}", self.body, run, size, colour, few)
-            mark_place(self.stream, f"trials/{name}/crash", self.body, run, size, colour, True)
-            mark_time(self.stream, f"trials/{name}/state/ended", run, self.dt, every, colour)
+            self.cross(f"paths/crashes/{name}", run, ARM * size, few)
+            self.cross(f"trials/{name}/crash", run, ARM * size, True)
+            self.last_values(f"trials/{name}/state/ended", run, every, COLOURS["model"])
         for role, one in self.compared.items():
             for i, name in enumerate(self.task.model.state_names):
                 if one is not None:
-                    at = f"state/{name}/ended_{role}"
-                    mark_time(self.stream, at, one, self.dt, [i], COLOURS[role])
+                    self.last_values(f"state/{name}/ended_{role}", one, [i], COLOURS[role])
+
+    def cross(self, at: str, run: Run, arm: float, labelled: bool) -> None:
+        """Record a cross where a run ended early, with a label to see or to hover over."""
+        import rerun as rr
+
+        last = crash(run)
+        place = None if last is None else self.body.path(run.trial.states[[last]])[0]
+        if place is None or not np.isfinite(place).all():
+            return
+        lines = [[place - end, place + end] for end in arm * np.array(CROSS)]
+        labels = [ended(run), *[""] * (len(lines) - 1)]
+        look = {"colors": COLOURS["model"], "radii": rr.Radius.ui_points(2)}
+        strips = rr.LineStrips3D(lines, labels=labels, show_labels=labelled, **look)
+        self.stream.log(at, strips, static=True)
+
+    def last_values(self, at: str, run: Run, columns: list[int], colour: Colour) -> None:
+        """Record the last values of some states as crosses, when a run ended early."""
+        import rerun as rr
+
+        last = crash(run)
+        values: Array = np.zeros(0) if last is None else run.trial.states[last, columns]
+        if last is None or not np.isfinite(values).all():
+            return
+        look = rr.SeriesPoints(
+            colors=[colour] * len(columns),
+            markers=["cross"] * len(columns),
+            marker_sizes=[5.0] * len(columns),
+            names=[ended(run)] * len(columns),
+        )
+        self.stream.log(at, look, static=True)
+        when = [rr.TimeColumn("time", duration=np.array([last * self.dt]))]
+        parts = rr.Scalars.columns(scalars=values).partition([len(columns)])
+        self.stream.send_columns(at, when, parts)
 
     def signals(self, at: str, trial: Trial, residual: Array) -> None:
         """Record states, inputs and bias, each as one entity with named columns."""

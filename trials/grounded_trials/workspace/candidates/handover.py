@@ -28,12 +28,12 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.result import listed
-from grounded.rollout import seen_late
+from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.certainty import beyond_one_trial
 from grounded.search.feedback.oscillation import quiet_gains
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, mean_trial
 from grounded_trials.store.store import Stored
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import ranges, what_became, with_unit
@@ -460,9 +460,7 @@ class Check:
 
     def _predicted(self) -> Candidate:
         """Predict the candidate with the current model, grounded on its trials or its base's."""
-        from grounded.rollout import simulate
         from grounded.solve.bias import ground
-        from grounded.trial import mean_trial
 
         planner, made = self.workspace.planner, self.candidate
         plan, horizon = planner.engaged, planner.task.horizon

@@ -20,7 +20,7 @@ import grounded
 from grounded.compile.run.jit import store, stored
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.planner import model_fingerprint
-from grounded.search.standing import Standing
+from grounded.search.standing import Proposal, Standing, standing
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import (
     readable_diagnosis,
@@ -51,8 +51,6 @@ def standing_in(
     Raises:
         GroundedError: if a stored file is damaged, or the task can't be planned.
     """
-    from grounded.search.standing import standing
-
     contents = contents or workspace.read()
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
@@ -76,7 +74,6 @@ def answered(workspace: Folder, now: Standing) -> Standing:
 def planned(workspace: Folder, contents: Contents) -> Proposal:
     """Ask the search for a proposal, unless it is known to have ended with these contents."""
     from grounded.search.improve import propose
-    from grounded.search.standing import Proposal, standing
 
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]

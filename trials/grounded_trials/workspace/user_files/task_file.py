@@ -20,6 +20,7 @@ from grounded.model import Model
 from grounded.task import MAX_HORIZON, Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file
+from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.user_files.config import Config
 from grounded_trials.workspace.user_files.model_file import check_names
 
@@ -395,8 +396,6 @@ def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
     """Write a target file, see `target_text`."""
-    from grounded_trials.store.store import write_atomically
-
     write_atomically(path, target_text(dt, columns).encode())
 
 

@@ -1,0 +1,420 @@
+"""What a diagnosis says: a tree of frozen values, which is also its JSON document.
+
+`to_json` gives the document of `diagnose --json`; `from_json` reads it back, including older
+versions. `report.Diagnosis` is the whole of it with its figures and its table for notebooks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from grounded.accounts.finding import Finding, late_effects
+from grounded.diagnosis.error_report import (
+    BRIEF,
+    Combination,
+    Correction,
+    Credit,
+    Gap,
+    Identifiable,
+    Region,
+    Remainder,
+    RulerRow,
+    RunChange,
+    UtilityPrediction,
+    Where,
+)
+from grounded.diagnosis.ruler_words import objection
+from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.result import Document, number
+
+Kind = Literal["effect", "several", "none", "unknown"]
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict(Document):
+    """The verdict: its kind, the effects that it claims, and sentences that explain them.
+
+    `sentences` has one entry per line, `sentence` joins them. One is made of `clauses`, one per
+    cause in the order of `Diagnosis.credit`, or per group of `causes`; before it is `comparison`,
+    of two groups of trials. `parameters` are off. `look_for`: number of effects that a
+    deeper diagnosis may name, or 0. `again`: whether to diagnose again once these effects, as many
+    as can be named, are adopted. `limit`: why no cause is named, an entry of `unknowable`.
+    """
+
+    kind: str  # one of `Kind`
+    effects: tuple[str, ...] = ()
+    sentence: str = ""
+    causes: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+    clauses: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    look_for: int = 0
+    again: bool = field(metadata=BRIEF, default=False)
+    limit: str = field(metadata=BRIEF, default="")
+    comparison: str = field(metadata=BRIEF, default="")
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The sentences; in older documents, all of them as one."""
+        return self.sentences or (self.sentence or self.kind,)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Document):
+    """A value, its standard deviation, its 95 % interval (None in older documents), its unit."""
+
+    value: float
+    std: float = math.nan
+    interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
+    unit: str = ""
+    stopped: str = field(metadata=BRIEF, default="")  # the bound that it reached (`Param`)
+
+    def moved(self, by: float) -> Estimate:
+        """Return the estimate shifted by a constant."""
+        ends = None if self.interval is None else (self.interval[0] + by, self.interval[1] + by)
+        return Estimate(self.value + by, self.std, ends, self.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked(Document):
+    """One explanation: its values, evidence [nats] over the model alone, the gap that it leaves."""
+
+    effect: str
+    params: Mapping[str, Estimate] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)  # constants, which are not fitted
+    evidence: float = math.nan
+    gap_after: float = math.nan
+    shrinkage: float = math.nan  # share of the gap that it closes
+    claimed: bool = False
+    no_better: bool = False  # likely by evidence, but predicts held-out trials no better
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All its quantities, as `grounded.effects.wrap` takes them."""
+        return {name: e.value for name, e in self.params.items()} | dict(self.fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness(Document):
+    """A candidate that reproduces a share of a claimed effect's signal."""
+
+    effect: str
+    like: str
+    share: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Unconfirmed(Document):
+    """A likely effect that few trials show, mostly `trial` from `start` to `end` [s].
+
+    seen: number of trials that hold most of its action, and of all trials; `trials`: these, those
+    that show it best first. region: where it acts.
+    repeats: these trials all make nearly the same motion, so it can't be distinguished from
+    anything else that repeats with the motion.
+    """
+
+    effect: str
+    meaning: str = ""
+    params: Mapping[str, Estimate] = field(default_factory=dict)
+    evidence: float = math.nan  # [nats]
+    trial: str = ""
+    start: float = field(metadata={"key": "from"}, default=math.nan)
+    end: float = field(metadata={"key": "to"}, default=math.nan)
+    seen: tuple[int, int] = (1, 1)
+    region: Region | None = None
+    repeats: bool = False
+    trials: tuple[str, ...] = field(metadata=BRIEF, default=())
+
+    def sentence(self) -> str:
+        """Return it as one clause."""
+        few, all_ = self.seen
+        if self.repeats:
+            made = f"{few} of {all_}" if few < all_ else f"all {all_}"
+            rest = f"or anything else that repeats with the motion of {made} trials"
+            return f"unconfirmed: {self.meaning}, {rest}"
+        place = self.region if self.region and not self.region.of_time else None
+        where = f", mostly {place.phrase}" if place else ""
+        start, end = number(self.start), number(self.end)
+        when = (
+            f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"
+        )
+        return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels(Document):
+    """The estimated noise: standard deviations by state."""
+
+    process: Mapping[str, float] = field(default_factory=dict)
+    measurement: Mapping[str, float] = field(default_factory=dict)
+    correlation_s: float = math.nan  # of process noise; NaN if it is white
+    outliers: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TrialValue(Document):
+    """A claimed value as estimated from one trial alone, all other values held."""
+
+    trial: str
+    effect: str
+    quantity: str = ""
+    value: float = math.nan
+    std: float = math.nan
+    agrees: bool = True  # with the others
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement(Document):
+    """Whether the trials agree on a value; `chance` is the p-value of their differences.
+
+    `estimate` is the common value; its `std` is the scatter of the trials beyond their own
+    uncertainty.
+    """
+
+    effect: str
+    quantity: str = ""
+    agrees: bool = True
+    chance: float = math.nan
+    estimate: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    goes_with: str = ""  # "rises with the mean throttle"
+
+
+@dataclass(frozen=True, eq=False)
+class Changed(Document):
+    """A value in each of two groups of trials, and the evidence that it differs [nats]."""
+
+    effect: str
+    quantity: str = ""
+    first: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    second: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    evidence: float = math.nan
+    chance: float = math.nan  # p-value of the difference
+
+
+@dataclass(frozen=True, eq=False)
+class Made(Document):
+    """What a diagnosis was made from: stored trials, and the model at that time."""
+
+    trials: tuple[str, ...] = ()
+    adopted: tuple[Mapping[str, Any], ...] = ()  # {"name": "dead_zone:throttle", "c": 0.146}
+    params: Mapping[str, float] | None = field(metadata=BRIEF, default=None)  # [model] params
+    nominal: Mapping[str, float] = field(default_factory=dict)  # values of all parameters
+    named: tuple[str, ...] = ()  # trials named by the user, if not all were used
+    compared: tuple[str, ...] = ()  # the second group
+    without: tuple[str, ...] = ()  # families that were excluded
+    rows_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.row_s`; 0: of no such table
+    interpolated_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.interpolated_s`
+
+    def __post_init__(self) -> None:
+        if not all("name" in effect for effect in self.adopted):
+            raise ValueError("an adopted effect has no 'name'")
+
+    @property
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """The adopted effects by name."""
+        return {str(effect["name"]): dict(effect) for effect in self.adopted}
+
+
+@dataclass(frozen=True, eq=False)
+class TrialGroup(Document):
+    """Trials of one motion in one condition, and the signals whose levels set them apart."""
+
+    id: str
+    trials: tuple[str, ...] = ()
+    differs_in: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Score(Document):
+    """Held-out log scores of open-loop predictions, of which the rule chooses.
+
+    A score is minus the mean logarithm of the rms errors, over states and horizons, in units of
+    each state's spread. The standard error is that of the reference's lead over the choice.
+    """
+
+    crude: float = math.nan
+    chosen: float = math.nan
+    reference: float = math.nan
+    standard_error: float = math.nan
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosed(Document):
+    """The result of a diagnosis, as in `diagnose --json`; shown by `Diagnosis`."""
+
+    verdict: Verdict
+    where: Where = field(default_factory=Where)
+    ranking: tuple[Ranked, ...] = ()  # claimed effects first, then rejected ones
+    indistinguishable: tuple[tuple[str, ...], ...] = ()  # groups that these trials can't separate
+    equivalent: tuple[tuple[str, ...], ...] = ()  # groups that no trial can separate
+    lookalikes: tuple[Likeness, ...] = ()  # effects with nearly the signal of a claimed one
+    acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
+    gap: Gap = field(default_factory=Gap)
+    utility_prediction: UtilityPrediction | None = None  # if the subject was a task
+    whole_run: Mapping[str, RunChange] = field(default_factory=dict)
+    leftover: tuple[Remainder, ...] = ()
+    unconfirmed: tuple[Unconfirmed, ...] = ()  # likely effects that are not claimed
+    correction: Correction | None = None  # if there is a leftover
+    next_trial: str = ""
+    unknowable: tuple[str, ...] = ()  # what these trials can't identify
+    noise: NoiseLevels = field(default_factory=NoiseLevels)
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
+    identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
+    combinations: tuple[Combination, ...] = ()  # values that show only in combination
+    prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
+    credit: tuple[Credit, ...] = ()  # largest first
+    preflight: tuple[Finding, ...] = ()  # of the sensors, before any physics
+    per_trial: tuple[TrialValue, ...] = ()
+    agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
+    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
+    unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # between two groups
+    trials: int = 0
+    motions: int = field(metadata=BRIEF, default=0)  # number of groups
+    groups: tuple[TrialGroup, ...] = ()  # trials that differ in motion or condition
+    held_out: str = "no"  # what values were not fitted on: groups, trials, pieces of a log, no
+    score: Score = field(default_factory=Score)
+    steps: int = 0
+    candidates: int = 0
+    made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
+    probe: str = field(metadata=BRIEF, default="")  # candidate that separates tied explanations
+    then: NextCommand | None = field(metadata={"key": ""}, default=None)  # next command
+
+    def __repr__(self) -> str:
+        named = ", ".join(self.effects) or "no effect"
+        gap = f"{number(self.gap.before)} -> {number(self.gap.after)}"
+        return f"Diagnosis({self.kind}: {named}; gap {gap}; {self.trials} trials)"
+
+    @property
+    def kind(self) -> str:
+        """Kind of the verdict: "effect", "several", "none" or "unknown"."""
+        return self.verdict.kind
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the claimed effects."""
+        return self.verdict.effects
+
+    @property
+    def joining(self) -> dict[str, dict[str, float]]:
+        """Quantities of the claimed effects, in the order in which they act, for `Search.adopt`.
+
+        Parameters in `known_parameters` are not repeated here.
+        """
+        known = self.known_parameters
+        own = {n for n in self.effects if n.removeprefix("parameter:") not in known}
+        return {n: self.values(n) for n in self.acting or self.effects if n in own}
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return self.verdict.sentence
+
+    @property
+    def contested(self) -> bool:
+        """Whether the claim should not be adopted, see `objection`."""
+        return bool(self.objection)
+
+    @property
+    def objection(self) -> str:
+        """Why the claim should not be adopted; "" if it may be."""
+        ties = [group for group in self.indistinguishable if group not in self.equivalent]
+        return objection(self.prediction_error, self.agreement, self.effects, ties, self.leftover)
+
+    @property
+    def no_cause(self) -> bool:
+        """Whether the data are insufficient to name any cause; figures are meaningless then."""
+        return bool(self.verdict.limit)
+
+    def ranked(self, effect: str) -> Ranked | None:
+        """Return the row of an effect, or None if it is not in the ranking."""
+        return next((row for row in self.ranking if row.effect == effect), None)
+
+    def values(self, effect: str) -> dict[str, float]:
+        """Return an effect's quantities, constants included, each in the model's unit.
+
+        Args:
+            effect: a name in `quantities`; the claimed ones are `effects`.
+
+        Raises:
+            GroundedError: if the diagnosis has no values of this effect.
+        """
+        found = self.quantities
+        if effect not in found:
+            there = f": {nearest(effect, found)}" if found else "; it has none of any effect"
+            raise GroundedError(f"this diagnosis has no values of '{effect}'{there}")
+        return found[effect]
+
+    @property
+    def quantities(self) -> dict[str, dict[str, float]]:
+        """Quantities by effect: of ranked effects, late sensors and the correction's curves."""
+        curves = self.correction.curves if self.correction is not None else ()
+        ranked = {row.effect: row.values for row in reversed(self.ranking)}
+        drawn = {curve.effect: dict(curve.quantities) for curve in curves}
+        return self.late_sensors | ranked | drawn
+
+    @property
+    def late_sensors(self) -> dict[str, dict[str, float]]:
+        """Filters and delays of sensors that were found and corrected, as effects by name.
+
+        The diagnosis is made without them, but a controller's feedback passes through them.
+        """
+        return late_effects(self.preflight)
+
+    @property
+    def known_parameters(self) -> dict[str, Estimate]:
+        """The calibrated parameters that the trials identify, which may be adopted."""
+        lost = {one.parameter for one in self.identifiable if one.lost}
+        return {name: e for name, e in self.parameters.items() if name not in lost}
+
+    @property
+    def combined(self) -> set[str]:
+        """The effects and parameters that the trials show only in combination."""
+        return {name for one in self.combinations for name in one.values}
+
+    @property
+    def conditions(self) -> dict[str, tuple[str, ...]]:
+        """Parameters by what holds only if they are right: a calibrated parameter or an effect."""
+        found = {one.parameter: tuple(one.given) for one in self.identifiable if one.given}
+        for one in self.combinations:
+            if one.rests_on:
+                found |= dict.fromkeys(one.values, tuple(one.rests_on))
+        return found
+
+    @property
+    def jointly(self) -> set[str]:
+        """The calibrated parameters that the trials identify only together with the others."""
+        return {one.parameter for one in self.identifiable if one.jointly}
+
+    def open(
+        self, adopted: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None = None
+    ) -> tuple[str, ...]:
+        """Return the claimed effects that have not been adopted or changed since the diagnosis.
+
+        Args:
+            adopted: effects, as in [model] effects.
+            params: the model's parameters, as in [model] params.
+        """
+        made = self.made or Made()
+        now, then = _numbers(adopted, params), _numbers(made.adopted, made.params)
+        return tuple(name for name in self.effects if now.get(name) == then.get(name))
+
+
+def _numbers(
+    effects: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None
+) -> dict[str, Any]:
+    """Return all numbers of a model: effects by name, and every number as `parameter:NAME`.
+
+    Numbers of an effect are parameters, too: that of `viscous_friction:vz` is called
+    `viscous_friction_vz_k`.
+    """
+    from grounded.effects import param_name
+
+    found: dict[str, Any] = {f"parameter:{name}": value for name, value in (params or {}).items()}
+    for effect in map(dict, effects):
+        name = str(effect["name"])
+        found[name] = effect
+        found |= {f"parameter:{param_name(name, key)}": value for key, value in effect.items()}
+    return found
