@@ -25,8 +25,6 @@ from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
 from small_tasks import plain_task
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 
 def axis(gain):
     return Model(
@@ -60,7 +58,6 @@ def task(model, steps=200):
     return plain_task(model, 0.05, np.zeros((steps + 1, 2)), 1.0, 2.0)
 
 
-@worse
 @pytest.mark.slow
 def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     """A gain of 1.0 that is 1.5: adopted as 1.502, its last 0.13 % are above the noise."""

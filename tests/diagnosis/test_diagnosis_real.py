@@ -8,8 +8,6 @@ from grounded_trials.store.trial_file import write_trial
 from real_systems import BAM_Q, DART_STEERING, DART_THROTTLE, SERVO
 from shared_data import needs_data
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 CONFIG = """[model]
 file = "model.py"
 
@@ -84,7 +82,6 @@ def test_the_dart_throttle_has_a_dead_zone(tmp_path):
     assert 0.75 < alike["coulomb_friction:v"] < 1
 
 
-@worse
 @pytest.mark.slow
 @needs_data
 def test_the_friction_of_a_geared_servo_grows_with_its_load():

@@ -192,13 +192,12 @@ class Options:
     def option(self, own: frozenset[str]) -> Option:
         """Return a set of causes as an option."""
         if own not in self._known:
-            fit, likeliest = self.fits[own], self._of(own)[0]
+            fit = self.fits[own]
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            evidence = self.search.score(likeliest)
-            self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
+            self._known[own] = Option(own, self.search.score(fit), self.ruler.errors(fit), order)
         return self._known[own]
 
     def alone(self, fit: Fitted) -> tuple[Array, Array]:
@@ -238,8 +237,9 @@ class Options:
         """Return a set without one cause, fitted from the values and the noise of the larger one.
 
         Otherwise the cause would be credited with what better values of the others gain. What is
-        taken is the likeliest under any noise: a cause gets no credit for what the rest can do
-        under another noise. None if that can't be filtered, or if a guard refuses the cause.
+        taken is the likeliest under any noise, as a cause gets no credit for what the rest can do
+        under another noise; but if the set is taken under white noise, so is its evidence without
+        the cause. None if that can't be filtered, or if a guard refuses the cause.
         """
         fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
@@ -248,7 +248,13 @@ class Options:
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
         loose = cause != CALIBRATION and one_group(search, fit, cause)
-        return None if cut or loose else self.option(own)
+        if cut or loose:
+            return None
+        white = [
+            f for f in self._of(own) if f.noise.structure == fit.noise.structure == Structure()
+        ]
+        found = self.option(own)
+        return replace(found, evidence=search.score(white[0])) if white else found
 
 
 def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:

@@ -32,9 +32,12 @@ def far(own: Candidate, trial: Trial) -> Array:
     """Return each state's rms difference from its prediction, relative to its size, (n,).
 
     The size is the geometric mean of the standard deviations, so that a column that is too small is
-    as far as one that is too large. NaN for a state that is predicted not to move.
+    as far as one that is too large. NaN for a state that is predicted not to move, or of which
+    nothing is finite.
     """
     T = min(trial.finite_steps, len(own.predicted_states) - 1)
+    if T < 0:
+        return np.full(trial.states.shape[1], np.nan)
     seen, said = trial.states[: T + 1], own.predicted_states[: T + 1]
     off = np.sqrt(((seen - said) ** 2).mean(axis=0))
     moves, shown = said.std(axis=0), seen.std(axis=0)

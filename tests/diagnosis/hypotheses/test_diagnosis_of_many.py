@@ -7,8 +7,6 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 DT = 0.02
 SLED = Model(
     name="sled",
@@ -45,7 +43,6 @@ def driven(trials=4, steps=250, bias=-0.3, damping=0.5, drag=0.3):
     return found
 
 
-@worse
 @pytest.mark.slow
 def test_more_than_three_effects_are_looked_for_where_three_leave_more_than_noise():
     """It stopped at three with a wrong damping (0.84), and asked for `--max-effects 5`."""

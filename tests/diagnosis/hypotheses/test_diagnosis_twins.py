@@ -16,8 +16,6 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 DT = 0.05
 
 
@@ -126,7 +124,6 @@ def test_a_look_alike_is_fitted_in_its_place_to_the_end(search):
     assert top.settled and abs(search.score(top) - search.score(best)) < 12
 
 
-@worse
 @pytest.mark.slow
 def test_what_is_one_thing_beside_a_parameter_is_named_together():
     found = diagnose(turner(low=0.03, high=0.6), trials())

@@ -12,8 +12,6 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 DT, FADE, RATE = 0.02, 0.03, 5.0
 VALVES = Model(
     name="valves",
@@ -159,7 +157,6 @@ def stepped(trials=3, steps=450, late=2):
     return found
 
 
-@worse
 @pytest.mark.slow
 def test_an_offset_found_before_a_dead_zone_acts_after_it():
     """A gain and a curve stood in for the dead zone, which was tried behind the offset alone."""

@@ -25,8 +25,6 @@ from grounded.experiments.pendulum import pendulum_task
 from grounded.models.pendulum import model as crude_pendulum
 from grounded.plant import Plant
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 DT = 0.02
 FRICTION, BIAS, WAVE = 0.4, -0.08, 0.05
 
@@ -182,7 +180,6 @@ def rare():
     return attribute(data, library.candidates(model, data.scales), max_effects=2)
 
 
-@worse
 @pytest.mark.slow
 def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare):
     """Values from the other trials, which show nothing of it, do not predict that trial."""
