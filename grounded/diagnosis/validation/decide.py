@@ -192,12 +192,13 @@ class Options:
     def option(self, own: frozenset[str]) -> Option:
         """Return a set of causes as an option."""
         if own not in self._known:
-            fit = self.fits[own]
+            fit, likeliest = self.fits[own], self._of(own)[0]
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            self._known[own] = Option(own, self.search.score(fit), self.ruler.errors(fit), order)
+            evidence = self.search.score(likeliest)
+            self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
         return self._known[own]
 
     def alone(self, fit: Fitted) -> tuple[Array, Array]:
@@ -238,7 +239,7 @@ class Options:
 
         Otherwise the cause would be credited with what better values of the others gain. What is
         taken is the likeliest under any noise, as a cause gets no credit for what the rest can do
-        under another noise; but if the set is taken under white noise, so is its evidence without
+        under another noise; but if the set is taken under white noise, so is what it loses without
         the cause. None if that can't be filtered, or if a guard refuses the cause.
         """
         fit, search = self.fits[option.causes], self.search
