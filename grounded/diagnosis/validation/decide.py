@@ -237,10 +237,10 @@ class Options:
     def less(self, option: Option, cause: str) -> Option | None:
         """Return a set without one cause, fitted from the values and the noise of the larger one.
 
-        Otherwise the cause would be credited with what better values of the others gain. What is
-        taken is the likeliest under any noise, as a cause gets no credit for what the rest can do
-        under another noise; but if the set is taken under white noise, so is what it loses without
-        the cause. None if that can't be filtered, or if a guard refuses the cause.
+        Otherwise the cause would be credited with what better values of the others gain. Evidence
+        is that of the likeliest noise, as a cause gets no credit for what the rest can do under
+        another one; so the larger set is fitted under that, too. None if the rest can't be
+        filtered, or if a guard refuses the cause.
         """
         fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
@@ -251,11 +251,12 @@ class Options:
         loose = cause != CALIBRATION and one_group(search, fit, cause)
         if cut or loose:
             return None
-        white = [
-            f for f in self._of(own) if f.noise.structure == fit.noise.structure == Structure()
-        ]
-        found = self.option(own)
-        return replace(found, evidence=search.score(white[0])) if white else found
+        likeliest = self._of(own)[0]
+        structures = {f.noise.structure for f in self._of(option.causes)}
+        if likeliest.noise.structure not in structures:
+            search.refined([(fit.hypothesis, likeliest.noise, fit.track)], REFIT)
+        nats = search.score(self._of(option.causes)[0]) - search.score(likeliest)
+        return replace(self.option(own), evidence=option.evidence - nats)
 
 
 def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
