@@ -11,8 +11,9 @@ steps:
     3. Of the supported sets within WITHIN standard errors of the reference, the smallest is chosen
        (the one-standard-error rule of Breiman et al. 1984, and of projection predictive selection,
        Piironen & Vehtari 2017).
-    4. Of those that are as small, and those that predict better than one of them, the likeliest. Within CLAIM nats they tie: then a parameter comes
-       before a mechanism, and that before what has no mechanism (`Option.order`).
+    4. Of those that are as small, and those that predict better than one of them, the likeliest.
+       Within CLAIM nats they tie: then a parameter comes before a mechanism, and that before what
+       has no mechanism (`Option.order`).
 
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
 each number's curve.
