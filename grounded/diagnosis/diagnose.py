@@ -2,7 +2,7 @@
 
 The stages and their modules:
 
-sound_trials      check and correct the sensors, from their signals alone       (instruments)
+sound_trials      check and correct the sensors, from their signals alone       (accounts)
 limits            what the data can't determine; which parameters they identify
 attribution       search for effects by evidence   (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units

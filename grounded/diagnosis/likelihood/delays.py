@@ -229,7 +229,7 @@ def delayed(effects: Sequence[Effect]) -> set[str]:
 
 
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
-    """Return {channel: [delay, time constant]} in steps, including filters from `instruments`."""
+    """Return {channel: [delay, time constant]} in steps, including filters from the accounts."""
     found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
     for effect, values in h.pairs:
         if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
