@@ -17,6 +17,8 @@ from markdown import Extension, Markdown
 from markdown.inlinepatterns import SimpleTextInlineProcessor
 from mkdocs.structure.files import File, Files
 
+from grounded.findings import catalogue
+
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = {"grounded": ROOT, "grounded_trials": ROOT / "trials", "grounded_cli": ROOT / "cli"}
 TITLES = {
@@ -66,6 +68,29 @@ def page(room: str) -> str:
     return "\n\n".join(opening + front + [f"::: {module}" for module in modules(room)]) + "\n"
 
 
+def findings() -> str:
+    """Return the page of all findings, from the catalogue, in Markdown."""
+    parts = [
+        "# Findings",
+        "Whatever a command tells is a finding: `findings` in its JSON document, with a code, a "
+        "weight, what it is about and facts with units. Scripts read codes and facts; sentences "
+        "may change. `grounded explain CODE` prints an entry. Text in `[[ ]]` appears where its "
+        "facts are known.",
+    ]
+    for area in catalogue.AREAS:
+        module = import_module(f"{catalogue.__name__}.{area}")
+        rows = [
+            f"## {area}",
+            f"{inspect.getdoc(module)}",
+            "| code | weight | says | remedy |\n|---|---|---|---|",
+        ]
+        for code, one in catalogue.entries(area).items():
+            cells = [f"`{code}`", one.weight, one.short, one.remedy]
+            rows[-1] += "\n| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        parts += rows
+    return "\n\n".join(parts) + "\n"
+
+
 class PlainMaths(Extension):
     """Keep x_t and [W][m] as text: they are indices and shapes, not emphasis and links."""
 
@@ -89,6 +114,7 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
+    files.append(File.generated(config, "findings.md", content=findings()))
     for package in SOURCES:
         for room in rooms(package):
             files.append(File.generated(config, f"reference/{room}.md", content=page(room)))

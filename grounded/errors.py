@@ -32,13 +32,15 @@ class GroundedError(Exception):
     """Raised for misuse or invalid input; the message is complete and meant for the user.
 
     Args:
-        message: what was found, what was expected, what to do.
+        message: what was found, what was expected, what to do; or a `findings.Finding`, whose
+            sentence and command these are.
         then: a command that fixes the problem, if there is one; the message does not repeat it.
     """
 
-    def __init__(self, message: str, then: NextCommand | None = None) -> None:
-        super().__init__(message)
-        self.then = then
+    def __init__(self, message: Any, then: NextCommand | None = None) -> None:
+        self.finding = None if isinstance(message, str) else message
+        super().__init__(message if self.finding is None else message.sentence)
+        self.then = then or getattr(self.finding, "then", None)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to copy it, whatever its class is made from (for another process)."""

@@ -353,7 +353,9 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
     asked = " or diagnose the model"
     kept = {"ending": "too doubtful", "incumbent": best, "then": DIAGNOSE}
     doubtful = replace(now, phase="stopped", sentence=f"no trial{asked}", missed=asked, **kept)
-    monkeypatch.setattr("grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: doubtful)
+    monkeypatch.setattr(
+        "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: doubtful
+    )
     count = len(w.trials())
     diagnosed(w.folder, diagnosed=taken_in(*range(1, count)))
     w.adopt("viscous_friction:v")
@@ -365,7 +367,9 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
 @pytest.mark.parametrize("left", [{"look_for": 5}, {"again": True}, {}])
 def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(w, monkeypatch, left):
     ended = replace(w.status().standing, phase="converged", ending="nothing promised")
-    monkeypatch.setattr("grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: ended)
+    monkeypatch.setattr(
+        "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: ended
+    )
     seen = taken_in(*range(1, len(w.trials()) + 1))
     diagnosed(w.folder, diagnosed=seen, verdict=one_effect("viscous_friction:v")["verdict"] | left)
     w.adopt("viscous_friction:v")

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
+from grounded.findings.finding import Finding, Weight
 from grounded.progress import duration
 from grounded.result import plain
 from grounded_cli.console.workspace_option import given
@@ -144,6 +145,21 @@ def remark(kind: str, text: str) -> None:
     """Write narration with a prefix, `note: ...`, to stderr, wrapped to the terminal."""
     first, *rest = lines(text, f"{kind}: ", "  ")
     say("\n".join([first.replace(kind, tinted(kind), 1), *rest]))
+
+
+def tell(findings: Sequence[Finding], about: str = "", most: int = 3) -> None:
+    """Write findings to stderr as remarks, the heaviest first; beyond `most`, how many are left.
+
+    Args:
+        findings: as `settle` orders them.
+        about: what all are about, such as the name of a log.
+        most: how many are told; the others are in the JSON document and with --details.
+    """
+    for one in findings[:most]:
+        kind = "note" if one.weight is Weight.NOTE else "warning"
+        remark(kind, f"{about}: {one.sentence}" if about else one.sentence)
+    if more := len(findings) - most if most < len(findings) else 0:
+        remark("note", f"{more} more with --details")
 
 
 def names_in(text: str | None) -> list[str]:

@@ -1,0 +1,101 @@
+"""Finding: one thing that a command tells, as data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Any
+
+from grounded.errors import NextCommand
+from grounded.findings.catalogue import entry_of
+from grounded.findings.numbers import filled
+
+
+class Weight(StrEnum):
+    """What a finding asks of the reader; the heaviest first."""
+
+    REFUSE = "refuse"  # the command stops
+    ASIDE = "aside"  # the trial does not count until a person decides
+    WARN = "warn"  # what was done may be wrong
+    NOTE = "note"  # good to know
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured value with its unit and, if known, its standard deviation in that unit."""
+
+    value: float
+    unit: str = "1"
+    std: float = math.nan
+
+    def to_json(self) -> dict[str, Any]:
+        """Return value, std (null if unknown) and unit."""
+        finite = [one if math.isfinite(one) else None for one in (self.value, self.std)]
+        return {"value": finite[0], "std": finite[1], "unit": self.unit}
+
+
+Fact = Quantity | float | int | str | tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a command tells.
+
+    Args:
+        code: its entry in the catalogue, such as "log.unit"; stable, for scripts.
+        about: the signals, trials or candidates that it is about.
+        facts: what was measured, by slot of the entry.
+        weight: what it asks of the reader; that of the entry unless stated.
+        nats: evidence for it, NaN if it does not rest on a statistic.
+        then: the command that it asks for, None for none.
+    """
+
+    code: str
+    about: tuple[str, ...] = ()
+    facts: Mapping[str, Fact] = field(default_factory=dict)
+    weight: Weight = Weight.NOTE
+    nats: float = math.nan
+    then: NextCommand | None = None
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do where the entry has a remedy."""
+        entry = entry_of(self.code)
+        facts = {"about": self.about, **self.facts}
+        return "; ".join(filled(text, facts) for text in (entry.short, entry.remedy) if text)
+
+    def weighing(self, weight: Weight) -> Finding:
+        """Return it with another weight."""
+        return replace(self, weight=weight)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return its entry in the `findings` of a JSON document."""
+        facts = {
+            name: value.to_json() if isinstance(value, Quantity) else value
+            for name, value in self.facts.items()
+        }
+        then = self.then and {"command": self.then.verb, "arguments": list(self.then.arguments)}
+        return {
+            "code": self.code,
+            "weight": self.weight.value,
+            "about": list(self.about),
+            "facts": facts,
+            "nats": self.nats if math.isfinite(self.nats) else None,
+            "sentence": self.sentence,
+            "then": then,
+        }
+
+
+def found(
+    code: str,
+    *about: str,
+    nats: float = math.nan,
+    then: NextCommand | None = None,
+    weight: Weight | None = None,
+    **facts: Fact,
+) -> Finding:
+    """Return a finding with the weight of its entry, see `Finding`."""
+    weighs = weight or Weight(entry_of(code).weight)
+    return Finding(code, about, facts, weighs, nats, then)
