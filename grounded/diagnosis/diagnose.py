@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.finding import SENSOR_DELAY, late_as_positions
+from grounded.accounts.finding import SENSOR_DELAY, Preflight, late_as_positions
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -44,12 +44,7 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.sound_data import sound_data
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, decide
-from grounded.diagnosis.validation.limits import (
-    counted_once,
-    held,
-    knowable,
-    limits,
-)
+from grounded.diagnosis.validation.limits import Limits, counted_once, held, knowable, limits
 from grounded.diagnosis.validation.motions import without_others
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import MOST_EFFECTS, interrupted, with_faults
@@ -137,71 +132,24 @@ def diagnose(
             search for one more effect ends, and what was found before it is returned.
         GroundedError: if the trials don't fit the model, or hold no data.
     """
-    given: Any = trials
-    loose = (
-        [type(t).__name__ for t in given if not isinstance(t, Trial)]
-        if hasattr(given, "__iter__")
-        else []
-    )
-    if loose or not hasattr(given, "__iter__") or not isinstance(subject, Task | Model):
-        raise GroundedError(
-            "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
-            f"{type(subject).__name__} and {' of '.join([type(given).__name__, *loose[:1]])}"
-        )
-    if not isinstance(options, DiagnosisOptions | None):
-        raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
-    options, tick = options or DiagnosisOptions(), Stages(progress, _done, open_ended=True)
-    model = subject.model if isinstance(subject, Task) else subject
-    if model.n + model.m > MOST_NAMES:
-        raise GroundedError(
-            f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
-            f"most {MOST_NAMES} of both together, since each may affect each: diagnose a model of "
-            "the part where the gap is"
-        )
+    options = _checked(subject, trials, options)
+    tick = Stages(progress, _done, open_ended=True)
     tick("instruments")
-    shares = share_of(trials), share_of(compare)
-    trials, copies = counted_once(shares[0].trials)
-    compare, more = counted_once(shares[1].trials)
-    copies += more
-    exact = bool(copies) and not (scattered(trials) or scattered(compare))
-    first = sum(trial.known_steps >= 2 for trial in trials)
-    data, looked = sound_data(
-        subject,
-        [*trials, *compare],
-        hidden=options.hidden,
-        one_message=options.one_message,
-        first=len(trials) if compare else None,
-        interpolated_s=options.interpolated_s,
-    )
-    trials, model = looked.trials, data.model
-    known = limits(data, looked.left_out)
-    told = filter(None, [share.sentence for share in shares])
-    known = replace(known, sentences=(*known.sentences, *copies, *told))
+    sound = _sound(subject, trials, compare, options)
+    data, looked = sound.data, sound.looked
+
+    # what may be blamed, beside parameters that the data identify
     tick("candidates")
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):
-        search = HypothesisSearch(data, ())
-        null = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
+        alone = HypothesisSearch(data, ())
+        null = alone.refined([alone.fresh(Hypothesis())], TO_THE_TOP)
         if null:
             data = replace(data, model=held(uncertain, null[0]))
-            model = without_others(data, options.but, options.library)
-            data = replace(data, model=model)
-    settled, late = {*options.but, *looked.settled}, options.delays
-    settled |= {f"sensor_delay:{name}" for name in options.one_message}
-    offered = list(options.library.candidates(data.model, data.scales))
-    names = {effect.name for effect in offered}
-    if delay in options.library.families:  # those of the inputs that moved in earlier trials
-        more = [name for name in late if name not in names]
-        offered += [options.library.effect(name, data.model, data.scales) for name in more]
-    shown = knowable(data, [e for e in offered if e.name not in settled], (*late,))
-    candidates = tuple(
-        _again(effect, late[effect.name], data) if effect.name in late else effect
-        for effect in shown
-        if effect.name not in settled
-    )
-    joints = options.library.joints(data.model, data.scales)
-    joints = knowable(data, [e for e in joints if e.name not in settled])
-    limit = options.max_effects or MOST_EFFECTS
+            data = replace(data, model=without_others(data, options.but, options.library))
+    candidates, joints = _offered(data, looked, options)
+
+    # search by evidence, then decide by held-out predictions
     copied = not simulated(data.model)
     with running(engine, copied=copied):
         search, best = attribute(
@@ -212,59 +160,187 @@ def diagnose(
             joints=joints,
             alone=null,
         )
-    many = len(best.hypothesis.effects)  # may exceed the usual number if it has all joints
-    most = min(limit, many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
-    used = [trial for trial in trials if trial.known_steps >= 2]
-    task = subject if isinstance(subject, Task) else None
     ruler = Ruler(search.predictor, options.origin)
-    decision: Decision | None = None
-    cut_short = False
+    loop = Loop(search, ruler, tick, options.max_effects, len(best.hypothesis.effects))
+    with (
+        np.errstate(all="ignore"),
+        interruptible(loop.so_far),
+        running(engine, copied=copied),
+    ):
+        decision = loop.decided()
+        tick("leftover")
+        used = [trial for trial in looked.trials if trial.known_steps >= 2]
+        written = Writer(
+            decision,
+            ruler,
+            sound.limits,
+            (*options.but, *options.delays),
+            options.horizon,
+            loop.most,
+            tick,
+            subject if isinstance(subject, Task) else None,
+            used,
+            sound.first,
+            sound.exact,
+            uncertain,
+        )
+        groups = [k < sound.first for k in range(data.count)]
+        found = written.diagnosis(compared(search, decision.fit, groups) if compare else None)
 
-    def found_so_far() -> str:
-        return so_far(search, most, decision.fit.hypothesis.names if decision else None)
+    said = with_faults(found.verdict, looked.findings)
+    said = interrupted(said) if loop.cut_short else said
+    delays = _sensor_delays(found, data.model, options.but)
+    older = late_as_positions(looked.findings, delays, options.but)
+    return replace(found, verdict=said, preflight=(*looked.findings, *older))
 
-    # While a gap remains, search again without the leader, then for one more effect; decide anew.
-    with np.errstate(all="ignore"), interruptible(found_so_far), running(engine, copied=copied):
+
+def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
+    """Return the options; raise GroundedError for arguments of another type, or too large."""
+    several = hasattr(trials, "__iter__")
+    loose = [type(t).__name__ for t in trials if not isinstance(t, Trial)] if several else []
+    if loose or not several or not isinstance(subject, Task | Model):
+        raise GroundedError(
+            "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
+            f"{type(subject).__name__} and {' of '.join([type(trials).__name__, *loose[:1]])}"
+        )
+    if not isinstance(options, DiagnosisOptions | None):
+        raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
+    model = subject.model if isinstance(subject, Task) else subject
+    if model.n + model.m > MOST_NAMES:
+        raise GroundedError(
+            f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
+            f"most {MOST_NAMES} of both together, since each may affect each: diagnose a model of "
+            "the part where the gap is"
+        )
+    return options or DiagnosisOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class _Sound:
+    """The data of a diagnosis, and what was found while it was made sound."""
+
+    data: Data
+    looked: Preflight
+    limits: Limits
+    first: int  # trials of the first of two groups that are compared
+    exact: bool  # all trials repeat each other to the last bit: there is no noise
+
+
+def _sound(
+    subject: Task | Model,
+    trials: Sequence[Trial],
+    compare: Sequence[Trial],
+    options: DiagnosisOptions,
+) -> _Sound:
+    """Correct the sensors, count copies once, and see what the data can't show."""
+    shares = share_of(trials), share_of(compare)
+    trials, copies = counted_once(shares[0].trials)
+    compare, more = counted_once(shares[1].trials)
+    data, looked = sound_data(
+        subject,
+        [*trials, *compare],
+        hidden=options.hidden,
+        one_message=options.one_message,
+        first=len(trials) if compare else None,
+        interpolated_s=options.interpolated_s,
+    )
+    known = limits(data, looked.left_out)
+    told = filter(None, [share.sentence for share in shares])
+    known = replace(known, sentences=(*known.sentences, *copies, *more, *told))
+    exact = bool(copies or more) and not (scattered(trials) or scattered(compare))
+    return _Sound(data, looked, known, sum(trial.known_steps >= 2 for trial in trials), exact)
+
+
+def _offered(
+    data: Data, looked: Preflight, options: DiagnosisOptions
+) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
+    """Return the effects that may be blamed, and the plain frictions of joints."""
+    library, late = options.library, options.delays
+    settled = {*options.but, *looked.settled}
+    settled |= {f"sensor_delay:{name}" for name in options.one_message}
+    offered = list(library.candidates(data.model, data.scales))
+    if delay in library.families:  # those of the inputs that moved in earlier trials
+        known = {effect.name for effect in offered}
+        offered += [library.effect(n, data.model, data.scales) for n in late if n not in known]
+    shown = knowable(data, [e for e in offered if e.name not in settled], (*late,))
+    candidates = tuple(_again(e, late[e.name], data) if e.name in late else e for e in shown)
+    joints = library.joints(data.model, data.scales)
+    return candidates, knowable(data, [e for e in joints if e.name not in settled])
+
+
+class Loop:
+    """Decide; while a gap remains, search on and decide anew.
+
+    The search starts again without the leader, once. Then a choice that it has not extended is
+    extended by one effect, or one more effect is sought, while predictions clearly improve.
+    """
+
+    def __init__(
+        self,
+        search: HypothesisSearch,
+        ruler: Ruler,
+        tick: Stages,
+        max_effects: int | None,
+        many: int,
+    ) -> None:
+        """`many`: effects of the likeliest set, more than usual if it has all joints of an arm."""
+        self.search, self.ruler, self.tick = search, ruler, tick
+        self.limit, self.whole = max_effects or MOST_EFFECTS, max_effects is not None
+        self.most = min(self.limit, many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
+        self.decision: Decision | None = None
+        self.cut_short = False
+
+    def so_far(self) -> str:
+        """Return what is told when it is interrupted before the first decision."""
+        known = self.decision.fit.hypothesis.names if self.decision else None
+        return so_far(self.search, self.most, known)
+
+    def decided(self) -> Decision:
+        """Return the decision; on Ctrl-C the last one, if there is one."""
         try:
-            tick("predict")
-            decision, restarts = decide(search, ruler), len(candidates) > PAIR
-            while decision.gap or options.max_effects:
-                before, size = decision.fit, len(decision.fit.hypothesis.names)
-                again = bool(restarts and decision.gap and decision.leader)
-                other = decision.gap and 0 < size < most and before is not search.of_size(size)[0]
-                if not (again or other or (most < limit and (options.max_effects or size >= most))):
-                    break
-                tick.beside = "one more effect; Ctrl-C keeps what was found"
-                tick("more effects")
-                if again:
+            self.tick("predict")
+            self.decision = decide(self.search, self.ruler)
+            restarts = len(self.search.candidates) > PAIR
+            while grow := self._next(restarts):
+                self.tick.beside = "one more effect; Ctrl-C keeps what was found"
+                self.tick("more effects")
+                before = self.decision
+                grow(before)
+                self.decision = decide(self.search, self.ruler)
+                if grow == self._restarted:
                     restarts = False
-                    regrown(search, decision.leader, max(size, PAIR))
-                elif other:
-                    grown(search, before, size + 1)
-                else:
-                    most += 1
-                    grown(search, search.chosen(most), most)
-                decision = decide(search, ruler)
-                if not again and not ruler.gain(before, decision.fit).clear:
+                elif not self.ruler.gain(before.fit, self.decision.fit).clear:
                     break
         except KeyboardInterrupt:
-            if decision is None:
+            if self.decision is None:
                 raise
-            cut_short, tick.beside = True, ""
-        tick("leftover")
-        adopted = (*options.but, *options.delays)
-        written = Writer(
-            decision, ruler, known, adopted, options.horizon, most, tick, task, used, first, exact,
-            uncertain,
-        )  # fmt: skip
-        groups = [k < first for k in range(data.count)]
-        apart = compared(search, decision.fit, groups) if compare else None
-        found = written.diagnosis(apart)
-        said = with_faults(found.verdict, looked.findings)
-        said = interrupted(said) if cut_short else said
-        delays = _sensor_delays(found, data.model, options.but)
-        older = late_as_positions(looked.findings, delays, options.but)
-        return replace(found, verdict=said, preflight=(*looked.findings, *older))
+            self.cut_short, self.tick.beside = True, ""
+        return self.decision
+
+    def _next(self, restarts: bool) -> Callable[[Decision], None] | None:
+        """Return how the search goes on, None if it is over."""
+        decision = self.decision
+        assert decision is not None
+        fit, size = decision.fit, len(decision.fit.hypothesis.names)
+        if not (decision.gap or self.whole):
+            return None
+        if restarts and decision.gap and decision.leader:
+            return self._restarted
+        if decision.gap and 0 < size < self.most and fit is not self.search.of_size(size)[0]:
+            return self._extended
+        more = self.most < self.limit and (self.whole or size >= self.most)
+        return self._enlarged if more else None
+
+    def _restarted(self, decision: Decision) -> None:
+        size = len(decision.fit.hypothesis.names)
+        regrown(self.search, decision.leader, max(size, PAIR))
+
+    def _extended(self, decision: Decision) -> None:
+        grown(self.search, decision.fit, len(decision.fit.hypothesis.names) + 1)
+
+    def _enlarged(self, decision: Decision) -> None:
+        self.most += 1
+        grown(self.search, self.search.chosen(self.most), self.most)
 
 
 def _sensor_delays(found: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:
