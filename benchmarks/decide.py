@@ -25,7 +25,7 @@ from grounded.diagnosis.validation.decide import Options, decide
 from grounded.diagnosis.validation.gain import Comparison
 
 CURVES = {
-    "CLAIM": (1.0, 2.0, 3.0, 5.0, 8.0),
+    "NATS": (1.0, 2.0, 3.0, 5.0, 8.0),
     "SCATTERS": (0.5, 1.0, 1.5, 2.0),
     "SHARE": (0.0, 0.01, 0.02, 0.05),
     "WITHIN": (0.0, 0.5, 1.0, 2.0),

@@ -37,11 +37,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.cause_words import value_called
-from grounded.diagnosis.hypotheses.explored import TIE
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import foretold
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
@@ -142,7 +142,7 @@ def probe(
     told = ways[0].known * len(trials) / max(len(again[0]), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
     apart = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
-    trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
+    trust = min(1.0, max(NATS, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
@@ -165,7 +165,7 @@ def probe(
         if claimed and not diagnosis.contested:
             text += f", so adopt the claimed one, {claimed}"
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
-    if expected < TIE <= most and trust < HIDDEN:
+    if expected < NATS <= most and trust < HIDDEN:
         text = (
             f"No probe is sure to distinguish {group[0]} from {group[1]}: by the model, the trials "
             "so far should have done so, but the rest that it lacks hides the difference"
@@ -173,10 +173,10 @@ def probe(
         return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
     tells = f"expected to distinguish {group[0]} from {group[1]} by {gain}"
-    if little := expected < TIE:
+    if little := expected < NATS:
         tells = (
             "no candidate inside the limits is informative enough: the most informative, "
-            f"{words}, is {tells} ({TIE:g} needed); record larger inputs or another manoeuvre"
+            f"{words}, is {tells} ({NATS:g} needed); record larger inputs or another manoeuvre"
         )
     else:
         tells = f"{words}: {tells}"

@@ -20,7 +20,8 @@ import numpy as np
 from grounded import places
 from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.error_report import Part, RulerRow
-from grounded.diagnosis.hypotheses.explored import CLAIM, no_limits
+from grounded.diagnosis.hypotheses.explored import no_limits
+from grounded.diagnosis.likelihood.levels import NATS, SURE
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.parts import Ranked, Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
@@ -36,7 +37,6 @@ from grounded.trial import Trial
 MENTIONED = 2
 FAR_OFF = 2.0  # times the range of the target and the best run: a run beyond it has failed
 TRIFLE = 0.1  # of a prediction error: an effect that changes states by less shows in none
-SURE = 2.0  # standard deviations by which one of its values differs from zero
 
 
 def unconfirmed(
@@ -123,7 +123,7 @@ def _anywhere(effect: Effect) -> Sequence[str]:
 def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:
     """Mark effects that are likely and yet do not improve held-out predictions."""
     return tuple(
-        replace(r, no_better=r.effect in likely and not r.claimed and not r.evidence < CLAIM)
+        replace(r, no_better=r.effect in likely and not r.claimed and not r.evidence < NATS)
         for r in ranking
     )
 

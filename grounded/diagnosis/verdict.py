@@ -33,6 +33,7 @@ from grounded.diagnosis.error_report import (
     furthest,
     runaway,
 )
+from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.parts import (
     Agreement,
     Changed,
@@ -252,7 +253,6 @@ def _causes(
     Beside a gap that remains (`open_gap`), nothing is said as if sure of those with `ties`.
     """
     from grounded.diagnosis.validation.claims import has_size
-    from grounded.diagnosis.validation.decide import NO_SIZE
 
     acting = claims.best.hypothesis.effects
     effects = {e.name: e for e in acting}
@@ -273,7 +273,7 @@ def _causes(
             else:
                 text += OPEN * (open_gap and one.of.startswith("parameter:"))
             text += GIVEN.format(listed(rests.get(one.of, ()))) * (one.of in rests)
-            text += UNSURE * (not has_size(effects[one.of], values[one.of], NO_SIZE))
+            text += UNSURE * (not has_size(effects[one.of], values[one.of], SURE))
             text += f", {apart[one.of]}" if one.of in apart else ""
         else:
             named = parameters_off(claims)[:NAMED]
@@ -307,7 +307,6 @@ def _unneeded(known: Mapping[str, Estimate], adopted: Collection[str]) -> list[s
 
     What an earlier diagnosis took for a drift of the speed was a thruster's weaker way astern.
     """
-    from grounded.diagnosis.validation.decide import NO_SIZE
     from grounded.effects import param_name
 
     of = {name: effect_of(name, adopted) for name in known}
@@ -317,7 +316,7 @@ def _unneeded(known: Mapping[str, Estimate], adopted: Collection[str]) -> list[s
         f"({name.removeprefix(param_name(effect, ''))} = {give_or_take(known[name])}): remove it "
         "from [model] effects, then diagnose again to see whether it is missed."
         for effect, (name, *more) in sorted(owned.items())
-        if not more and abs(known[name].value) < NO_SIZE * known[name].std
+        if not more and abs(known[name].value) < SURE * known[name].std
     ]
 
 

@@ -5,7 +5,8 @@
     numbers     formats the facts in a sentence: units, lists, +-, plurals
     catalogue   code -> weight, sentence, remedy
 
-Read `finding`, then one area of the catalogue. Code reads codes and facts. No code reads, compares or cuts a sentence.
+Read `finding`, then one area of the catalogue. Code reads codes and facts. No code reads, compares
+or cuts a sentence.
 """
 
 from grounded.findings.finding import Finding as Finding

@@ -17,9 +17,10 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.choose import CLAIM, SCATTERS
+from grounded.diagnosis.validation.choose import SCATTERS
 from grounded.diagnosis.validation.gain import LEAST, Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
@@ -92,7 +93,7 @@ class Fit(Result):
     def helps(self) -> bool:
         """Whether the values are likelier and predict held-out trials better (`choose`)."""
         better = self.gain is None or (self.gain.pays(SCATTERS) and not self.gain.ruins)
-        return self.nats >= CLAIM and better
+        return self.nats >= NATS and better
 
     @property
     def worse(self) -> bool:

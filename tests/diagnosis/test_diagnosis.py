@@ -13,8 +13,9 @@ from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.parts import Ranked
-from grounded.diagnosis.validation.blame import ENOUGH, fewest, loss, still
+from grounded.diagnosis.validation.blame import fewest, loss, still
 from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
@@ -133,7 +134,7 @@ def test_a_parameter_that_did_not_move_is_not_blamed_for_those_that_did():
     free, _ = fewest(H, b, range(3))
     assert {*free} == {0, 1, 2} and still(H, b, free) == [0]  # K alone would do most of it
     free, left = fewest(H, b, [1, 2])
-    assert {*free} == {1, 2} and left < ENOUGH and still(H, b, free) == []
+    assert {*free} == {1, 2} and left < NATS and still(H, b, free) == []
     assert still(np.eye(2), np.array([0.2, 1.2]), [0]) == []  # the other may be none, too
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.joint_model import joint_model, split
 from grounded.diagnosis.hypotheses.plainest import plain_friction, plainer
 from grounded.diagnosis.hypotheses.search import (
@@ -29,6 +28,7 @@ from grounded.diagnosis.hypotheses.swaps import HOPEFUL, TUNED, parted, reordere
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler
@@ -39,7 +39,6 @@ from grounded.result import listed
 USUAL_EFFECTS = 3  # most effects searched for at first
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-NEAR = 3.0  # nats behind the likeliest of a size within which fits have to converge
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
 RESTARTED = 3  # large effects that are also fitted from a start of their own
@@ -259,7 +258,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if larger:
             _nested(search, larger[0])
             best = search.of_size(size)[0]
-        if larger and not search.score(larger[0]) < search.score(best) + CLAIM:
+        if larger and not search.score(larger[0]) < search.score(best) + NATS:
             best = swapped(search, larger[0])
             size = len(best.hypothesis.effects)
         elif not larger or frozenset(best.hypothesis.names) in done:
@@ -325,7 +324,7 @@ def settle(search: HypothesisSearch, most: int) -> None:
         for size in range(most + 1):
             fits = [f for f in search.fits.values() if len(f.hypothesis.names) == size]
             top = max(map(search.score, fits), default=0.0)
-            least = top - NEAR if size in (0, claimed) else top  # of others, the likeliest
+            least = top - NATS if size in (0, claimed) else top  # of others, the likeliest
             near += [f for f in fits if not f.fine and search.score(f) >= least]
         if not near:
             return

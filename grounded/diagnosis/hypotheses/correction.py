@@ -18,6 +18,7 @@ from grounded.diagnosis.error_report import Correction, Curve
 from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, filter_of, held_out_columns
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.prediction_error import Horizon, errors
 from grounded.effects import Library
@@ -27,7 +28,6 @@ from grounded.result import per_second
 
 MOST = 2  # most variables
 LEAST = 0.02  # smallest relative reduction of the held-out squared error to be adoptable
-SURE = 2.0  # the same in standard errors over the trials
 
 
 @dataclass(frozen=True)

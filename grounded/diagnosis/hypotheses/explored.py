@@ -29,6 +29,7 @@ from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -36,9 +37,6 @@ from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, Rat
 from grounded.effects.wrap import SURE
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array, median, white_noise
-
-CLAIM = 3.0  # nats from which an effect is claimed
-TIE = 3.0  # nats within which two explanations are indistinguishable
 
 
 class FittedHypotheses:
@@ -123,7 +121,7 @@ class FittedHypotheses:
         """Check whether calibrating the parameters explains the data better than noise alone."""
         best = self.best_null()
         spread = best.hypothesis.spread
-        return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
+        return spread > 0 and self.score(best) > self.score(self.exact_null()) + NATS
 
     def of_size(self, count: int) -> list[Fitted]:
         """Return the best fit of each set of `count` effects, best first."""
@@ -136,11 +134,11 @@ class FittedHypotheses:
         return sorted(best.values(), key=lambda f: -self.score(f))
 
     def chosen(self, most: int) -> Fitted:
-        """Return the hypothesis to claim: each further effect must gain CLAIM nats."""
+        """Return the hypothesis to claim: each further effect must gain NATS nats."""
         chosen = self.best_null()
         for size in range(1, most + 1):
             for fit in self.of_size(size)[:1]:
-                if self.score(fit) > self.score(chosen) + CLAIM:
+                if self.score(fit) > self.score(chosen) + NATS:
                     chosen = fit
         if not chosen.hypothesis.effects and self.calibrates():
             # a single parameter is a calibration, too: it need only beat the shift of all of them

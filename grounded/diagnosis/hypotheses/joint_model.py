@@ -18,7 +18,6 @@ from itertools import product
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.plainest import push
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
@@ -29,6 +28,7 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
@@ -121,7 +121,7 @@ def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Remove effects that do not pay, the least needed first."""
     while fit.hypothesis.effects:
         less = _less(search, fit, int(_losses(search, fit).argmin()))
-        if less is fit or search.score(less) < search.score(fit) - CLAIM:
+        if less is fit or search.score(less) < search.score(fit) - NATS:
             return fit
         fit = less
     return fit
@@ -195,7 +195,7 @@ def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:
         further = search.extended(fit, iterations=AGAIN, late=False)
         best = max(further, key=search.score, default=fit)
         best = max(search.refined([best], TO_THE_TOP), key=search.score, default=best)
-        if search.score(best) < search.score(fit) + CLAIM:
+        if search.score(best) < search.score(fit) + NATS:
             return fit
         fit = _spared(search, best)
     return fit

@@ -21,12 +21,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.orders import orders
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, Start
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.actuator import delay
@@ -145,7 +145,7 @@ def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
             starts = [(h, fit.noise, fit.track) for h in orders(search.predictor, fit.hypothesis)]
             found = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
             best = max(found, key=search.score, default=fit)
-            if search.score(best) < search.score(search.latest(fit)) + CLAIM:
+            if search.score(best) < search.score(search.latest(fit)) + NATS:
                 break
             search.keep([best])
             fit = best

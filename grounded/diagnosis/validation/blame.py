@@ -8,7 +8,7 @@ lower by
     loss(S) = 1/2 b' (H_rr - H_rS H_SS^-1 H_Sr) b,        r: the others, b: their shifts
 
 Parameters are added to S one by one, each time the one that lowers the loss most, until the loss is
-below ENOUGH. So if the data only determine a combination of two parameters (a gain and a time
+below NATS. So if the data only determine a combination of two parameters (a gain and a time
 constant), not both are blamed.
 """
 
@@ -23,12 +23,12 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.levels import NATS, SURE
 from grounded.diagnosis.validation.choose import SHARE
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
-ENOUGH = 3.0  # nats that the parameters not named may still gain
-STILL, MOVED = 1.0, 2.0  # standard deviations within which a shift is none; from which it is one
+STILL = 1.0  # standard deviations within which a shift is none
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
 def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Blame, ...]:
     """Return the parameters of a calibrated fit that must differ from nominal, by importance.
 
-    Evidence selects as few as possible, so that the others gain less than ENOUGH. Of these, one
+    Evidence selects as few as possible, so that the others gain less than NATS. Of these, one
     after another is left out, the least needed first, if predictions with it at nominal, the others
     fitted again, are as good. So of two that can do each other's work, one stays.
     """
@@ -71,7 +71,7 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     held = still(H, b, free)  # at nominal; the others do their work
     while held:
         fewer, then = fewest(H, b, [i for i in range(len(b)) if i not in held])
-        if then <= ENOUGH:
+        if then <= NATS:
             free, now = fewer, then
             break
         held = held[1:]
@@ -96,7 +96,7 @@ def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float
     """Select as few of the allowed shifts as possible; return them and what the others lose."""
     free: list[int] = []
     now = loss(H, b, free)
-    while len(free) < len(allowed) and (now > ENOUGH or not free):
+    while len(free) < len(allowed) and (now > NATS or not free):
         losses = {i: loss(H, b, [*free, i]) for i in allowed if i not in free}
         i = min(losses, key=lambda j: losses[j])
         free, now = [*free, i], losses[i]
@@ -107,7 +107,7 @@ def still(H: Array, b: Array, free: Sequence[int]) -> list[int]:
     """Return the selected shifts that may be none, the smallest last, if another one clearly is."""
     sizes = np.abs(b) / np.sqrt(np.diag(np.linalg.pinv(H, hermitian=True)) + 1e-300)
     none = [i for i in sorted(free, key=lambda i: -sizes[i]) if sizes[i] < STILL]
-    return none if sizes.max(initial=0.0) > MOVED else []
+    return none if sizes.max(initial=0.0) > SURE else []
 
 
 def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:

@@ -4,7 +4,7 @@ Search proposes, this rule claims. Every set of causes that was fitted is an `Op
 and its errors where its values were not fitted (`ruler`, by group of trials). The rule has four
 steps:
 
-    1. A set is *supported* if each of its causes is: with it the set is likelier (CLAIM nats), and
+    1. A set is *supported* if each of its causes is: with it the set is likelier (NATS nats), and
        predictions are better by more than their standard error and as much as matters (LEAST, and
        SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
@@ -12,7 +12,7 @@ steps:
        (the one-standard-error rule of Breiman et al. 1984, and of projection predictive selection,
        Piironen & Vehtari 2017).
     4. Of those that are as small, and those that predict better than one of them, the likeliest.
-       Within CLAIM nats they tie: then a parameter comes before a mechanism, and that before what
+       Within NATS nats they tie: then a parameter comes before a mechanism, and that before what
        has no mechanism (`Option.order`).
 
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
@@ -24,9 +24,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.validation.gain import LEAST, Errors, Gain
 
-CLAIM = 3.0  # nats by which a cause must make a set likelier; within which two sets tie
 SCATTERS = 1.0  # standard errors by which predictions must gain by each cause
 SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
 WITHIN = 1.0  # standard errors of the reference within which a smaller set predicts as well
@@ -101,7 +101,7 @@ class Rule:
                 small = [option for option in same if not self.unsupported(option)]
                 break
         most = max(option.evidence for option in small)
-        tied = [option for option in small if option.evidence > most - CLAIM]
+        tied = [option for option in small if option.evidence > most - NATS]
         chosen = min(tied, key=lambda option: (option.order, -option.evidence))
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.scatter)
@@ -125,7 +125,7 @@ class Rule:
     def _needed(self, option: Option, cause: str) -> bool:
         """Check whether a set is likelier and predicts better with one of its causes."""
         less = self.less(option, cause)
-        if less is None or not option.evidence - less.evidence >= CLAIM:  # also of no evidence
+        if less is None or not option.evidence - less.evidence >= NATS:  # also of no evidence
             return False
         more = self.gain(less.errors, option.errors)
         matters = more.mean >= SHARE * max(self.gained(option), 0.0)

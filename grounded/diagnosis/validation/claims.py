@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, no_limits, parametric
+from grounded.diagnosis.hypotheses.explored import no_limits, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.one_clock import one_clock
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
@@ -18,10 +18,11 @@ from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
+from grounded.diagnosis.likelihood.levels import NATS, SURE
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
-from grounded.diagnosis.validation.blame import ENOUGH, MOVED, STILL, Blame, moved_parameters
+from grounded.diagnosis.validation.blame import STILL, Blame, moved_parameters
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
@@ -102,9 +103,9 @@ class Claims:
         for one in off:
             e = known[model.param_names[one.index]]
             sizes[one.index] = abs(e.value - float(model.values[one.index])) / max(e.std, 1e-300)
-        if max(sizes.values(), default=0.0) < MOVED:
+        if max(sizes.values(), default=0.0) < SURE:
             return tuple(off)
-        least = {one.index: STILL if one.nats > ENOUGH else MOVED for one in off}
+        least = {one.index: STILL if one.nats > NATS else SURE for one in off}
         return tuple(one for one in off if sizes[one.index] > least[one.index])
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
@@ -153,7 +154,7 @@ class Claims:
                     effect=f"parameter:{name}",
                     params={"d": d},
                     fixed={},
-                    evidence=blame.nats if blame.nats > ENOUGH else math.nan,  # too inexact
+                    evidence=blame.nats if blame.nats > NATS else math.nan,  # too inexact
                     gap_after=after,
                     shrinkage=1 - after / before if before > 0 else 0.0,
                     claimed=not self.known.no_cause,
@@ -171,7 +172,7 @@ class Claims:
         found = {}
         for name in self.names:
             lost = self._lost(name, self.search.fits.values())
-            if lost < CLAIM:
+            if lost < NATS:
                 own = self.best.noise.structure
                 alike = [f for f in self.search.fits.values() if f.noise.structure == own]
                 lost = self._lost(name, alike)
@@ -308,7 +309,7 @@ class Claims:
                 continue
             (other,) = set(h.names) - rest
             # not if parameters that predictions refused make it likelier, or make all of it
-            as_likely = abs(score(f) - score(self.best)) < TIE and score(f) > without + CLAIM
+            as_likely = abs(score(f) - score(self.best)) < NATS and score(f) > without + NATS
             needed = (h.spread > 0) == free or as_likely
             beyond = other in no_limits(self.data, h) or _restated(name, other, rest)
             beyond = beyond or self._adds(other, score(f) - without)
@@ -365,21 +366,21 @@ class Claims:
         adds up to nats. They tie if their priors (mainly those of the parameters) do.
         """
         score, best = self.search.score, self.best
-        if score(best) - score(fit) < TIE:
+        if score(best) - score(fit) < NATS:
             return self._not_refused(fit)
         b = self.search.tempering.factor
         known, other_known = (score(f) - b * f.loglik for f in (best, fit))
-        return abs(known - other_known) < TIE and self._one_thing(name, other)
+        return abs(known - other_known) < NATS and self._one_thing(name, other)
 
     def _as_likely(self, fit: Fitted) -> bool:
         """Check whether a fit is as likely as the claim, or likelier and predicts as well."""
-        return self.search.score(self.best) - self.search.score(fit) < TIE and self._not_refused(
+        return self.search.score(self.best) - self.search.score(fit) < NATS and self._not_refused(
             fit
         )
 
     def _not_refused(self, fit: Fitted) -> bool:
         """Check that a fit is no likelier than the claim, or that predictions don't refuse it."""
-        likelier = self.search.score(fit) - self.search.score(self.best) > TIE
+        likelier = self.search.score(fit) - self.search.score(self.best) > NATS
         refused = likelier and self.ruler.held_out
         return not (refused and self.ruler.gain(fit, self.best).clear)
 

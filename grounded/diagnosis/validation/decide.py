@@ -10,7 +10,7 @@ A guard refuses a cause whatever it gains:
 
     cut        beside it, a parameter of the model ends at a bound at which it is not without it:
                the bound decides how large the cause is
-    no size    none of its values differs from zero by NO_SIZE standard deviations
+    no size    none of its values differs from zero by SURE standard deviations
     one group  only one of several groups of trials shows it, or all trials are of one group and
                it names no mechanism (`Family.loose`)
     refuted    it limits a rate that the log exceeds, or that no command reaches (`no_limits`)
@@ -28,6 +28,7 @@ from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftov
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
+from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.choose import Choice, Option, Rule
@@ -38,7 +39,6 @@ from grounded.frozen import Array
 
 MEASURED = 6  # likeliest sets of each size, with and without free parameters, that are measured
 REFIT = 12  # iterations after a cause was removed
-NO_SIZE = 2.0  # standard deviations from zero below which a value is none
 LIKELY = 10.0  # nats from which an effect that is not claimed is told
 
 
@@ -231,7 +231,7 @@ class Options:
             effect.name
             for effect, own in zip(h.effects, h.sizes, strict=True)
             if own and not isinstance(effect.family, ParamFamily)
-            if (np.abs(h.theta[own]) < NO_SIZE * std[own]).all()
+            if (np.abs(h.theta[own]) < SURE * std[own]).all()
         ]
 
     def less(self, option: Option, cause: str) -> Option | None:
@@ -284,7 +284,7 @@ def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> int:
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
     for g, shift in zip(np.unique(group), leave_one_out(fit, group)[0], strict=True):
         others = worth * fit.gram[group != g].sum(axis=0) + np.diag(fit.prior)
-        if (np.abs(h.theta[own] + shift[own]) < NO_SIZE * fisher(others)[own]).all():
+        if (np.abs(h.theta[own] + shift[own]) < SURE * fisher(others)[own]).all():
             return len(np.unique(data.trial_of[group == g]))
     return 0
 

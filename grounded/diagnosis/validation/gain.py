@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.likelihood.levels import SURE
 from grounded.frozen import Array
 
 LEAST = 0.01  # log gain in some channel at some horizon below which a difference does not matter
-CLEARLY = 2.0  # standard errors from which one hypothesis predicts clearly better than another
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +51,17 @@ class Gain:
     @property
     def ruins(self) -> bool:
         """Whether predictions of whole trials are clearly worse."""
-        return self.whole[0] < -max(CLEARLY * self.whole[1], LEAST)
+        return self.whole[0] < -max(SURE * self.whole[1], LEAST)
 
     @property
     def clear(self) -> bool:
         """Whether predictions are clearly better."""
-        return self.mean > CLEARLY * self.scatter and self.largest > LEAST
+        return self.mean > SURE * self.scatter and self.largest > LEAST
 
     def pays(self, scatters: float) -> bool:
         """Check whether the gain is significant: over all channels, again and again, or in one."""
-        one = (self.channels > CLEARLY * scatters * self.scatters) & (self.channels > LEAST)
-        several = self.mean > 0 and (self.again > CLEARLY or bool(one.any()))
+        one = (self.channels > SURE * scatters * self.scatters) & (self.channels > LEAST)
+        several = self.mean > 0 and (self.again > SURE or bool(one.any()))
         return self.largest > LEAST and (self.mean > scatters * self.scatter or several)
 
 
