@@ -1,8 +1,8 @@
 """The words of every finding: a code -> its weight, sentence and remedy.
 
 Read `gap` as an example. A module an area, which is the part of the code before its first dot.
-`numbers` says how slots are written. `short` says what was found and what it means, `remedy` what to do; `hides` names the codes
-(with `*`) that are only its consequences.
+`numbers` says how slots are written. `short` says what was found and what it means, `remedy` what
+to do; `hides` names the codes (with `*`) that are only its consequences.
 """
 
 from __future__ import annotations
