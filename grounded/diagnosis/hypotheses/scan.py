@@ -159,7 +159,7 @@ class _Context(SentOnce):
                 d[..., seen.index(state)] += part * rate
             if behind_logs(predictor.data.model) is not None:
                 d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
-            for a, b in predictor.tied():
+            for a, b in predictor.tied:
                 if effect.family.needs_own:  # type: ignore[attr-defined]
                     before, later = (
                         self._rates_at(effect, values, k, instant=True) for k in (0, 1)
@@ -180,7 +180,7 @@ class _Context(SentOnce):
     def _entering(self) -> dict[int, Array]:
         """How changes of the other states enter each carried heading rate, (L, B, n)."""
         found = {}
-        for _, b in self.predictor.tied():
+        for _, b in self.predictor.tied:
             assert self.G is not None
             found[b] = self.G[..., b, :].copy()
             found[b][..., b] = 0.0

@@ -204,7 +204,7 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
 
     It is not the identity where a carried heading rate is a function of disturbed states.
     """
-    tied = predictor.tied()
+    tied = predictor.tied
     if not tied:
         return None
     data = predictor.data

@@ -64,7 +64,7 @@ def marched(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array | 
             first = predictor.advance(h, x, u[0], np.zeros(len(x)))
             off = np.abs(march(predictor, h, x, u[:1])[1] - first)
             room = np.full(first.shape[-1], AGREE)
-            room[[rate for _, rate in predictor.tied()]] = CARRIED
+            room[[rate for _, rate in predictor.tied]] = CARRIED
             march = march if (off <= room * (1 + np.abs(first))).all() else None
         predictor.marches[h.names] = march
     found = predictor.marches[h.names]

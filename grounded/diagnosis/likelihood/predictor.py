@@ -28,6 +28,7 @@ from grounded.diagnosis.likelihood.arriving import (
     memories_moved,
     within_steps,
 )
+from grounded.diagnosis.likelihood.cache import Cache
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
 from grounded.diagnosis.likelihood.hypothesis import (
@@ -61,21 +62,16 @@ from grounded.frozen import Array
 from grounded.places import integrated, outright_states, partner
 from grounded.rollout import each_stepped
 
-MOST_KEPT = 4_000_000  # numbers in the cache of one received input, or of whole trials
-STEPS_KEPT = 16  # simulator steps in the cache
-LOADS_KEPT = 32_000  # states in the cache of `loads`
-WEIGHTS_KEPT = 1000  # parameters at which weights of a loss' speed are remembered
-
 
 @dataclass(frozen=True, eq=False)
 class Predictor(SentOnce):
     """Evaluate hypotheses on one `Data`. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
 
     data: Data
-    _inputs: dict[str, dict[Any, Array]] = field(default_factory=dict)
-    _steps: dict[bytes, Array] = field(default_factory=dict)
-    _loads: dict[Any, Loads] = field(default_factory=dict)
-    _weights: dict[str, dict[bytes, Mapping[str, float]]] = field(default_factory=dict)
+    _inputs: dict[str, Cache] = field(default_factory=dict)
+    _steps: Cache = field(default_factory=lambda: Cache(16))  # of a simulator
+    _loads: Cache = field(default_factory=lambda: Cache(32_000))
+    _weights: dict[str, Cache] = field(default_factory=dict)
     _alike: dict[Any, list[tuple[Any, Array, Array]]] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
@@ -92,7 +88,7 @@ class Predictor(SentOnce):
         """Return a predictor whose caches follow one hypothesis' track, if a simulator; or self."""
         if not simulated(self.data.model):
             return self
-        return replace(self, _taken=self.taken.following(), _loads={})
+        return replace(self, _taken=self.taken.following(), _loads=Cache(self._loads.most))
 
     def inputs(self, h: Hypothesis) -> Array:
         """Return the inputs that the actuators receive under a hypothesis, by run (L, B, m).
@@ -176,14 +172,9 @@ class Predictor(SentOnce):
         self, what: str, acting: Acting, make: Callable[[], Array], beside: bytes = b""
     ) -> Array:
         """Return the cached result for the same effects and values (and `beside`), or make it."""
-        found = self._inputs.setdefault(what, {})
-        key: Any = (beside,)
-        key += tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
-        if (one := found.get(key)) is None:
-            one = make()
-            if len(found) > max(64, MOST_KEPT // max(one.size, 1)):
-                found.clear()
-        return found.setdefault(key, one)
+        found = self._inputs.setdefault(what, Cache(4_000_000, least=64))
+        values = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
+        return found.made((beside, *values), make)
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
@@ -214,10 +205,7 @@ class Predictor(SentOnce):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
         parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow and losses ask again
         key = blake2b(b"".join(part.tobytes() for part in parts)).digest()
-        if (found := self._steps.get(key)) is None:
-            if len(self._steps) >= STEPS_KEPT:
-                self._steps.clear()
-            found = self._steps[key] = system.step(*rows, p, dt or self.data.dt)
+        found = self._steps.made(key, lambda: system.step(*rows, p, dt or self.data.dt), 1)
         return found.reshape(x.shape).copy()
 
     def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
@@ -266,7 +254,7 @@ class Predictor(SentOnce):
             if dry:
                 last += self.added_rate(dry, after, u, t + dt, own)
         result = after + 0.5 * dt * last
-        for i, j in self.tied():  # a carried heading rate is the heading's rate, effects included
+        for i, j in self.tied:  # a carried heading rate is the heading's rate, effects included
             found = []
             for s, when in ((x, t), (result, t + dt)):
                 rate = self.instant(h, s, u)
@@ -377,26 +365,24 @@ class Predictor(SentOnce):
         names, p = self.data.model.input_names, self.params(h)
         drives = tuple(effect.site.targets for effect, _ in losses_of(h))
         rows = blake2b(x.tobytes() + u.tobytes() + p.tobytes()).digest()
-        if (found := self._loads.get(key := (drives, dt, rows))) is not None:
-            return found  # only the values of the losses differ, which this does not depend on
 
         def step(a: Named) -> Named:
             return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
 
-        a = Named("input", names, [u[..., j] for j in range(len(names))])
-        weights = self.weights(h, p, x.shape[:-1])
-        slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
-        if slopes is None:
-            found = loads(losses_of(h), self.named(x), a, step, weights)
-        else:  # cached slopes by the inputs are accurate enough
+        def make() -> Loads:
+            a = Named("input", names, [u[..., j] for j in range(len(names))])
+            weights = self.weights(h, p, x.shape[:-1])
+            slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
+            if slopes is None:
+                return loads(losses_of(h), self.named(x), a, step, weights)
+            # cached slopes by the inputs are accurate enough
             by_u = slopes[1].reshape(*x.shape, len(names))
             driving = {coupled(effect.site)[0] for effect, _ in losses_of(h)}
             answers = {tau: self.named(by_u[..., names.index(tau)]) for tau in driving}
-            found = loads_from(losses_of(h), self.named(x), a, step(a), answers, weights)
-        if len(self._loads) > LOADS_KEPT // x.size:
-            self._loads.clear()
-        self._loads[key] = found
-        return found
+            return loads_from(losses_of(h), self.named(x), a, step(a), answers, weights)
+
+        # the values of the losses may differ: this does not depend on them
+        return self._loads.made((drives, dt, rows), make, x.size)
 
     def weights(self, h: Hypothesis, p: Array, shape: tuple[int, ...]) -> list[Mapping[str, Any]]:
         """Return the weights of the velocities in each loss' speed, see `effects.drive`.
@@ -419,13 +405,11 @@ class Predictor(SentOnce):
         return found
 
     def _weights_at(self, effect: Effect, p: Array) -> Mapping[str, float]:
-        kept = self._weights.setdefault(effect.site.joined, {})
-        if (found := kept.get(key := p.tobytes())) is None:
-            if len(kept) >= WEIGHTS_KEPT:
-                kept.clear()
-            given = dict(zip(self.data.model.param_names, p.tolist(), strict=True))
-            found = kept[key] = weights_at(effect.site.model, effect.site.joined, given)
-        return found
+        kept = self._weights.setdefault(effect.site.joined, Cache(1000))
+        given = dict(zip(self.data.model.param_names, p.tolist(), strict=True))
+        return kept.made(
+            p.tobytes(), lambda: weights_at(effect.site.model, effect.site.joined, given), 1
+        )
 
     def _weight_slopes(self, h: Hypothesis, p: Array) -> list[dict[str, Array]]:
         """Return how the weights of each loss' speed change with the parameters, (k,) each."""
@@ -510,14 +494,12 @@ class Predictor(SentOnce):
         short = 1e-3 * self.data.dt
         return np.asarray((self.moved(h, x, u, short) - x) / short)
 
+    @cached_property
     def tied(self) -> list[tuple[int, int]]:
-        """Return pairs (heading, heading rate) of rates that are only carried along."""
+        """Pairs (heading, heading rate) of rates that are only carried along."""
         names, model = self.seen, moved_model(self.data.model)
-        known = self._inputs.setdefault("tied", {})
-        if () not in known:
-            found = [(names.index(n), k) for n in model.state_names if (k := partner(model, n))]
-            known[()] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
-        return [(int(i), int(j)) for i, j in known[()]]
+        found = [(names.index(n), k) for n in model.state_names if (k := partner(model, n))]
+        return [(i, names.index(k)) for i, k in found]
 
     def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
         """Return the total rate that (effect, values) pairs add at x (..., n), (..., n) [1/s]."""

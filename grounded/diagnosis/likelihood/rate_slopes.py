@@ -19,7 +19,7 @@ def with_effects(
     """Return the Jacobian of a hypothesis' step from x (L, B, n), given the model's own F."""
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
-    if not rates_of(h) and not (limits_of(h) and predictor.tied()):
+    if not rates_of(h) and not (limits_of(h) and predictor.tied):
         return logged_slopes(predictor, h, F) if limits_of(h) else F
     after = predictor.advance(h, x, u, data.time) if after is None else after
     half, mean = 0.5 * data.dt, (F - one) / data.dt
@@ -33,7 +33,7 @@ def with_effects(
         # the model's own rate used at the end is the step's mean, a function of the start
         later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
     found = later @ (one + half * first)
-    for heading, rate in predictor.tied():
+    for heading, rate in predictor.tied:
         row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
         row = (row[..., None, :] @ found)[..., 0, :]
         row -= heading_slope(predictor, h, x, u, data.time, heading, rate)
