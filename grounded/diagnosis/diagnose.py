@@ -44,8 +44,14 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.sound_data import sound_data
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, decide
-from grounded.diagnosis.validation.limits import Limits, counted_once, held, knowable, limits
-from grounded.diagnosis.validation.motions import without_others
+from grounded.diagnosis.validation.limits import (
+    Limits,
+    counted_once,
+    held,
+    knowable,
+    limits,
+    without_others,
+)
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import MOST_EFFECTS, interrupted, with_faults
 from grounded.diagnosis.writer import Writer

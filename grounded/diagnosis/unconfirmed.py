@@ -1,6 +1,6 @@
 """Effects that are likely but unconfirmed: too few trials show them to test them on held-out data.
 
-The same holds for an effect that shows in one repeated motion only (`validation.motions`). They are
+The same holds for an effect that shows in one repeated motion only. They are
 never claimed. Each is reported with the trial, the time and the region that show it, which is
 where a further trial should go. An effect that is likely in most trials and yet improves no
 held-out prediction points to a flaw of the likelihood: it is marked in the table, so that its
@@ -24,10 +24,10 @@ from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.likelihood.levels import NATS, SURE
 from grounded.diagnosis.next_trial import LOG, LOST
 from grounded.diagnosis.parts import Ranked, Unconfirmed
+from grounded.diagnosis.validation.acting import acting
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
-from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import Effect, RateFamily
 from grounded.frozen import Array
 from grounded.result import listed, number, with_unit
@@ -81,10 +81,9 @@ def _trifling(claims: Claims, one: Doubtful, row: RulerRow) -> bool:
 
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
-    data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
-    few = one.one_group or few_trials(data, acts)
-    if not few:
+    if not (few := one.one_group):
         return None
+    data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
     trial = int(np.bincount(data.trial_of, acts.sum(axis=0), data.count).argmax())
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
@@ -106,7 +105,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         float(begin + end),
         (few, data.count),
         regions[0] if regions else None,
-        one.one_group > 1,
+        few > 1,
         tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few]),
     )
 

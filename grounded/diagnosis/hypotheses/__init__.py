@@ -11,7 +11,6 @@ The modules:
     tuning        the constants of effects, which are no parameters of a fit
     joint_model   friction and inertia of all joints of an arm at once
     plainest      plain dry friction of a joint, as a rival of effects with more parameters
-    counterpart   effects that a shift of a parameter undoes
     lookalike     effects whose signals are nearly the same in these data
     stand_in      look-alikes fitted in place of an effect, with the parameters free
     one_clock     delayed commands and delayed sensors, which are equivalent

@@ -3,6 +3,8 @@
 Read `hypothesis`, then `refine`. The modules, each building on those above it (the Kalman filter
 itself is `grounded.filter`):
 
+    levels        what is asked of evidence and of a standard error
+    groups        trials that make the same motion under the same condition
     data          all trials as one record, cut into runs of equal length
     hypothesis    effects with their values, and shifts of the model's parameters
     predictor     what a hypothesis predicts

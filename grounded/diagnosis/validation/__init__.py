@@ -5,12 +5,9 @@ Read `ruler`, then `decide`. The modules, from the measurement to the claims:
     ruler              held-out open-loop errors over 0.1, 0.5, 1 s and whole trials, in units
     ahead              the open-loop predictions themselves
     gain               improvement of one hypothesis over another, and its scatter
-    single_steps       the same by one-step likelihoods, each trial left out in turn
-    visits             where an effect acts, and whether only few trials show it
-    motions            in how many different motions an effect is seen
-    decide             the decision between likely hypotheses, by the ruler
-    bounds             what the bounds of the model's parameters say about an effect beside them
-    own_numbers        the model's own numbers in place of effects that tie with them
+    choose             the rule: the smallest set of causes that predicts as well as any
+    decide             the fitted hypotheses as options of the rule, and its guards
+    acting             where an effect acts
     measured           errors, noise floor, credit and leftover of a decision
     held_out           the noise-normalised gap and utilities, held out
     prediction_error   where the gap is, by channel, time and region

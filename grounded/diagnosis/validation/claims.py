@@ -24,10 +24,10 @@ from grounded.diagnosis.parts import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.blame import STILL, Blame, moved_parameters
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
-from grounded.diagnosis.validation.credit import ordered
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
+from grounded.diagnosis.validation.measured import ordered
 from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect

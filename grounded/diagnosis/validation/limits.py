@@ -23,6 +23,7 @@ from grounded.diagnosis.validation.by_priors import information
 from grounded.effects import (
     Effect,
     InputFamily,
+    Library,
     LossFamily,
     MediumFamily,
     MemoryFamily,
@@ -30,6 +31,7 @@ from grounded.effects import (
     SensorDelayFamily,
     SensorFamily,
     SensorLagFamily,
+    param_name,
 )
 from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
@@ -429,6 +431,28 @@ def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Mode
     fixed = {names[i] for i in range(len(names)) if i not in free}
     params = {n: Param(p.value, p.unit) if n in fixed else p for n, p in model.params.items()}
     return replace(model, params=params) if fixed else model
+
+
+def without_others(data: Data, adopted: Collection[str], library: Library) -> Model:
+    """Return the model with the values of adopted effects held that one motion can't determine.
+
+    These are effects without a mechanism, if all trials are of one group: their values were found
+    from other trials.
+
+    Args:
+        data: the trials.
+        adopted: names of the adopted effects, whose values are parameters of the model.
+        library: source of the effects.
+    """
+    model, held = data.model, set[str]()
+    for name in adopted if len(data.groups) == 1 < data.count else ():
+        of, _, target = name.partition(":")
+        family = library.family(of)
+        if family.loose and target in family.targets(model):
+            effect = library.effect(name, model, data.scales)
+            held |= {param_name(name, q.name) for q in effect.quantities}
+    params = {n: Param(p.value, p.unit) if n in held else p for n, p in model.params.items()}
+    return replace(model, params=params) if held else model
 
 
 def _information(predictor: Predictor, fit: Fitted) -> Array:

@@ -8,7 +8,7 @@ floor is lowered to what it reaches.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -31,7 +31,6 @@ from grounded.diagnosis.hypotheses.leftover import Leftover, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.ahead import unseen
-from grounded.diagnosis.validation.credit import losses, ordered, shares
 from grounded.diagnosis.validation.decide import Decision, plain
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
 from grounded.diagnosis.validation.ruler import Ruler, repeated
@@ -332,3 +331,24 @@ def root_mean_square(error: Any) -> Any:
     count = np.isfinite(error).sum(axis=0)
     total = np.nansum(error**2, axis=0)
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def losses(ruler: Ruler, decision: Decision) -> dict[str, float]:
+    """Return by how much the log error grows without each cause, in the mean."""
+    without = decision.without.items()
+    return {name: max(ruler.gain(fit, decision.fit).mean, 0.0) for name, fit in without}
+
+
+def shares(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dict[str, float]:
+    """Return the share of the total gain (in log error) that is lost without each cause.
+
+    If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
+    losses sum to more than the total gain, the shares are normalised to 1.
+    """
+    whole = ruler.gain(decision.crude, decision.fit).mean
+    return {name: loss / max(whole, sum(lost.values()), 1e-12) for name, loss in lost.items()}
+
+
+def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
+    """Return names by their credit, largest first."""
+    return sorted(names, key=lambda name: -shares_.get(name, 0.0))

@@ -14,9 +14,9 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.parts import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.credit import losses, shares
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import limits
+from grounded.diagnosis.validation.measured import losses, shares
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library

@@ -6,7 +6,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.validation.motions import (
+from grounded.diagnosis.validation.limits import (
     without_others,
 )
 from grounded.effects import Library, wrap
