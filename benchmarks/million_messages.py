@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from peer_data import fastest
+from peers import fastest
 
 from grounded_trials.logs.signals import SignalSpec, read_signals
 

@@ -1,6 +1,6 @@
 """Run the foreign bench.
 
-    python -m benchmarks.foreign [--only NAME] [--alone] [--json] [--optimum] [--adopt N] [--list]
+    python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--adopt N] [--list]
 
 Needs mujoco, jsbsim, commonroad-vehicle-models; set-ups of a missing simulator are skipped with a
 note.
@@ -20,7 +20,6 @@ from benchmarks.foreign.study import adopting, measured, table
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.foreign", description=__doc__)
     parser.add_argument("--only", action="append", help="set-ups whose names begin so")
-    parser.add_argument("--alone", action="store_true", help="without refit-and-replan and ILC")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
     parser.add_argument("--optimum", action="store_true", help="compute optima.json, which is slow")
     parser.add_argument("--adopt", type=int, help="diagnose after so many trials, and adopt")
@@ -43,7 +42,7 @@ def main() -> int:
         elif asked.adopt:
             print(adopting(one, asked.adopt), flush=True)
         else:
-            rows.append(measured(one, asked.alone))
+            rows.append(measured(one))
             say(table(rows[-1:]).splitlines()[-1])
     if asked.json:
         print(json.dumps([row.to_json() for row in rows], indent=1))

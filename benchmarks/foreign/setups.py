@@ -33,7 +33,7 @@ class Setup:
         return self.robot.run(candidate.policy)
 
     def real(self, policy: Policy, run: int) -> Trial:
-        """Run a policy on the robot; every run is the same (`grounded.experiments.baselines`)."""
+        """Run a policy on the robot; every run is the same."""
         return self.robot.run(policy)
 
 

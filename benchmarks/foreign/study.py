@@ -1,4 +1,4 @@
-"""Run the search, refit-and-replan and iterative learning control on a set-up.
+"""Run the search on a set-up, alone or with what a diagnosis claims.
 
 The gap is counted from the first trial, the model's own policy, or from a run with the inputs held
 if that failed. A utility within half a per cent of the optimum counts as all of the gap, because
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 
@@ -18,8 +18,6 @@ import numpy as np
 from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
 from grounded.diagnosis.diagnose import diagnose
-from grounded.experiments.baselines import learning_control, refit_alone
-from grounded.experiments.bench import Kept
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
@@ -31,24 +29,12 @@ from grounded_trials.workspace.adopted import planner_of
 
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
-PATIENCE = 30.0  # [s] of CPU time for each method
-
-
-@dataclass(frozen=True)
-class Other:
-    """Another method's best utility, the trial that had it, and why it did not finish, if so."""
-
-    utility: float
-    trial: int
-    trouble: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.utility:.4g} ({self.trial}{', ' if self.trouble else ''}{self.trouble})"
+PATIENCE = 30.0  # [s] of CPU time
 
 
 @dataclass(frozen=True)
 class Row:
-    """One set-up: utilities, trials to SHARES, the other methods, CPU time, the ending."""
+    """One set-up: utilities, trials to SHARES, CPU time, the ending."""
 
     name: str
     withheld: str
@@ -57,8 +43,6 @@ class Row:
     trials: int
     reached: tuple[int | None, ...]
     optimum: float | None
-    refit: Other | None
-    ilc: Other | None
     seconds: float
     phase: str
     sentence: str
@@ -88,8 +72,8 @@ def patience(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def measured(setup: Setup, alone: bool = False) -> Row:
-    """Run the search on one set-up and, unless `alone`, refit-and-replan and ILC."""
+def measured(setup: Setup) -> Row:
+    """Run the search on one set-up."""
     utilities: list[float] = []
 
     def run(candidate: Candidate) -> Trial:
@@ -117,8 +101,6 @@ def measured(setup: Setup, alone: bool = False) -> Row:
         trials=len(utilities),
         reached=trials_to(setup, utilities, best),
         optimum=best,
-        refit=None if alone else other(setup, refit_alone),
-        ilc=None if alone else other(setup, learning_control),
         seconds=seconds,
         phase=phase,
         sentence=sentence,
@@ -152,37 +134,6 @@ def adopting(setup: Setup, after: int) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def other(setup: Setup, method: Callable[[Setup, SearchOptions], list[Kept]]) -> Other:
-    """Return another method's best utility, and after how many trials it came."""
-    utilities: list[float] = []
-
-    def counted(policy: Policy) -> Trial:
-        trial = setup.robot.run(policy)
-        utilities.append(setup.task.utility(trial))
-        return trial
-
-    trouble = ""
-    try:
-        with patience(PATIENCE):
-            method(_Counted(setup, counted), SearchOptions())
-    except OutOfTime:
-        trouble = "out of time"
-    except Exception as error:  # what it had until then counts
-        trouble = type(error).__name__
-    best = int(np.argmax(utilities)) if utilities else -1
-    return Other(utilities[best] if utilities else -np.inf, best + 1, trouble)
-
-
-class _Counted:
-    """A set-up whose runs are counted."""
-
-    def __init__(self, setup: Setup, run: Callable[[Policy], Trial]) -> None:
-        self.task, self._run = setup.task, run
-
-    def real(self, policy: Policy, run: int) -> Trial:
-        return self._run(policy)
-
-
 def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple[int | None, ...]:
     """Return the trial at which each share of the gap was first closed, or None."""
     if best is None or not utilities:
@@ -210,15 +161,14 @@ def table(rows: list[Row]) -> str:
 
     head = (
         "set-up", "withheld", "first", "final", "optimum", "trials", "to 90/97/99 %",
-        "refit (trial)", "ILC (trial)", "CPU s", "ended",
+        "CPU s", "ended",
     )  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for r in rows:
         reached = "/".join("-" if t is None else str(t) for t in r.reached)
         cells = (
             r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), str(r.trials),
-            reached, str(r.refit or "-"), str(r.ilc or "-"),
-            f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
+            reached, f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

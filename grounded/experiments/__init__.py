@@ -5,9 +5,7 @@ and a result with `to_json` and `tables`:
 
     flight           Table 1, Figure 1: an aircraft's figure-8 (task: `figure8`)
     car              Figures 4 and 5: three manoeuvres of the RC car (`car_tasks`, `real_car`)
-    estimated        the same on estimated states; fit_car: its parameters from driving (`driving`)
-    nondeterminism   repeated runs; repeats: the line search under noise
-    baselines        seven methods (`ilc` is one) on one `bench`
+    nondeterminism   repeated open-loop runs of the car
     theorem1, footnote9     the paper's theoretical results
     pendulum         the smallest example, for `grounded demo`
 

@@ -18,14 +18,16 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
+from grounded.plant import Noise, Plant
+from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.step.step_size import SearchOptions
+from grounded.task import Task
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
@@ -113,32 +115,67 @@ def run(
     return CarResult(run_study(CarRun, car_job, cases, **how))
 
 
-def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
-    """Return a case with the simulated real car as declared, not a variant of it."""
-    task, model = car_task(manoeuvre, car), real_car()
+@dataclass(frozen=True, eq=False)
+class CarCase:
+    """The task with the crude model, the same with the real car and its latency, and that car."""
+
+    task: Task
+    truth: Task
+    plant: Plant
+    seed: int
+
+    def run(self, policy: Policy, *stream: int) -> Trial:
+        """Run a policy on the real car, with the random numbers of a stream."""
+        start = dict(zip(car.state_names, map(float, self.task.start), strict=True))
+        return self.plant.run(policy, start, np.random.default_rng(list(stream)))
+
+    def optimum(self) -> Policy:
+        """Return the best policy of a search that plans with the real car, without scatter."""
+        quiet = replace(self.plant, noise=Noise())
+        options = SearchOptions(step="full", max_trials=30, max_halvings=6)
+        best = learn(self.truth, replace(self, plant=quiet).first, options, check=False).best
+        assert best is not None
+        return best.candidate.policy
+
+    def first(self, candidate: Candidate) -> Trial:
+        """Run a candidate as the first one."""
+        return self.run(candidate.policy, self.seed, 11, 0)
+
+    def true_utility(self, policy: Policy, runs: int) -> float:
+        """Return the mean utility of fresh runs; a crash counts as a car that never moved."""
+        error = self.task.model.difference(
+            np.tile(self.task.start, (self.task.horizon + 1, 1)), self.task.target
+        )
+        still = -float((np.nan_to_num(error) ** 2 @ self.task.reward.state).sum())
+        fresh = [self.task.utility(self.run(policy, self.seed, 7, i)) for i in range(runs)]
+        return float(np.mean(np.maximum(fresh, still)))
+
+
+def car_case(manoeuvre: str, seed: int, noisy: bool) -> CarCase:
+    """Return a case with the simulated real car as declared."""
+    task = car_task(manoeuvre, car)
     latency = np.array([LATENCY[name] for name in car.input_names])
-    truth = replace(task.with_model(model), latency=latency)
-    return Bench(task, truth, real_plant(noisy), seed)
+    truth = replace(task.with_model(real_car()), latency=latency)
+    return CarCase(task, truth, real_plant(noisy), seed)
 
 
 def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """Run one job: one repetition of one manoeuvre."""
-    case = real_case(manoeuvre, seed, noisy)
+    case = car_case(manoeuvre, seed, noisy)
     options = SearchOptions(max_trials=BUDGET)
     trials: list[Trial] = []
 
     def real(candidate: Candidate) -> Trial:
-        trials.append(case.real(candidate.policy, len(trials)))
+        trials.append(case.run(candidate.policy, seed, 11, len(trials)))
         return trials[-1]
 
     found = learn(case.task, real, options, max_iterations=ITERATIONS, check=False)
     standing = found.standing
     kept = [tried for tried in standing.history if tried.accepted]
-    best, _ = optimum(case)
     fresh = FRESH if noisy else 1
     true = [
-        true_utility(case.task, case.plant, policy, fresh, seed)
-        for policy in (kept[0].candidate.policy, kept[-1].candidate.policy, best)
+        case.true_utility(policy, fresh)
+        for policy in (kept[0].candidate.policy, kept[-1].candidate.policy, case.optimum())
     ]
     columns = [case.task.model.state_names.index(name) for name in ("x", "y")]
     paths = {"target": case.task.target[:, columns].tolist()}

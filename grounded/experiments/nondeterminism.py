@@ -15,12 +15,12 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
 from grounded.experiments.jobs import Running, StudyTable, every, run_study
 from grounded.experiments.real_car import real_plant
 from grounded.frozen import Array
 from grounded.models.car import model as car
+from grounded.plant import Noise, Plant
 
 SECONDS = 2.0
 RUNS = 10
@@ -106,3 +106,12 @@ def nondeterminism_job(sequence: str, level: float, runs: int, seed: int) -> dic
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     rms = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return {"sequence": sequence, "level": level, "rms": rms, "largest": float(apart.max())}
+
+
+def scaled(plant: Plant, level: float) -> Plant:
+    """Return the plant with all noise standard deviations times `level`."""
+    kinds = {
+        kind: {name: level * std for name, std in getattr(plant.noise, kind).items()}
+        for kind in ("start", "process", "measurement")
+    }
+    return replace(plant, noise=Noise(**kinds))

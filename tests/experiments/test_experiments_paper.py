@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from grounded.experiments import (
-    baselines,
     car,
     flight,
     footnote9,
     nondeterminism,
-    repeats,
     theorem1,
 )
 
@@ -129,40 +127,3 @@ def test_the_quiet_car_reaches_the_papers_improvement():
     assert quiet.trials <= car.BUDGET
     assert len(quiet.paths["target"]) == len(quiet.paths["iteration 0"])
     plain(result)
-
-
-@pytest.mark.slow
-def test_baselines_count_trials():
-    result = baselines.run(
-        [0], manoeuvres=("turn",), kinds=("parametric",), methods=("grounded", "ilc", "differences")
-    )
-    found = {line.method: line for line in result.lines}
-    assert found["grounded"].final > 0.95 and found["ilc"].final > 0.95
-    assert found["grounded"].trials[0] <= 4
-    assert found["differences"].trials[0] > 100  # a gradient alone costs H m = 120 trials
-    plain(result)
-    assert baselines.median_trials([2, None, 4]) == "4"
-    assert baselines.median_trials([2, None, None]) == "-"
-
-
-@pytest.mark.slow
-def test_noise_judges_by_fresh_runs():
-    rules = (repeats.RULES[0], repeats.RULES[5])
-    result = repeats.run([0], manoeuvres=("turn",), levels=(1.0,), rules=rules)
-    document = plain(result)
-    assert [o["rule"] for o in document["outcomes"]] == [rule.name for rule in rules]
-    assert all(o["closed"] > 0.8 for o in document["outcomes"])
-    assert document["recommended"] in [rule.name for rule in rules]
-    assert result.tables()[-1].rows[0][-1] == f"{document['outcomes'][0]['trials']:.1f}"
-
-
-def test_the_recommended_rule_is_the_cheapest_that_is_as_good_as_the_best():
-    def outcome(rule, seed, closed, trials):
-        return repeats.Outcome(rule, "turn", 1.0, seed, 5, 1, closed, closed, 0.0, trials)
-
-    lucky = [outcome("dear", s, 0.99 + 0.01 * (-1) ** s, 40) for s in range(8)]
-    cheap = [outcome("cheap", s, 0.988 - 0.01 * (-1) ** s, 20) for s in range(8)]
-    bad = [outcome("bad", s, 0.8, 5) for s in range(8)]
-    assert repeats.NoiseResult((*lucky, *cheap, *bad)).recommended == "cheap"
-    worse = [outcome("cheap", s, 0.9, 20) for s in range(8)]
-    assert repeats.NoiseResult((*lucky, *worse, *bad)).recommended == "dear"

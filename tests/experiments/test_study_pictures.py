@@ -7,19 +7,15 @@ import pytest
 
 from facts import holding
 from grounded.errors import GroundedError
-from grounded.experiments.baselines import BaselinesResult, Line
 from grounded.experiments.car import CarResult, CarRun
-from grounded.experiments.estimated import EstimatedResult, EstimatedRun
-from grounded.experiments.fit_car import FitCarResult
 from grounded.experiments.flight import FlightResult, FlightRun
 from grounded.experiments.footnote9 import Footnote9Result, Footnote9Row
 from grounded.experiments.nondeterminism import EndPointSpread, NondeterminismResult
-from grounded.experiments.repeats import NoiseResult, Outcome
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.figures.figure import Bars
 from grounded.figures.interactive import plotted
 from grounded_cli.studies.experiment import STUDIES
-from grounded_trials.report.studies.pictures import PICTURES, draw_study
+from grounded_trials.report.study_pictures import PICTURES, draw_study
 
 ANGLE = np.linspace(0, 2 * np.pi, 61)
 LOOP = np.column_stack([40 * np.sin(ANGLE), 40 * np.cos(ANGLE), 0 * ANGLE])
@@ -37,28 +33,8 @@ def driven(name, noisy, iterations):
     return CarRun(name, 0, noisy, (-9.0, -1.0), (-9.0, -1.0), -0.9, 4, (1.0,), paths)
 
 
-def filmed(name, way):
-    errors = (0.003, 0.05, 0.1) if way == "camera" else None
-    return EstimatedRun(name, 0, way, (-9.0, -1.0), (-9.0, -1.0, -0.9), 4, 1.0, errors, errors)
-
-
-def fitted():
-    value = {"true": 1.0, "first": 1.1, "value": 1.01, "std": 0.01, "low": 0.99, "high": 1.03}
-    return {"params": {"a1": value | {"unit": "rad", "inside": True}}}
-
-
 def results():
     cars = [driven("turn", True, 5), driven("circle", False, 2), driven("figure8", True, 0)]
-    lines = [
-        Line("grounded", "turn", "noise", 0, (2, 2, 3, 4), 0.99, 4),
-        Line("refit", "turn", "noise", 0, (2, 3, None, None), 0.9, 4),
-        Line("differences", "turn", "noise", 0, (125, 300, 600, 850), 0.99, 850),
-    ]
-    outcomes = [
-        Outcome(rule, "turn", level, 0, 3, 1, 0.9 - 0.1 * level, 0.8, 0.1, 9)
-        for rule in ("single", "three")
-        for level in (1.0, 2.0)
-    ]
     theorem = [
         Theorem1Row(e, s, e * (1 + s), (e * (1 + s)) ** 2, 2.0, 9, 40.0 + s)
         for e in (0.01, 0.1)
@@ -67,17 +43,12 @@ def results():
     spreads = tuple(
         EndPointSpread("circle", level, 0.1 * level, 0.2 * level) for level in (0.0, 1.0, 3.0)
     )
-    ways = [filmed("circle", way) for way in ("camera", "true")]
     return {
         "flight": FlightResult((flown(0, 1.0), flown(1, 2.0)), -1826.0, LOOP.tolist()),
         "car": CarResult(tuple(cars)),
-        "fit-car": FitCarResult((fitted(), fitted()), 30.0),
-        "estimated": EstimatedResult(tuple(ways)),
         "nondeterminism": NondeterminismResult(spreads, 5),
         "footnote9": Footnote9Result((Footnote9Row(5.0, 1e-11, 1.0, 2, 1e-11, 21),)),
         "theorem1": Theorem1Result(tuple(theorem)),
-        "baselines": BaselinesResult(tuple(lines)),
-        "noise": NoiseResult(tuple(outcomes)),
     }
 
 

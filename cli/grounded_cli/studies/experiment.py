@@ -18,13 +18,9 @@ if TYPE_CHECKING:
 STUDIES = {
     "flight": ("flight", "run", "count", "Table 1 and Figure 1: the aircraft's figure-8"),
     "car": ("car", "run", "seeds", "the car's three tasks, Figures 4 and 5"),
-    "fit-car": ("fit_car", "fit_car", "seeds", "footnote 17: parameters from driving"),
-    "estimated": ("estimated", "run", "seeds", "the closed-loop car on estimated states"),
     "nondeterminism": ("nondeterminism", "run", "runs", "repeated open-loop runs (5.2)"),
     "footnote9": ("footnote9", "run", "", "a model that is wrong by a constant"),
     "theorem1": ("theorem1", "run", "seeds", "gradient error and where the search ends"),
-    "baselines": ("baselines", "run", "seeds", "trials to close the gap, seven methods"),
-    "noise": ("repeats", "run", "seeds", "the line search under noise, six rules"),
 }
 
 
@@ -70,7 +66,7 @@ def command(
             given["progress"] = progress
         result = study(**given)
     if png:
-        from grounded_trials.report.studies.pictures import draw_study
+        from grounded_trials.report.study_pictures import draw_study
 
         draw_study(name, result, Path(png))
     if json_:
@@ -85,7 +81,7 @@ def command(
 def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
     """Translate --seeds into the arguments of a study."""
     if text is None:
-        return {"seeds": range(20)} if name == "fit-car" else {}
+        return {}
     if not kind:
         raise click.UsageError(f"'{name}' is deterministic: it takes no --seeds")
     try:

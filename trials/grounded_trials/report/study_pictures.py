@@ -1,8 +1,4 @@
-"""Draws the picture of each of the paper's studies, in the style of the report's figures.
-
-This module draws those with curves: the aircraft's paths (Figure 1), the car's (Figures 4 and 5),
-Theorem 1 over epsilon, and the line search over the scatter. `bars.py` draws the others.
-"""
+"""Draws the picture of each of the paper's studies, in the style of the report's figures."""
 
 from __future__ import annotations
 
@@ -16,8 +12,9 @@ from grounded.errors import GroundedError
 from grounded.experiments.car import PAPER, CarResult, CarRun
 from grounded.experiments.figure8 import DT
 from grounded.experiments.flight import FIGURE_STEP, FlightResult
+from grounded.experiments.footnote9 import Footnote9Result
 from grounded.experiments.jobs import mean_se
-from grounded.experiments.repeats import NoiseResult, Outcome
+from grounded.experiments.nondeterminism import NondeterminismResult
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.figures.figure import (
     STEPS,
@@ -35,18 +32,11 @@ from grounded.figures.figure import (
 )
 from grounded.frozen import Array
 from grounded_trials.report.figures.png import png
-from grounded_trials.report.studies.bars import (
-    baselines_figure,
-    estimated_figure,
-    fit_car_figure,
-    footnote9_figure,
-    nondeterminism_figure,
-)
 from grounded_trials.store.store import made_folder, write_atomically
 
 FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
 PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
-RULE_ROLES = ("model", "step2", "accepted", "best", "other", "predicted", "desired")
+PAPER_SPREAD = 50.0  # [cm] largest distance reported in the paper
 SMALLEST = 1e-300  # lower bound of arguments of the logarithm
 
 
@@ -215,43 +205,47 @@ def _log(value: float) -> float:
     return float(np.log10(max(value, SMALLEST)))
 
 
-def noise_figure(result: NoiseResult) -> Figure:
-    """Draw the share of the gap closed by each rule over the scatter: median and worst seed."""
-    panels = []
-    for name in dict.fromkeys(o.manoeuvre for o in result.outcomes):
-        own = [o for o in result.outcomes if o.manoeuvre == name]
-        panels.append(_shares(own, f"{name}: gap closed, median of the seeds", np.median))
-        if len({o.seed for o in own}) > 1:
-            panels.append(_shares(own, f"{name}: gap closed, the worst seed", np.min))
-    title = f"The line search under noise; recommended: {result.recommended}"
-    return Figure("noise", title, "", tuple(panels), legend(panels))
+def footnote9_figure(result: Footnote9Result) -> Figure:
+    """Draw shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
+    kinds = {"model": "model-based", "best": "one iteration", "other": "policy gradient"}
+    bars = []
+    for row in result.rows:
+        values = (row.model_based, row.solved, row.gradient)
+        for (role, name), value in zip(kinds.items(), values, strict=True):
+            bars.append(Bar(f"b = {row.b:g}, {name}", value, f"{value:.3g}", role))
+    title = "Footnote 9: a model that is wrong by b"
+    panel = Bars("Real utility as a share of the optimum", tuple(bars))
+    return Figure(
+        "footnote9",
+        title,
+        "",
+        (panel,),
+        tuple(Key(role, name, "disc") for role, name in kinds.items()),
+    )
 
 
-def _shares(outcomes: Sequence[Outcome], title: str, of: Callable[[Array], Any]) -> Panel:
-    """Draw one curve per rule."""
-    curves, dots = [], []
-    for k, rule in enumerate(dict.fromkeys(o.rule for o in outcomes)):
-        closed: dict[float, list[float]] = {}
-        for o in sorted((o for o in outcomes if o.rule == rule), key=lambda o: o.level):
-            closed.setdefault(o.level, []).append(o.closed)
-        shares = {level: 100 * float(of(np.array(some))) for level, some in closed.items()}
-        role = RULE_ROLES[k % len(RULE_ROLES)]
-        curves.append(Curve(np.array([*shares]), np.array([*shares.values()]), role, rule))
-        for level, share in shares.items():
-            dots.append(Dot(level, share, role, f"{rule}, scatter x{level:g}: {share:.1f} %"))
-    return Panel(title, "scatter, relative to the car’s", "%", tuple(curves), tuple(dots))
+def nondeterminism_figure(result: NondeterminismResult) -> Figure:
+    """Draw the largest distance between end points, by scatter and sequence, on one scale."""
+    roles = ("other", "best", "model")
+    bars, keys = [], []
+    for i, level in enumerate(sorted({s.level for s in result.spreads})):
+        role = roles[min(i, len(roles) - 1)]
+        keys.append(Key(role, f"scatter x{level:g}", "disc"))
+        for s in result.spreads:
+            if s.level == level:
+                cm = 100 * s.largest
+                bars.append(Bar(f"{s.sequence}, x{level:g}", cm, f"{cm:.1f} cm", role))
+    bars.append(Bar("the paper’s car, at most", PAPER_SPREAD, f"{PAPER_SPREAD:.0f} cm", "desired"))
+    panel = Bars(f"Largest distance between end points, {result.runs} runs of 2 s", tuple(bars))
+    return Figure("nondeterminism", "Repeated runs with the same inputs", "", (panel,), tuple(keys))
 
 
 PICTURES: dict[str, Callable[[Any], Figure]] = {
     "flight": flight_figure,
     "car": car_figure,
-    "fit-car": fit_car_figure,
-    "estimated": estimated_figure,
     "nondeterminism": nondeterminism_figure,
     "footnote9": footnote9_figure,
     "theorem1": theorem1_figure,
-    "baselines": baselines_figure,
-    "noise": noise_figure,
 }
 
 

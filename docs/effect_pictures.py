@@ -1,12 +1,10 @@
-"""Draws a picture of each effect family's signature, for docs/effects.md.
-
-Run `python -m grounded_trials.report.studies.effect_pictures docs` to update them.
+"""Draw each effect family's signature for docs/effects.md: `python docs/effect_pictures.py docs`.
 
 The model (grey) and the model with one effect (orange) get the same commands. The model is a car,
 for effects of a joint a pendulum, for those of a medium a boat. The picture shows the state that
 changes most relative to its range: a dynamic one (speed, steering angle, heading rate) if it
 changes at all, else a position. The strength is chosen for a change of about a quarter of the
-range.
+range. Needs the extra `png`.
 """
 
 from __future__ import annotations
@@ -28,22 +26,28 @@ from grounded.effects import (
     MemoryFamily,
     ParamFamily,
     RateFamily,
-    Scales,
     memory_start,
     scales_of,
     wrap,
 )
 from grounded.effects.medium import FAMILIES as MEDIUM
+from grounded.figures.figure import Curve, Figure, Panel
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
+from grounded_trials.report.figures.png import png
 
 DT, STEPS = 0.05, 160
-WIDE, HIGH, GAP, TOP = 170, 84, 14, 18  # of a panel [px]
-ROW = 4  # panels side by side
-SEEN = 0.25  # desired change, as a fraction of a state's range
+CHANGE = 0.25  # as a fraction of a state's range
+KINDS = (
+    ("input", InputFamily),
+    ("memory", MemoryFamily),
+    ("joint", LossFamily),
+    ("rate", RateFamily | MediumFamily),
+    ("param", ParamFamily),
+)
 
 Drawn = tuple[str, Array, Array]  # a state's name, its values without and with effect (T + 1,)
 
@@ -101,7 +105,7 @@ def settings(effect: Effect) -> list[dict[str, float]]:
 
 
 def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
-    """Return the state that changes most, at the strength with a change closest to `SEEN`."""
+    """Return the state that changes most, at the strength with a change closest to `CHANGE`."""
     size, model = np.maximum(np.ptp(plain, axis=0), 1e-9), effect.site.model
     fast = [model.state_names.index(name) for name in places.dynamic(model)]
     found = []
@@ -111,78 +115,64 @@ def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
         if change[fast].max() > 0.02:
             change = np.where(np.isin(np.arange(model.n), fast), change, 0.0)
         i = int(np.argmax(change))
-        found.append(
-            (abs(float(change[i]) - SEEN), model.state_names[i], plain[:, i], changed[:, i])
-        )
-    return min(found, key=lambda each: each[0])[1:]
-
-
-def strip(named: Mapping[str, Drawn]) -> str:
-    """Return small plots in rows as one SVG."""
-    step, body = TOP + HIGH + GAP, []
-    for i, (title, (state, *curves)) in enumerate(named.items()):
-        x, y = (i % ROW) * (WIDE + GAP), (i // ROW) * step
-        low, size = np.min(curves), max(float(np.ptp(curves)), 1e-9)
-        body.append(f'<text x="{x}" y="{y + 12}" fill="#777777">{title} ({state})</text>')
-        for values, colour in zip(curves, ("#999999", "#d9480f"), strict=True):
-            across = x + WIDE * np.arange(len(values)) / (len(values) - 1)
-            up = y + TOP + HIGH * (1 - (values - low) / size)
-            points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(across, up, strict=True))
-            look = f'fill="none" stroke="{colour}" stroke-width="1.6"'
-            body.append(f'<polyline points="{points}" {look}/>')
-    wide, high = min(len(named), ROW) * (WIDE + GAP), -(-len(named) // ROW) * step
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{high}" '
-        f'font-family="sans-serif" font-size="11">{"".join(body)}</svg>\n'
-    )
+        drawn = (model.state_names[i], plain[:, i], changed[:, i])
+        found.append((abs(float(change[i]) - CHANGE), drawn))
+    return min(found, key=lambda each: each[0])[1]
 
 
 def kind_of(effect: Effect) -> str:
     """Return the section of docs/effects.md that an effect belongs to."""
-    kinds = {InputFamily: "input", MemoryFamily: "memory", LossFamily: "joint", RateFamily: "rate"}
-    kinds |= {MediumFamily: "rate", ParamFamily: "param"}
-    name = next((k for cls, k in kinds.items() if isinstance(effect.family, cls)), "sensor")
-    return "sensor" if effect.family.name == "odometry_scale" else name
+    kinds = (name for name, kind in KINDS if isinstance(effect.family, kind))
+    return "sensor" if effect.family.name == "odometry_scale" else next(kinds, "sensor")
 
 
-def drawn_of(model: Model, scales: Scales) -> list[Effect]:
+def drawn_of(model: Model, plain: Array, inputs: Array) -> list[Effect]:
     """Return the effects to draw: all for the car, joint effects for the pendulum, else medium."""
+    library, scales = Library(), scales_of(model, plain, inputs, DT, STEPS * DT)
     if model is car:
-        return list(Library().candidates(model, scales))
-    library = Library()
+        return list(library.candidates(model, scales))
     joints = [family for family in library.families if isinstance(family, LossFamily)]
-    drawn = MEDIUM if model is boat else joints
-    names = [f"{family.name}:{target}" for family in drawn for target in family.targets(model)]
+    families = MEDIUM if model is boat else joints
+    names = [f"{family.name}:{target}" for family in families for target in family.targets(model)]
     return [library.effect(name, model, scales) for name in names]
 
 
-def draw_all(folder: Path) -> list[Path]:
-    """Write effects-KIND.svg for every kind; return their paths."""
-    inputs, swings = commands(), 2.0 * commands()[:, :1]
-    strips: dict[str, dict[str, Drawn]] = {}
-    for model, u in ((car, inputs), (pendulum, swings), (boat, inputs)):
-        plain = run(model, model, u)
-        scales = scales_of(model, plain, u, DT, STEPS * DT)
-        for effect in drawn_of(model, scales):
-            named = strips.setdefault(kind_of(effect), {})
-            drawn = signature(effect, u, plain)
-            before = named.get(effect.family.name)
-            if before is None or _change(drawn) > _change(before):  # the target that shows it best
-                named[effect.family.name] = drawn
-    paths = []
-    for kind, named in strips.items():
-        paths.append(folder / f"effects-{kind}.svg")
-        paths[-1].write_text(strip(named), encoding="utf-8")
-    return paths
-
-
-def _change(drawn: Drawn) -> float:
+def change_of(drawn: Drawn) -> float:
     """Return the largest distance of the lines relative to the first one's range, 0 if over 2."""
     _, plain, changed = drawn
     far = float(np.abs(changed - plain).max() / max(float(np.ptp(plain)), 1e-9))
     return far if far < 2 else 0.0
 
 
+def picture(kind: str, named: Mapping[str, Drawn]) -> bytes:
+    """Return a picture with a panel for each family."""
+    times = np.arange(STEPS + 1) * DT
+    panels = []
+    for name, (state, plain, changed) in named.items():
+        curves = (Curve(times, plain, "other"), Curve(times, changed, "model"))
+        panels.append(Panel(f"{name} ({state})", "", "", curves, kind="time"))
+    return png(Figure(f"effects-{kind}", "", "", tuple(panels)), columns=4, size=(2.6, 1.5))
+
+
+def main(folder: Path) -> None:
+    """Write effects-KIND.png for every kind."""
+    strips: dict[str, dict[str, Drawn]] = {}
+    for model, inputs in (
+        (car, commands()),
+        (pendulum, 2.0 * commands()[:, :1]),
+        (boat, commands()),
+    ):
+        plain = run(model, model, inputs)
+        for effect in drawn_of(model, plain, inputs):
+            named, drawn = strips.setdefault(kind_of(effect), {}), signature(effect, inputs, plain)
+            before = named.get(effect.family.name)
+            if before is None or change_of(drawn) > change_of(
+                before
+            ):  # the target that shows it best
+                named[effect.family.name] = drawn
+    for kind, named in strips.items():
+        (folder / f"effects-{kind}.png").write_bytes(picture(kind, named))
+
+
 if __name__ == "__main__":
-    for path in draw_all(Path(sys.argv[1] if len(sys.argv) > 1 else "docs")):
-        print(path)
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))
