@@ -9,12 +9,14 @@ range. Needs the extra `png`.
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from grounded import places
 from grounded.effects import (
@@ -144,14 +146,18 @@ def change_of(drawn: Drawn) -> float:
     return far if far < 2 else 0.0
 
 
-def picture(kind: str, named: Mapping[str, Drawn]) -> bytes:
-    """Return a picture with a panel for each family."""
+def picture(kind: str, named: Mapping[str, Drawn]) -> Image.Image:
+    """Return a small picture in few colours, with a panel for each family."""
     times = np.arange(STEPS + 1) * DT
     panels = []
     for name, (state, plain, changed) in named.items():
         curves = (Curve(times, plain, "other"), Curve(times, changed, "model"))
         panels.append(Panel(f"{name} ({state})", "", "", curves, kind="time"))
-    return png(Figure(f"effects-{kind}", "", "", tuple(panels)), columns=4, size=(2.6, 1.5))
+    figure = Figure(f"effects-{kind}", "", "", tuple(panels))
+    whole = Image.open(io.BytesIO(png(figure, columns=4, size=(2.6, 1.5)))).convert("RGB")
+    return whole.resize((whole.width // 2, whole.height // 2), Image.Resampling.LANCZOS).quantize(
+        24
+    )
 
 
 def main(folder: Path) -> None:
@@ -171,7 +177,7 @@ def main(folder: Path) -> None:
             ):  # the target that shows it best
                 named[effect.family.name] = drawn
     for kind, named in strips.items():
-        (folder / f"effects-{kind}.png").write_bytes(picture(kind, named))
+        picture(kind, named).save(folder / f"effects-{kind}.png", optimize=True)
 
 
 if __name__ == "__main__":

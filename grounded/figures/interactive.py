@@ -23,6 +23,7 @@ from grounded.figures.figure import (
     Curve,
     Dot,
     Figure,
+    Key,
     Panel,
     log_ticks,
     loss_ticks,
@@ -120,8 +121,7 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
         trace |= {"x": x, "y": y, "mode": "lines+markers"}
     if curve.note:
         trace["hovertemplate"] = f"{curve.note}: {trace['hovertemplate']}"
-    if curve.role in DASHES:
-        trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
+    trace["line"] |= _dash(curve.role)
     if curve.times is not None:
         trace["customdata"] = curve.times[index]
         trace["hovertemplate"] = "%{customdata:.2f} s: (%{x:.4g}, %{y:.4g})"
@@ -173,6 +173,23 @@ def _dots(panel: Panel, dots: Sequence[Dot]) -> dict[str, Any]:
     return trace
 
 
+def key_trace(key: Key) -> dict[str, Any]:
+    """Return a trace without points that stands for an entry of a legend."""
+    colour = f"@{key.role}"
+    trace: dict[str, Any] = {"type": "scatter", "x": [None], "y": [None], "name": key.name}
+    if key.shape in SYMBOLS:
+        look = {"size": 9, "color": colour, "line": {"width": 2, "color": colour}}
+        return trace | {"mode": "markers", "marker": look | {"symbol": SYMBOLS[key.shape]}}
+    if key.shape == "band":
+        return trace | {"mode": "lines", "line": {"color": f"{colour}/0.3", "width": 10}}
+    return trace | {"mode": "lines", "line": {"color": colour, "width": 2} | _dash(key.role)}
+
+
+def _dash(role: str) -> dict[str, str]:
+    dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ()))
+    return {"dash": dash} if dash else {}
+
+
 def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
     bottom, top = (float(panel.height(v)) for v in (low, high))
     return {
@@ -182,8 +199,7 @@ def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
 
 
 def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
-    dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ())) or "solid"
-    look = {"color": f"@{role}", "width": 1.2, "dash": dash}
+    look = {"color": f"@{role}", "width": 1.2} | _dash(role)
     return _flat(panel, y, y, axis) | {
         "type": "line", "line": look, "layer": "above",
     }  # fmt: skip
@@ -308,12 +324,7 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     keys = {(k.role, k.name): k for figure in figures for k in figure.key if not k.trial}
     for key in keys.values():
         if all(key.name != name for _, name in named):  # marks have no names of their own
-            colour = coloured(f"@{key.role}")
-            mode = "markers" if key.shape in SYMBOLS else "lines"
-            look = {"symbol": SYMBOLS.get(key.shape), "size": 9, "color": colour}
-            look["line"] = {"width": 2, "color": colour}
-            line = {"color": colour, "width": 10 if key.shape == "band" else 2}
-            made.add_scatter(x=[None], y=[None], mode=mode, name=key.name, marker=look, line=line)
+            made.add_trace(coloured(key_trace(key)))
     total = sum(heights) + SPACE * rows + 80
     made.update_layout(
         height=total, template="plotly_white", title=_title(figures),

@@ -1,4 +1,4 @@
-"""Draws the page's figures as PNG files with matplotlib, on white."""
+"""Draws the page's figures as PNG files: matplotlib draws Plotly's traces, on white."""
 
 from __future__ import annotations
 
@@ -9,26 +9,15 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import needs
-from grounded.figures.figure import (
-    COLOURS,
-    DASHES,
-    FEW,
-    Bars,
-    Curve,
-    Dot,
-    Figure,
-    Key,
-    Panel,
-    log_ticks,
-    loss_ticks,
-    typeset,
-)
+from grounded.figures.figure import Bars, Figure, Key, Panel, typeset
+from grounded.figures.interactive import key_trace, palette, plotted
 
 WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
 HEAD, ROW = 0.5, 0.27  # [inch] of a title above bars, and of a bar
 POSES = 6  # drawn poses of a moving body
 DPI = 200
-MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
+MARKERS = {"circle": "o", "circle-open": "o", "x-thin": "x", "line-ew": "_"}
+LINE, MARK = 0.8, 0.7  # points of a pixel of a line's width, and of a mark's size
 TITLE = 52  # characters per line of a panel's title
 CAPTION, PER_INCH = 8.0, 17.0  # size of a caption [pt], and its characters per inch
 NOTE, NOTE_SIZE = 68, 8.0  # characters per line of a panel's note, and its size [pt]
@@ -42,8 +31,13 @@ STYLE: Any = {
 }  # fmt: skip
 
 
-def png(figure: Figure) -> bytes:
+def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIGH)) -> bytes:
     """Return the PNG file of a figure: its title, its panels, its legend, and its caption.
+
+    Args:
+        figure: the figure.
+        columns: panels side by side; 0: two, or three of more than four.
+        size: width and height of a panel [inch].
 
     Raises:
         GroundedError: if matplotlib is not installed.
@@ -51,13 +45,14 @@ def png(figure: Figure) -> bytes:
     needs("matplotlib", "png")
     from matplotlib import rc_context, rcParams
     from matplotlib.figure import Figure as Sheet
+    from matplotlib.lines import Line2D
 
     panels = figure.panels
-    columns = min(3 if len(panels) > 4 else 2, max(len(panels), 1))
+    columns = columns or min(3 if len(panels) > 4 else 2, max(len(panels), 1))
     rows = [panels[i : i + columns] for i in range(0, len(panels), columns)]
-    heights = [max(_height(panel) for panel in row) for row in rows] or [1.0]
+    heights = [max(_height(panel, size[1]) for panel in row) for row in rows] or [1.0]
     with rc_context(STYLE):
-        wide = max(columns, 1.6) * WIDE
+        wide = max(columns, 1.6) * size[0]
         caption = textwrap.fill(figure.caption, round(wide * PER_INCH))
         below = CAPTION / 72 * 1.3 * len(caption.splitlines())
         sheet = Sheet(figsize=(wide, sum(heights) + 0.9 + below), dpi=DPI)
@@ -74,11 +69,8 @@ def png(figure: Figure) -> bytes:
                     typeset(note), (0, 1), (0, 3), "axes fraction", "offset points",
                     fontsize=NOTE_SIZE, va="bottom",
                 )  # fmt: skip
-                if isinstance(panel, Bars):
-                    _bars(axes, panel, most=round((heights[i] - HEAD) / ROW))
-                else:
-                    _panel(axes, panel)
-        handles = [_handle(key) for key in _keys(figure)]
+                _draw(axes, panel, most=round((heights[i] - HEAD) / ROW))
+        handles = [Line2D([], [], label=key.name, **_look(key_trace(key))) for key in _keys(figure)]
         if handles:
             sheet.legend(
                 handles=handles, loc="outside lower left", ncols=columns + 1, alignment="left",
@@ -91,10 +83,10 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def _height(panel: Panel | Bars) -> float:
+def _height(panel: Panel | Bars, usual: float) -> float:
     if isinstance(panel, Bars):
         return HEAD + ROW * max(len(panel.bars), 1)
-    return SQUARE if panel.equal else HIGH
+    return SQUARE if panel.equal else usual
 
 
 def _keys(figure: Figure) -> list[Key]:
@@ -106,110 +98,100 @@ def _keys(figure: Figure) -> list[Key]:
     return [*kept, Key(single[0].role, f"{len(single)} other trials")]
 
 
-def _bars(axes: Any, panel: Bars, most: int) -> None:
-    """Draw bars as thick as those of the panel with the `most` bars in the same row."""
-    rows = range(len(panel.bars))
-    drawn = axes.barh(rows, panel.values, color=[_colour(bar.role) for bar in panel.bars])
-    axes.bar_label(drawn, [bar.text for bar in panel.bars], padding=3)
-    axes.set_yticks(rows, [bar.label for bar in panel.bars])
-    axes.set_xlim(panel.ends)
-    axes.set_ylim(max(most, len(rows)) - 0.5, -0.5)
-    axes.xaxis.set_visible(False)
-    axes.grid(False)
-    axes.tick_params(left=False)
-    axes.spines["bottom"].set_visible(False)
-
-
-def _panel(axes: Any, panel: Panel) -> None:
-    across, up = panel.ranges()
-    for band in panel.bands:
-        ends = [float(panel.height(v)) for v in (band.low, band.high)]
-        axes.axhspan(*np.clip(ends, *up), color=_colour(band.role), alpha=0.15, lw=0)
-    for rule in panel.rules:
-        axes.axhline(float(panel.height(rule.y)), **_line(rule.role, 1.2))
-    for curve in panel.curves:
-        _curve(axes, panel, curve)
-    for dot in panel.dots:
-        _dot(axes, panel, dot, up)
-    axes.set(xlabel=typeset(panel.x_name), ylabel=typeset(panel.y_name))
-    if panel.log:
-        axes.set(xscale="log", yscale="log")
-        for axis, span in ((axes.xaxis, across), (axes.yaxis, up)):
-            ticks = log_ticks(*span)
-            axis.set_ticks(ticks, [f"{v:g}" for v in ticks])
-            axis.set_ticks([], minor=True)
-        across, up = ((10.0**low, 10.0**high) for low, high in (across, up))
-    axes.set_xlim(across, auto=panel.equal)
-    axes.set_ylim(up, auto=panel.equal)
+def _draw(axes: Any, panel: Panel | Bars, most: int) -> None:
+    """Draw a panel; bars as thick as those of the panel with the `most` bars in the same row."""
+    found = plotted(panel)
+    layout: dict[str, Any] = found["layout"]
+    for shape in layout.get("shapes", ()):
+        ends = np.clip((shape["y0"], shape["y1"]), *layout["yaxis"]["range"])
+        if shape["type"] == "rect":
+            axes.axhspan(*ends, color=_colour(shape["fillcolor"]), lw=0)
+        else:
+            axes.axhline(shape["y0"], **_look(shape))
+    for trace in found["data"]:
+        if trace["type"] == "bar":
+            drawn = axes.barh(trace["y"], trace["x"], color=map(_colour, trace["marker"]["color"]))
+            axes.bar_label(drawn, trace["text"], padding=3)
+        elif trace.get("visible", True):
+            _trace(axes, trace)
+    for name in ("x", "y"):
+        _axis(axes, name, layout[f"{name}axis"], "scaleanchor" in layout["yaxis"])
+    if isinstance(panel, Bars):
+        axes.set_ylim(len(panel.bars) - max(most, len(panel.bars)) - 0.5, len(panel.bars) - 0.5)
+        axes.xaxis.set_visible(False)
+        axes.grid(False)
+        axes.tick_params(left=False)
+        axes.spines["bottom"].set_visible(False)
+        return
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
-    if panel.whole:
+    for curve in panel.curves:
+        if curve.motion is not None and curve.trial and curve.role != "other" and curve.name:
+            for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
+                for line, thick in curve.motion.lines(row):
+                    width = 4.0 if thick else 1.0
+                    axes.plot(*line.T, color=_colour(f"@{curve.role}/0.25"), lw=width)
+
+
+def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:
+    """Set the range (that `grows` if needed), the ticks and the title of an axis."""
+    set_ticks = getattr(axes, f"set_{name}ticks")
+    ends = axis.get("range", ())
+    if axis.get("type") == "log":
+        getattr(axes, f"set_{name}scale")("log")
+        set_ticks([], minor=True)
+        ends = [10.0**end for end in ends]
+    if "tickvals" in axis:
+        set_ticks(axis["tickvals"], [text.replace("<br>", "\n") for text in axis["ticktext"]])
+    if ends:
+        getattr(axes, f"set_{name}lim")(ends, auto=grows)
+    if "dtick" in axis:
         from matplotlib.ticker import MaxNLocator
 
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if panel.x_ticks:
-        axes.set_xticks(*zip(*panel.x_ticks, strict=True))
-    if panel.loss:
-        ticks = loss_ticks(*up)
-        axes.set_yticks(panel.height(np.array(ticks)), [f"{v:g}" for v in ticks])
+    if "title" in axis:
+        getattr(axes, f"set_{name}label")(typeset(axis["title"]["text"]))
 
 
-def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
-    y = curve.y if panel.log else panel.height(curve.y)
-    if curve.style == "ghost":
+def _trace(axes: Any, trace: dict[str, Any]) -> None:
+    """Draw a trace: a line, marks, or a line whose points are coloured by a value."""
+    x, y, marker = trace["x"], trace["y"], trace.get("marker", {})
+    if "colorbar" in marker:
+        look = _look(trace | {"mode": "lines"})
+        axes.plot(x, y, **look)
+        drawn = axes.scatter(x, y, c=marker["color"], s=9, cmap="cividis", zorder=3)
+        label = marker["colorbar"]["title"]["text"]
+        axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
         return
-    if curve.style == "points":
-        few = len(curve.x) <= FEW
-        look: dict[str, Any] = {"ms": 5.0, "alpha": 0.7} if few else {"ms": 2.5, "alpha": 0.4}
-        look |= {"ms": 9.0} if panel.log else {}
-        axes.plot(curve.x, y, ".", color=_colour(curve.role), mew=0, **look)
-        return
-    how = "steps-post" if curve.style == "steps" else "default"
-    dots = {"marker": ".", "ms": 7.0} if panel.log else {}
-    axes.plot(curve.x, y, drawstyle=how, **_line(curve.role, curve.width), **dots)
-    if curve.motion is not None and curve.trial and curve.role != "other":
-        for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
-            for line, thick in curve.motion.lines(row):
-                width = 4.0 if thick else 1.0
-                axes.plot(*line.T, color=_colour(curve.role), lw=width, alpha=0.25)
-    if curve.shade is not None:
-        drawn = axes.scatter(curve.x, y, c=curve.shade, s=9, cmap="cividis", zorder=3)
-        axes.figure.colorbar(drawn, ax=axes, label=curve.shade_name, shrink=0.8)
+    if error := trace.get("error_y"):
+        ends = (error["arrayminus"], error["array"])
+        axes.errorbar(x, y, ends, fmt="none", ecolor=_colour(error["color"]), elinewidth=1.2)
+    axes.plot(x, y, clip_on=trace.get("cliponaxis", True), **_look(trace))
 
 
-def _dot(axes: Any, panel: Panel, dot: Dot, up: tuple[float, float]) -> None:
-    height, colour = float(panel.height(dot.y)), _colour(dot.role)
-    if not np.isfinite(height):
-        height = up[0] + 0.04 * (up[1] - up[0])
-    elif dot.error > 0:
-        ends = [float(panel.height(dot.y + sign * dot.error)) for sign in (-1, 1)]
-        axes.plot([dot.x, dot.x], ends, color=colour, lw=1.2)
-    axes.plot(dot.x, height, **_mark(dot.shape, colour), clip_on=False)
+def _look(trace: dict[str, Any]) -> dict[str, Any]:
+    """Return the look of a trace, of a legend's entry or of a rule for matplotlib."""
+    mode, line, marker = trace.get("mode", "lines"), trace.get("line", {}), trace.get("marker", {})
+    look: dict[str, Any] = {"ls": "none"}
+    if "lines" in mode:
+        width = max(line["width"], 1.0)
+        dash = [float(part.strip("px")) / width for part in line.get("dash", "").split(",") if part]
+        look = {"color": _colour(line["color"]), "lw": LINE * line["width"]}
+        look["ls"] = (0, tuple(dash)) if dash else "-"
+        look["drawstyle"] = "steps-post" if line.get("shape") == "hv" else "default"
+    if "markers" in mode and not marker:
+        look |= {"marker": ".", "ms": 7.0}
+    elif "markers" in mode:
+        colour, symbol = _colour(marker["color"]), marker.get("symbol", "circle")
+        edge = marker.get("line", {}).get("width", 0.0)
+        look |= {"marker": MARKERS[symbol], "ms": MARK * marker["size"], "mec": colour}
+        look |= {"mfc": "none" if symbol.endswith("open") else colour, "mew": edge}
+    return look
 
 
-def _mark(shape: str, colour: str) -> dict[str, Any]:
-    inside = "none" if shape == "ring" else colour
-    size = 9 if shape == "dash" else 6
-    look = {"marker": MARKERS[shape], "ms": size, "mfc": inside, "mec": colour, "mew": 1.6}
-    return look | {"ls": "none"}
+def _colour(role: str) -> tuple[float, ...]:
+    """Return the colour on white of a role, such as "@best" or "@best/0.15"."""
+    from matplotlib.colors import to_rgba
 
-
-def _line(role: str, width: float) -> dict[str, Any]:
-    dash = DASHES.get(role)
-    style = (0, tuple(v / max(width, 1.0) for v in dash)) if dash else "-"
-    return {"color": _colour(role), "lw": width * 0.8, "ls": style}
-
-
-def _handle(key: Key) -> Any:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    if key.shape == "band":
-        return Patch(color=_colour(key.role), alpha=0.3, lw=0, label=key.name)
-    if key.shape in MARKERS:
-        return Line2D([], [], label=key.name, **_mark(key.shape, _colour(key.role)))
-    return Line2D([], [], label=key.name, **_line(key.role, 2.0))
-
-
-def _colour(role: str) -> str:
-    return COLOURS[role][0]
+    name, _, opacity = role[1:].partition("/")
+    return to_rgba(palette()[name][0], float(opacity or 1))
