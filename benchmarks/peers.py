@@ -49,15 +49,18 @@ def fastest(function: Callable[[], object], repeats: int = 20) -> float:
     return min(times)
 
 
+xp: ModuleType = np  # whose functions the smooth car calls; see `load`
+
+
 def smooth_dynamics(s, a, p):
     delta_dot = (p.a1 * a.steering + p.b1 - s.delta) / p.tau_delta
     v_dot = (p.a2 * a.throttle + p.b2 - s.v) / p.tau_v
-    cd, sd = np.cos(s.delta), np.sin(s.delta)
+    cd, sd = xp.cos(s.delta), xp.sin(s.delta)
     return {
         "delta": delta_dot,
         "v": v_dot,
-        "x": s.v * cd * np.cos(s.psi),
-        "y": s.v * cd * np.sin(s.psi),
+        "x": s.v * cd * xp.cos(s.psi),
+        "y": s.v * cd * xp.sin(s.psi),
         "psi": s.v * sd / p.L,
         "psi_rate": (v_dot * sd + s.v * cd * delta_dot) / p.L,
     }
@@ -113,12 +116,12 @@ def case(name: str) -> Case:
     return Case(name, problem, run.u[0], run.z[0])
 
 
-def load(path: str, best: str, xp: ModuleType) -> SimpleNamespace:
-    """Load a saved case, whose model calls the functions of `xp`."""
+def load(path: str, best: str, module: ModuleType) -> SimpleNamespace:
+    """Load a saved case, whose model calls the functions of a module."""
     loaded = SimpleNamespace(**dict(np.load(path)))
     loaded.name, loaded.dt, loaded.best = str(loaded.name), float(loaded.dt), float(best)
     model = MODELS[loaded.name]
-    model.derivative.__globals__["np"] = xp
+    model.derivative.__globals__["xp" if loaded.name == "car" else "np"] = module
 
     def rate(x, u, p):
         named = (
@@ -326,14 +329,14 @@ def main() -> None:
     """Solve a case with a peer."""
     peer, path, best = sys.argv[1:]
     if peer in ("casadi", "fatrop"):
-        import casadi as xp
+        import casadi as module
 
-        xp.abs = xp.fabs  # NumPy's name
-        found = casadi(load(path, best, xp), "ipopt" if peer == "casadi" else peer)
+        module.abs = module.fabs  # NumPy's name
+        found = casadi(load(path, best, module), "ipopt" if peer == "casadi" else peer)
     elif peer == "jax":
-        import jax.numpy as xp
+        import jax.numpy as module
 
-        found = jax(load(path, best, xp))
+        found = jax(load(path, best, module))
     else:
         found = crocoddyl(load(path, best, np))
     print(json.dumps({"case": Path(path).stem, **found}))

@@ -110,7 +110,8 @@ def _draw(axes: Any, panel: Panel | Bars, most: int) -> None:
             axes.axhline(shape["y0"], **_look(shape))
     for trace in found["data"]:
         if trace["type"] == "bar":
-            drawn = axes.barh(trace["y"], trace["x"], color=map(_colour, trace["marker"]["color"]))
+            colours = [_colour(role) for role in trace["marker"]["color"]]
+            drawn = axes.barh(trace["y"], trace["x"], color=colours)
             axes.bar_label(drawn, trace["text"], padding=3)
         elif trace.get("visible", True):
             _trace(axes, trace)
