@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from grounded.errors import GroundedError
-from grounded_trials.logs.inspection.inspect_guess import Guess
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.starting.begin import begin
 
 

@@ -25,7 +25,7 @@ from grounded_cli.console.terminal import (
 from grounded_cli.console.workspace_option import next_line
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspection.inspect_guess import Guess
+    from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.starting.begin import Begun
 
 FEW = 8  # alternative signals listed for an unsure state or input
@@ -116,7 +116,7 @@ def _ask(guess: Guess) -> str:
     paths = [p for p in (guess.path, *guess.others) if p]
     show(f"\n{guess.name} {'is unsure' if guess.path else 'was not found'}")
     for reason in guess.reasons:
-        show(f"  {reason}")
+        show(f"  {reason.sentence}")
     for i, path in enumerate(paths, start=1):
         show(f"  {i}  {path}")
     first = "1" if guess.path else ""
@@ -144,7 +144,7 @@ def _tell(begun: Begun) -> None:
         none = f"{'no name' if guess.others else 'nothing'} in the log fits"
         show(aligned(guess.name, f"{mark}{guess.path or none}"))
         for reason in guess.reasons:
-            show(aligned("", reason))
+            show(aligned("", reason.sentence))
         if guess.others and not guess.sure:
             or_ = "or" if guess.path else "perhaps"
             more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)

@@ -7,8 +7,8 @@ import pytest
 
 from cli import grounded
 from facts import holds
+from grounded.units import factor_between
 from grounded_trials.logs.stated_units import (
-    factor_between,
     unit_in_name,
     without_unit,
 )

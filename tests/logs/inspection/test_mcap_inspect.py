@@ -16,12 +16,17 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
+from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
-from grounded_trials.logs.inspection.inspect_guess import guess_mapping, is_simulated
 from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
 from shared_data import data, files, needs_data
+
+
+def by_name(log, states, inputs):
+    """Return the guesses for states and inputs of which only the names are known."""
+    return assigned(log, dict.fromkeys(states, ""), dict.fromkeys(inputs, ""))
 
 
 @pytest.mark.slow
@@ -61,8 +66,8 @@ def test_a_gap_in_a_genuine_bag_is_refused_where_it_is() -> None:
 @needs_data
 def test_simulation_time_is_said() -> None:
     report = inspect_log(data("mcap_format_fixtures", "evo", "nav2_turtlebot_SIM.mcap"))
-    assert is_simulated(report)
-    states, inputs = guess_mapping(report, ["v", "x", "y", "psi"], ["throttle"])
+    assert report.simulated
+    states, inputs = by_name(report, ["v", "x", "y", "psi"], ["throttle"])
     assert [g.path for g in states] == [
         "/odom.twist.twist.linear.x",
         "/odom.pose.pose.position.x",
@@ -77,7 +82,7 @@ def test_simulation_time_is_said() -> None:
 def test_dart_from_an_unknown_bag_to_arrays() -> None:
     path = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
     report = inspect_log(path)
-    states, inputs = guess_mapping(report, ["v", "x", "y", "psi"], ["steering", "throttle"])
+    states, inputs = by_name(report, ["v", "x", "y", "psi"], ["steering", "throttle"])
     assert [g.path for g in inputs] == ["/steering_1.data", "/throttle_1.data"]
     assert [g.sure for g in states] == [False, True, True, True] and states[0].path == ""
     text = mapping_toml(states, inputs)
@@ -145,7 +150,7 @@ def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, s
     columns = np.column_stack([t, x, beam, true])
     np.savetxt(tmp_path / "h.csv", columns, "%.7f", ",", header="t,x,beam,volt", comments="")
     report = inspect_log(tmp_path / "h.csv")
-    states, inputs = guess_mapping(report, ["x", "v", "beam"], ["volt"])
+    states, inputs = by_name(report, ["x", "v", "beam"], ["volt"])
     measured = tomllib.loads(mapping_toml(states, inputs))["estimate"]["measured"]
     assert 0.8e-3 < measured["x"] < 1.3e-3
     low, high = (0.95 * step / np.sqrt(12), step) if step > 1e-6 else (1e-6, 1e-4)
@@ -188,5 +193,5 @@ def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, 
     writer.finish()
     path = tmp_path / "log.mcap"
     path.write_bytes(stream.getvalue())
-    _, (_, voltage) = guess_mapping(inspect_log(path), [], ["steering", "voltage"])
+    _, (_, voltage) = by_name(inspect_log(path), [], ["steering", "voltage"])
     assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)

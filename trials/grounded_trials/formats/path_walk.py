@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.errors import nearest
 from grounded.result import listed
+from grounded.units import in_another_unit
 from grounded_trials.formats.message_path import (
     ANGLES,
     AXES,
@@ -45,7 +46,6 @@ from grounded_trials.formats.messages import (
     Text,
     Type,
 )
-from grounded_trials.formats.name_endings import in_another_unit
 
 SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos")
 CALENDAR_S = 9_200_000_000  # 2^63 ns: the years 1678 to 2261

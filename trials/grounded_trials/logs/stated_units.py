@@ -15,44 +15,15 @@ together, `Gierwinkelgeschwindigkeit`, is translated if all of its parts are kno
 
 from __future__ import annotations
 
-import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from grounded_trials.formats.name_endings import ENDINGS, unit_ending
+from grounded.units import ENDINGS, factor_between, unit_ending
 from grounded_trials.formats.text_tables import column_units
 
-_OF = {  # units as multiples of another unit, which may be a product
-    "mm": ("m", 1e-3),
-    "cm": ("m", 1e-2),
-    "km": ("m", 1e3),
-    "deg": ("rad", math.pi / 180),
-    "degree": ("rad", math.pi / 180),
-    "degrees": ("rad", math.pi / 180),
-    "°": ("rad", math.pi / 180),
-    "Grad": ("rad", math.pi / 180),
-    "mrad": ("rad", 1e-3),
-    "rpm": ("rad/s", 2 * math.pi / 60),
-    "U": ("rad", 2 * math.pi),
-    "dps": ("rad/s", math.pi / 180),
-    "us": ("s", 1e-6),
-    "ms": ("s", 1e-3),
-    "min": ("s", 60.0),
-    "h": ("s", 3600.0),
-    "mV": ("V", 1e-3),
-    "mA": ("A", 1e-3),
-    "mN": ("N", 1e-3),
-    "mNm": ("N m", 1e-3),
-    "kN": ("N", 1e3),
-    "g": ("kg", 1e-3),
-    "Nm": ("N m", 1.0),
-    "%": ("1", 0.01),
-    "°C": ("degC", 1.0),
-}
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
 )
@@ -156,37 +127,6 @@ def _parts(path: str) -> tuple[str, str]:
     whole = _NUMBER.sub("", path)
     ending = unit_ending(re.split(r"[./]", whole)[-1])
     return (whole[: -len(ending) - 1], ending) if ending else (path, "")
-
-
-def factor_between(said: str, wanted: str) -> float | None:
-    """Return the factor that converts a number from one unit to another; None if incompatible.
-
-    Args:
-        said: the unit in the log, such as "mm/s" or "deg/s^2".
-        wanted: the unit in the model.
-    """
-    (a, one), (b, other) = _in_base(said), _in_base(wanted)
-    return one / other if a == b else None
-
-
-def same_unit(said: str, wanted: str) -> bool:
-    """Check whether two spellings mean the same unit, such as `N·m`, `Nm` and `N m`."""
-    factor = factor_between(said, wanted)
-    return factor is not None and math.isclose(factor, 1.0)
-
-
-def _in_base(unit: str) -> tuple[Counter[str], float]:
-    """Return a unit as powers of base units, and its factor to these."""
-    powers, size = Counter[str](), 1.0
-    for k, side in enumerate(unit.replace("²", "^2").replace("·", " ").split("/")):
-        for part in re.findall(r"[^\s*^()]+(?:\^-?\d)?", side):
-            name, _, power = part.partition("^")
-            sign = (-1 if k else 1) * int(power or 1)
-            inner, by = _in_base(_OF[name][0]) if name in _OF else (Counter({name: 1}), 1.0)
-            size *= (by * _OF.get(name, ("", 1.0))[1]) ** sign
-            for base, count in inner.items():
-                powers[base] += sign * count
-    return Counter({base: n for base, n in powers.items() if n and base != "1"}), size
 
 
 def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:

@@ -27,7 +27,7 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
-from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.candidates.exporting import Exported, format_of

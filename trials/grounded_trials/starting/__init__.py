@@ -5,6 +5,5 @@ a log and chooses a model skeleton, which `pushed.py` drives by a duty or voltag
 speed command; `shapes.py` draws targets: lines, circles, figure-8s, steps, swing-ups;
 `recorded_run.py` reads one from a run. `blank.py` creates a workspace from a model alone,
 `examples.py` the examples that come with grounded; `first_toml.py` writes the grounded.toml of a
-log's workspace, `examples.py` all others. `in_degrees.py` doubts commands of which the model has
-radians and the log degrees.
+log's workspace, `examples.py` all others.
 """

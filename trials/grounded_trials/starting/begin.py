@@ -9,47 +9,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import undeclared_angles
 from grounded.result import Result, listed
 from grounded_trials.formats.text_tables import column_units, states_time_unit
+from grounded_trials.logs.inspection.assignment import assigned
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
-from grounded_trials.logs.inspection.inspect_evidence import (
-    as_stated,
-    from_the_rest,
-    only_commands,
-    weigh,
-)
-from grounded_trials.logs.inspection.inspect_guess import (
-    PARTS,
-    Guess,
-    guess_mapping,
-    is_simulated,
-    taking,
-)
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspection.inspect_pairs import rates_among, velocities
-from grounded_trials.logs.inspection.joint_names import joint_names, joint_units, wide_joints
+from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
+from grounded_trials.logs.inspection.names import PARTS
+from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
-from grounded_trials.logs.stated_units import Stated, factor_between
+from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
-from grounded_trials.starting.in_degrees import in_degrees
 from grounded_trials.starting.interval import interval_of, too_coarse
 from grounded_trials.starting.kinds import (
     KINDS,
-    Joints,
     by_encoders,
-    called_input,
     kind_in,
     moving,
     skeleton,
@@ -121,7 +108,7 @@ class Begun(Result):
                 "name": guess.name,
                 "path": guess.path or None,
                 "sure": guess.sure,
-                "reasons": list(guess.reasons),
+                "reasons": [one.sentence for one in guess.reasons],
                 "rivals": list(guess.others),
                 "scale": guess.scale,
             }
@@ -216,43 +203,36 @@ def _begin(
     joints, plain = joint_names(report), None
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
     if own:
-        why, found = "your model", own.bring(folder)
+        why, built = "your model", own.bring(folder)
     else:
         plain = skeleton(chosen, report, joints, named, column_units(files[0]))
-        found = _model_in(folder, plain.source())
-    states, inputs = _matched(report, found, joints)
-    if not (kind or own or any(g.path for g in states)):
+        built = _model_in(folder, plain.source())
+    matched = assigned(report, built.states, built.inputs, built, joints)
+    if not (kind or own or any(g.path for g in matched[0])):
         why = f"no number in the log matches a state of kind {chosen}; names are the log's"
         chosen = "generic"
         plain = skeleton(chosen, report, joints, named, column_units(files[0]))
-        found = _model_in(folder, plain.source())
-        states, inputs = _matched(report, found, joints)
+        built = _model_in(folder, plain.source())
     if chosen == "generic" and not own:
-        states, inputs = (
-            tuple(_only_named(report, g, of) for g in s)
-            for s, of in ((states, "state"), (inputs, "input"))
-        )
-        notes = (*notes, *_left_out(report, found), TO_COMPLETE)
-    units = {**found.states, **found.inputs}
-    both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
-    states, inputs = both[: found.n], only_commands(both[: found.n], both[found.n :], report)
-    if own:
-        inputs = _last_number(report, found, states, inputs)
+        given = {name: one.path for name, one in moving(report).items()}
+        matched = assigned(report, built.states, built.inputs, built, joints, given)
+        notes = (*notes, *_left_out(report, built), TO_COMPLETE)
+    states, inputs = matched
+    units = {**built.states, **built.inputs}
     if chosen == "balance" and not own:
-        states = tuple(by_encoders(states, report, joints, found.params["r"].value))
+        states = tuple(by_encoders(states, report, joints, built.params["r"].value))
     if ask is not None:
-        said = Stated.by(files)
         states, inputs = (
-            tuple(_asked(g, ask, partial(as_stated, said, units[g.name])) for g in some)
-            for some in (states, inputs)
+            tuple(_asked(g, ask, report, units) for g in g_) for g_ in (states, inputs)
         )
     if plain is not None:
         full = with_gain(plain, {g.name: g for g in (*states, *inputs)}, report)
-        found = found if full is plain else _model_in(folder, full.source())
-    ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
-    inputs = in_degrees(inputs, units, ranges)
+        built = built if full is plain else _model_in(folder, full.source())
+    ranges = {g.name: g.extent for g in (*states, *inputs)}
+    odd = perhaps_degrees((*states, *inputs), built, joints)
+    inputs = tuple(g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs)
     slow = () if states_time_unit(files[0]) else _in_seconds(report)
-    notes = (*notes, *slow, *wide_joints(states, units, joints, report))
+    notes = (*notes, *slow, *(odd[g.name].sentence for g in states if g.name in odd))
     step, whose, note = (
         (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
     )
@@ -261,21 +241,21 @@ def _begin(
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
         }
     if own:
-        notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, found))
-        notes = (*notes, *_turning(found))
-    rates = velocities(found)
-    table = mapping_toml(states, inputs, simulated=is_simulated(report), rates=rates)
+        notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, built))
+        notes = (*notes, *_turning(built))
+    rates = velocities(built)
+    table = mapping_toml(states, inputs, simulated=report.simulated, rates=rates)
 
     stood: dict[str, float] | None = None
 
     def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
         nonlocal stood
-        name, stood = Path(log).name, held_first(found, columns, sent, step, ranges)
+        name, stood = Path(log).name, held_first(built, columns, sent, step, ranges)
         held = stood or {}
-        write_first(folder, found, (step, whose), columns, rows, ranges, table, why, name, held)
+        write_first(folder, built, (step, whose), columns, rows, ranges, table, why, name, held)
 
-    write({found.state_names[0]: np.zeros(2)}, 1)
-    target, horizon, more = _recorded(folder, files, found, states, step, write)
+    write({built.state_names[0]: np.zeros(2)}, 1)
+    target, horizon, more = _recorded(folder, files, built, states, step, write)
     return Begun(
         workspace=str(folder),
         log=str(log),
@@ -286,54 +266,10 @@ def _begin(
         states=states,
         inputs=inputs,
         target=target,
-        start=_start(found, stood, states),
+        start=_start(built, stood, states),
         notes=(*notes, *[note] * bool(note), *more),
         again=again if slow else (),
     )
-
-
-def _matched(
-    report: LogReport, model: Model, joints: Joints
-) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
-    """Match the states and inputs to numbers of the log, by name and then by their values.
-
-    The log need not contain the names, which may be a skeleton's. If no name matches a state, any
-    numbers are tried as a position and its rate of which one follows the other's derivative; if as
-    many numbers are then left over as there are inputs, they are matched in the order of the log,
-    unless the model's steps tell them apart.
-    """
-    both = {**model.states, **model.inputs}
-    names = guess_mapping(report, model.state_names, model.input_names, both)
-    states, inputs = weigh(report, model, *names, joints)
-    if any(g.path or g.others for g in states):
-        return states, inputs
-    found, taken = moving(report), {g.path for g in inputs}
-    free = [f.path for f in reversed(found.values()) if f.path not in taken]
-    sent = {f.path for name, f in found.items() if called_input(name, f.path)}
-    stated, rates = Stated.by(report.files), rates_among(report, [p for p in free if p not in sent])
-    kinds = {q: list(rates) for q in velocities(model)}
-    kinds |= {w: [path for path, _ in rates.values()] for w in velocities(model).values()}
-
-    def offered(name: str) -> tuple[str, ...]:
-        units = {path: stated.unit(path) for path in kinds.get(name, ())}
-        may = {path: not said or factor_between(said, both[name]) for path, said in units.items()}
-        return tuple(path for path in free if may.get(path))
-
-    tried = tuple(replace(g, others=offered(g.name) or g.others) for g in states)
-    tried, inputs = weigh(report, model, tried, inputs, joints)
-    pairs = zip(tried, states, strict=True)
-    states = tuple(replace(g, sure=False) if g.path else old for g, old in pairs)
-    used = {g.path for g in states}
-    rest = [path for path in free if path not in used]
-    if all(g.path for g in states) and not any(g.path for g in inputs) and len(rest) == len(inputs):
-        why = "the only number left" if len(rest) == 1 else "the numbers left, in the log's order"
-        left = [
-            replace(guess, path=path, others=tuple(p for p in rest if p != path), reasons=(why,))
-            for guess, path in zip(inputs, rest, strict=True)
-        ]
-        _, inputs = weigh(report, model, states, left, joints)
-        inputs = tuple(replace(guess, sure=False) for guess in inputs)
-    return states, inputs
 
 
 def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
@@ -353,15 +289,6 @@ def _model_in(folder: Path, text: str) -> Model:
     return model_in(load_module(folder, "model.py"))
 
 
-def _only_named(report: LogReport, guess: Guess, of: str) -> Guess:
-    """Mark a generic skeleton's signal as a guess: only its name and path come from the log."""
-    why, own = f"a guess that it is a{'n' * (of == 'input')} {of}", moving(report).get(guess.name)
-    if own is not None and own.path != guess.path:
-        bare = Guess(guess.name, "", "", sure=False, others=())
-        return taking(bare, own.path, report, why)
-    return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
-
-
 def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
     """Return notes on the numbers that a generic skeleton leaves out, and on missing inputs."""
     left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
@@ -373,29 +300,6 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
             f"the inputs, such as --inputs {last}"
         )
     return tuple(found)
-
-
-def _last_number(
-    report: LogReport, model: Model, states: Sequence[Guess], inputs: Sequence[Guess]
-) -> tuple[Guess, ...]:
-    """Return the inputs; the only one without a name in the log gets the only number left.
-
-    If rates are missing, too, it is no rate: those were sought by the derivatives.
-    """
-    lost = [guess.name for guess in inputs if not guess.path]
-    known = {guess.name for guess in states if guess.path}
-    beside = [w for q, w in velocities(model).items() if q in known]
-    used = {guess.path for guess in (*states, *inputs)}
-    left = [field.path for field in moving(report).values() if field.path not in used]
-    if len(lost) != 1 or len(left) != 1 or not {*model.states} <= {*known, *beside}:
-        return tuple(inputs)
-    said = Stated.by(report.files).unit(left[0])
-    if said and factor_between(said, model.inputs[lost[0]]) is None:
-        return tuple(inputs)
-    bare = Guess(lost[0], "", "", sure=False, others=())
-    one = taking(bare, left[0], report, "no name matches; the only number left")
-    one = as_stated(Stated.by(report.files), model.inputs[lost[0]], one)
-    return tuple(one if guess.name == lost[0] else guess for guess in inputs)
 
 
 def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[str, ...]:
@@ -443,14 +347,18 @@ def _in_seconds(report: LogReport) -> tuple[str, ...]:
     )
 
 
-def _asked(guess: Guess, ask: Ask, stated: Callable[..., Guess]) -> Guess:
+def _asked(guess: Guess, ask: Ask, report: LogReport, units: Mapping[str, str]) -> Guess:
+    """Return an unsure guess as the user answers."""
     if guess.sure:
         return guess
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    why = ("as you specified",)
-    return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
+    field = next((one for one in report.numbers if one.path == path), None)
+    scale = Stated.by(report.files).factor(path, units[guess.name]) if path else 1.0
+    why = (found("start.asked", guess.name),)
+    clock = next((report.clock(t) for t in report.topics if field in t.fields), "log")
+    return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)
 
 
 def _start(model: Model, stood: Mapping[str, float] | None, states: Sequence[Guess]) -> str:
@@ -467,16 +375,6 @@ def _start(model: Model, stood: Mapping[str, float] | None, states: Sequence[Gue
     if not lost and not any(unit.endswith("/s") for unit in model.states.values()):
         why = "whether it rested in the log is not known while no state is a speed by its unit"
     return f"empty, {why}: enter where a run begins in [task] start"
-
-
-def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:
-    """Return the lowest and highest value in the log, in the model's unit."""
-    for topic in report.topics:
-        for one in topic.fields:
-            if one.path == guess.path and one.low is not None and one.high is not None:
-                low, high = sorted((one.low * guess.scale, one.high * guess.scale))
-                return low, high
-    return None
 
 
 def _recorded(

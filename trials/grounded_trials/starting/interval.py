@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded_trials.logs.inspection.inspect_guess import Guess
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.starting.kinds import COMMANDED

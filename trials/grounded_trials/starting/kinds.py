@@ -11,17 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.logs.inspection.inspect_guess import (
-    NAMES_BY_UNIT,
-    PARTS,
-    POSES,
-    Guess,
-    taking,
-)
+from grounded.findings import found as found_
+from grounded.units import factor_between
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.inspection.inspect_pairs import rates_among
 from grounded_trials.logs.inspection.joint_names import from_base, slides
-from grounded_trials.logs.stated_units import bare_command, factor_between, unit_in_name
+from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
+from grounded_trials.logs.inspection.relations import rates_among
+from grounded_trials.logs.stated_units import bare_command, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
 from grounded_trials.starting.skeletons import (
     BALANCE,
@@ -380,9 +377,9 @@ def by_encoders(states: Sequence[Guess], log: LogReport, joints: Joints, r: floa
     for guess in states:
         path = f"{where}.{ends.get(guess.name, '')}[0]"
         if path in moving and guess.name in ends:
-            why = f"of '{wheel}', times the radius r: enter yours here and in model.py"
-            bare = Guess(guess.name, "", "", sure=False, others=(), scale=r)
-            guess = taking(bare, path, log, why)
+            topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
+            why, clock = found_("start.encoder", path, joint=wheel), log.clock(topic)
+            guess = Guess(guess.name, path, clock, False, (), field, (why,), r)
         found.append(guess)
     return found
 

@@ -13,9 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded_trials.logs.inspection.inspect_guess import COMMAND_TOPIC, Guess
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
-from grounded_trials.logs.inspection.inspect_pairs import Signals
+from grounded_trials.logs.inspection.names import COMMAND_TOPIC
+from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, unit_in_name
 from grounded_trials.starting.skeletons import Skeleton
 
@@ -87,7 +88,7 @@ def _v(plain: Skeleton) -> str:
 
 def _gain(v: Guess, u: Guess, log: LogReport) -> float:
     """Return the median of v / u at steady speeds, else the largest ratio; 0 if unknown."""
-    gridded = Signals(log, (v, u), set(), Stated.by(log.files)).grid((v.path, u.path))
+    gridded = Signals(log, (), Stated.by(log.files)).grid((v.path, u.path))
     if gridded is None:
         return 0.0
     step, (speed, command) = gridded

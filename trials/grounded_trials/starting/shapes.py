@@ -21,7 +21,7 @@ from grounded.places import integrals
 from grounded.places import velocities as velocities_of
 from grounded.result import listed
 from grounded.task import MAX_HORIZON
-from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.workspace.off_target import position_names
 
 PATHS = ("line", "circle", "figure-8")

@@ -84,10 +84,9 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     Raises:
         GroundedError: if the log can't be read at all.
     """
+    from grounded_trials.logs.inspection.assignment import assigned
     from grounded_trials.logs.inspection.guessed_table import mapping_toml
-    from grounded_trials.logs.inspection.inspect_evidence import from_the_rest, weigh
-    from grounded_trials.logs.inspection.inspect_guess import guess_mapping, is_simulated
-    from grounded_trials.logs.inspection.joint_names import joint_names, joint_units, wide_joints
+    from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
     from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 
     refuse_ids(workspace, log, "inspect")
@@ -104,16 +103,12 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
                 ", as this folder is no workspace: make one from the log, or name yours with -C DIR"
             )
         return Inspected(str(log), report, "", why, outside=not here)
-    units = {**model.states, **model.inputs}
-    states, inputs = guess_mapping(report, model.state_names, model.input_names, units)
     joints = joint_names(report)
-    states, inputs = weigh(report, model, states, inputs, joints)
-    both = from_the_rest((*states, *inputs), units, report, joint_units(joints))
-    states, inputs = both[: model.n], both[model.n :]
-    table = mapping_toml(states, inputs, simulated=is_simulated(report))
+    states, inputs = assigned(report, model.states, model.inputs, model, joints)
+    table = mapping_toml(states, inputs, simulated=report.simulated)
     mapping = workspace.log_mapping
     odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
-    odd += wide_joints(states, model.states, joints, report)
+    odd += tuple(one.sentence for one in perhaps_degrees(states, model, joints).values())
     known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
     mapped = {*model.states, *model.inputs} <= known
     ran_nothing = not workspace.candidate_ids()

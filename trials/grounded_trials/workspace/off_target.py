@@ -212,7 +212,7 @@ def position_names(model: Model) -> list[str]:
 
 def rates_beside(model: Model, names: Collection[str]) -> set[str]:
     """Return which of some states are the velocities of others, or of a position among them."""
-    from grounded_trials.logs.inspection.inspect_pairs import velocities
+    from grounded_trials.logs.inspection.relations import velocities
 
     known = {model.state_names[i] for role in RATES for i in roles_of(model).get(role, ())}
     moved = {rate for place, rate in velocities(model).items() if place in names}

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from grounded.result import extent
-from grounded_trials.logs.inspection.inspect_guess import FEW, Guess
+from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.toml_table import key
 
+FEW = 8  # alternatives listed
 LESS = 0.8  # of a value: a rounded one below it has two digits
 DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
 
@@ -58,7 +59,7 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         low, high = extent(field.low, field.high)
         lines[-1] += f"  # {low:.4g} to {high:.4g} in this log"
     if guess.reasons:
-        lines.insert(1, f"# {'; '.join(guess.reasons)}")
+        lines.insert(1, f"# {'; '.join(one.sentence for one in guess.reasons)}")
     if scale := _scale(guess):
         lines.append(scale)
     return lines + [line for line in (_clock(guess, clock), _unwrap(guess.path)) if line]

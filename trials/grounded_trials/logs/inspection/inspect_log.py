@@ -41,6 +41,7 @@ from grounded_trials.logs.signals import Decoder, decoder_of
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
 GAP = 10.0  # intervals; longer gaps are reported
+SIMULATED_S = 1.0  # [s] header stamps further from the log's clock are simulation time
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 SAME = 0.95  # correlation above which two signals show the same motion
 LEAST = 30  # fewest samples
@@ -102,6 +103,15 @@ class LogReport:
     def numbers(self) -> list[FieldReport]:
         """The numbers of all topics."""
         return [field for topic in self.topics for field in topic.fields]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether header stamps are on another clock than the log, as in a simulation."""
+        return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in self.topics)
+
+    def clock(self, topic: TopicReport) -> str:
+        """Return the clock by which a topic's numbers are read."""
+        return "header" if topic.stamped and not self.simulated else "log"
 
     @property
     def moving(self) -> list[str]:

@@ -9,21 +9,24 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import product
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
+from grounded.model import Model
+from grounded.units import UNITS
 from grounded_trials.formats.mcap_records import Channel, Messages
-from grounded_trials.logs.inspection.inspect_guess import COMMAND_TOPIC, Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
+from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspection.inspect_pairs import Signals
+    from grounded_trials.logs.inspection.guess import Guess
+    from grounded_trials.logs.inspection.relations import Signals
 
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
@@ -40,9 +43,17 @@ TURNS = {  # words of revolute joints, which take precedence: a shoulder's lift,
     *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
     *("pole", "pendulum", "swing", "sway", "angle", "theta"),
 } - {"base", "torso"}
+NAMED, ORDERED, UNKNOWN, LESS = (
+    6.0,
+    2.5,
+    1.5,
+    0.2,
+)  # points of a joint's number; less of each further one
 ALIKE, CLEARLY = 0.9, 0.1  # least correlation of a command with an effort, and lead over others
 LATEST = 0.1  # [s] largest delay of an effort behind its command
-FULL_TURNS, DEGREES = 4 * math.pi, 720.0  # range that suggests degrees; largest angle in degrees
+FULL_TURNS, LARGEST = 4 * math.pi, 720.0  # range that suggests degrees; largest angle in degrees
+FOLLOWED = 0.3  # of a command of several turns, that a state in rad reaches if it follows it
+DEFLECTED = re.compile(r"steer|rudder|aileron|elevator|flap|wheel_angle")  # follows no such state
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -136,19 +147,23 @@ def _first(words: Sequence[str], joint: str) -> int:
     return next((i for i, word in enumerate(words) if word in joint.lower()), len(words))
 
 
+@dataclass(frozen=True)
+class Joint:
+    """A number that belongs to a state or input by the names and the order of joints."""
+
+    points: float
+    why: Finding
+    doubted: bool = True  # it rests on an order that a person should check
+
+
 def of_joint(
-    guess: Guess,
-    unit: str,
-    joints: Mapping[str, tuple[str, ...]],
-    log: LogReport,
-    *,
-    sent: bool = False,
-) -> Guess:
-    """Assign a state or input whose name contains a joint's to that joint's number.
+    name: str, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport, *, sent: bool
+) -> dict[str, Joint]:
+    """Return the numbers of the joint that the name of a state or input contains, by path.
 
     Args:
-        guess: of the state or input.
-        unit: of the state or input, which decides between position, velocity and effort.
+        name: of the state or input.
+        unit: of it, which decides between position, velocity and effort.
         joints: see `joint_names`.
         log: an inspected log.
         sent: whether it is an input. An array with a command for each joint is then preferred to
@@ -157,100 +172,104 @@ def of_joint(
     """
     there = _there(log)
     for topic, names in joints.items():
-        for i, joint in enumerate(names):
-            if not _holds(guess.name, joint):
-                continue
+        for i, joint in ((i, joint) for i, joint in enumerate(names) if holds(name, joint)):
             measured = SLIDING if slides(joint) else TURNING
             kind = next((k for k, u in measured.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
             path = f"{topic}.{kind}[{i}]"
             plain = unit == "1"  # commands may be torques, positions or speeds
             torque = sent and kind == "effort"
-            if commanded := _commands(log, len(names), plain) if torque or (sent and plain) else []:
-                at = from_base(names).index(joint)
-                paths = [f"{command}[{at}]" for command in commanded]
-                paths += [path] if torque and path in there else []
-                rest = [f"{c}[{k}]" for c in commanded for k in range(len(names)) if k != at]
-                why = f"commands name no joints; in order from the base, {at} is '{joint}'"
-                others = (*paths[1:], *rest)
-                return replace(guess, path=paths[0], sure=False, others=others, reasons=(why,))
+            if commanded := commands(log, len(names), plain) if torque or (sent and plain) else []:
+                own = [path] if torque and path in there else []
+                return _commanded(commanded, own, from_base(names).index(joint), joint, names)
             measures = kind != "effort" and not COMMAND_TOPIC.search(topic.lower())
             if path in there and not (sent and measures):
-                others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
-                why = f"{topic} names its joint {i} '{joint}'"
-                return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))
-    return guess
-
-
-def wide_joints(
-    guesses: Sequence[Guess],
-    units: Mapping[str, str],
-    joints: Mapping[str, tuple[str, ...]],
-    log: LogReport,
-) -> tuple[str, ...]:
-    """Return a warning on joints other than wheels that span full turns if they are in rad.
-
-    They are probably in degrees, against the ROS conventions.
-    """
-    fields = {field.path: field for field in log.numbers}
-    called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
-    found = []
-    for one in guesses:
-        field, joint = fields.get(one.path), called.get(one.path, "")
-        if field is None or field.low is None or field.high is None or units[one.name] != "rad":
-            continue
-        low, high = (one.scale * end for end in (field.low, field.high))
-        if not joint or ROLLS.search(joint.lower()) or abs(high - low) <= FULL_TURNS:
-            continue
-        if max(abs(low), abs(high)) <= DEGREES:
-            found.append(f"{one.name}, from {min(low, high):.3g} to {max(low, high):.3g}")
-    if not found:
-        return ()
-    several = len(found) > 1
-    return (
-        f"{'; '.join(found)}: full turns of a joint, if {'these are' if several else 'that is'} "
-        f"rad. If it is in degrees, set scale = {math.pi / 180:.8g} in [log.state] of each, and of "
-        "the joints' velocities too",
-    )
+                return {path: Joint(NAMED, found("start.joint", topic, joint=joint), doubted=False)}
+    return {}
 
 
 def in_order(
-    guesses: Mapping[str, Guess],
-    units: Mapping[str, str],
+    roles: Mapping[str, str],
     joints: Mapping[str, tuple[str, ...]],
     log: LogReport,
-) -> dict[str, Guess]:
-    """Assign states in order from the base, if there are as many of a unit as joints.
+) -> dict[str, dict[str, Joint]]:
+    """Return the numbers of each state and input in order from the base, if none has a name.
 
-    Only if none of them has a path yet. Prismatic joints have states in m, revolute ones in rad.
+    There must be as many of a unit as joints. Prismatic joints have states in m, revolute in rad.
+
+    Args:
+        roles: the unit of each state and input without a matching name, "" for those with one.
+        joints: see `joint_names`.
+        log: an inspected log.
     """
-    found: dict[str, Guess] = {}
     if len(joints) != 1:
-        return found
+        return {}
     topic, names = next(iter(joints.items()))
     order, there = from_base(names), _there(log)
+    given: dict[str, dict[str, Joint]] = {}
     kinds = ((k, u, slide) for slide in (False, True) for k, u in (TURNING, SLIDING)[slide].items())
     for kind, unit, slide in kinds:
         some = [joint for joint in order if slides(joint) is slide]
-        those = [name for name, guess in guesses.items() if units[name] == unit]
-        if len(those) != len(some) or any(guesses[name].path for name in those):
+        those = [name for name, own in roles.items() if own == unit]
+        if len(those) != len(some):
             continue
-        commanded = _commands(log, len(names)) if kind == "effort" else []
-        own = [next((j for j in some if _holds(name, j)), "") for name in those]
-        for name, joint in zip(those, own if set(own) == set(some) else some, strict=True):
-            at = order.index(joint)
-            paths = [f"{command}[{at}]" for command in commanded]
-            paths += [path] if (path := f"{topic}.{kind}[{names.index(joint)}]") in there else []
-            if not paths:
-                continue
-            why = f"in the order of joints from the base, {at} is '{joint}'"
-            if len(some) == 1:
-                why = f"'{joint}' is the only joint{' that slides' * slide}"
-            why = f"no name matches; {why}" if commanded else why
-            rest = [f"{c}[{i}]" for c in commanded for i in range(len(names)) if i != at]
-            others = (*paths[1:], *rest)
-            found[name] = replace(guesses[name], path=paths[0], others=others, reasons=(why,))
-    return found
+        commanded = commands(log, len(names)) if kind == "effort" else []
+        for name, joint in zip(those, some, strict=True):
+            path = f"{topic}.{kind}[{names.index(joint)}]"
+            at, own = order.index(joint), [path] * (path in there)
+            if commanded:
+                given[name] = _commanded(commanded, own, at, joint, names)
+            elif own:
+                why = found("start.joint_order", topic, joint=joint, index=at)
+                known = slide or bool(_words(joint) & TURNS)
+                points = ORDERED if known else UNKNOWN
+                given[name] = {path: Joint(points, why, doubted=len(some) > 1)}
+    return given
+
+
+def _commanded(
+    arrays: Sequence[str], own: Sequence[str], at: int, joint: str, names: Sequence[str]
+) -> dict[str, Joint]:
+    """Return the commands for a joint: by its place in arrays, its effort, the rest of them."""
+    why = found("start.joint_order", arrays[0], joint=joint, index=at)
+    paths = [*(f"{array}[{at}]" for array in arrays), *own]
+    paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
+    return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}
+
+
+def perhaps_degrees(
+    guesses: Sequence[Guess],
+    model: Model,
+    joints: Mapping[str, tuple[str, ...]],
+) -> dict[str, Finding]:
+    """Return a finding on each signal in rad by the model that spans turns: it may be in degrees.
+
+    A command of more than a turn, unless a state comes close to it; a joint other than a wheel that
+    spans full turns, against the ROS conventions.
+
+    Args:
+        guesses: of states and inputs, with the ranges of their numbers.
+        model: with their units.
+        joints: see `joint_names`.
+    """
+    called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
+    units, spans = {**model.states, **model.inputs}, {g.name: g.extent for g in guesses}
+    peaks = {n: max(map(abs, e)) for n, e in spans.items() if e and units[n] == "rad"}
+    moved = max((peak for name, peak in peaks.items() if name in model.states), default=0.0)
+    doubts = {}
+    for one in (g for g in guesses if g.name in peaks):
+        peak, joint, (low, high) = peaks[one.name], called.get(one.path, ""), one.extent or (0, 0)
+        if one.name in model.inputs:
+            several = moved >= FOLLOWED * peak and not DEFLECTED.search(one.name.lower())
+            odd = peak > 2 * math.pi and not several
+        else:
+            plain = bool(joint) and not ROLLS.search(joint.lower())
+            odd = plain and high - low > FULL_TURNS and peak <= LARGEST
+        if odd:
+            ends, by = (Quantity(end, "rad") for end in (low, high)), UNITS["deg"][1]
+            first, last = ends
+            doubts[one.name] = found("start.degrees", one.name, low=first, high=last, scale=by)
+    return doubts
 
 
 def _there(log: LogReport) -> set[str]:
@@ -264,46 +283,34 @@ def _there(log: LogReport) -> set[str]:
 
 
 def by_efforts(
-    guesses: Mapping[str, Guess],
-    inputs: Sequence[str],
+    name: str,
     joints: Mapping[str, tuple[str, ...]],
     signals: Signals,
     log: LogReport,
-) -> dict[str, Guess]:
-    """Assign the commands of an array to joints by their correlation with measured efforts.
+) -> str:
+    """Return the number of an array that is the command of an input's joint, "" if unknown.
 
-    If each command correlates with one joint's effort, clearly more than with the others, it is
-    assigned to that joint. Otherwise the reasons say where to look it up.
+    Each command of the array must correlate with one joint's measured effort, clearly more than
+    with the others.
 
     Args:
-        guesses: of all states and inputs.
-        inputs: names of inputs.
+        name: of the input.
         joints: see `joint_names`.
         signals: reads the samples.
         log: an inspected log.
     """
-    found: dict[str, Guess] = {}
     there = _there(log)
-    for (topic, names), name in product(joints.items(), inputs):
-        guess = guesses[name]
-        own = [joint for joint in names if _holds(name, joint)]
-        arrays = [c for c in _commands(log, len(names), True) if guess.path.startswith(f"{c}[")]
-        if guess.sure or len(own) != 1 or not arrays or name in found:
-            continue
-        sent, measured = (
-            [f"{array}[{k}]" for k in range(len(names))] for array in (*arrays, f"{topic}.effort")
+    for topic, names in joints.items():
+        own = [joint for joint in names if holds(name, joint)]
+        arrays, measured = (
+            commands(log, len(names)),
+            [f"{topic}.effort[{k}]" for k in range(len(names))],
         )
-        joint, torques = names.index(own[0]), arrays[0] in _commands(log, len(names))
-        known = torques and there.issuperset(measured)
-        at = _goes_with(sent, measured, signals)[joint] if known else None
-        if at is None:
-            why = "check it by the order of `joints` in the parameters of the controller"
-            found[name] = replace(guess, reasons=(*guess.reasons, why))
-        else:
-            why = f"correlates with {measured[joint]}, the effort of '{own[0]}', clearly more than "
-            why += "with any other joint's"
-            found[name] = replace(guess, path=sent[at], sure=True, others=(), reasons=(why,))
-    return found
+        if len(own) == 1 and len(arrays) == 1 and there.issuperset(measured):
+            sent = [f"{arrays[0]}[{k}]" for k in range(len(names))]
+            at = _goes_with(sent, measured, signals)[names.index(own[0])]
+            return "" if at is None else sent[at]
+    return ""
 
 
 def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -> list[int | None]:
@@ -331,7 +338,7 @@ def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -
     return [int(k) for k in best]
 
 
-def _commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
+def commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
     """Return array topics with a torque command for each of `count` joints; `plain`: any kind."""
     words = ("cmd", "command", "effort", "torque", "desired", "ref")
     return [
@@ -344,7 +351,7 @@ def _commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
     ]
 
 
-def _holds(name: str, joint: str) -> bool:
+def holds(name: str, joint: str) -> bool:
     """Check whether a state's name is a joint's, perhaps with a word for the quantity."""
     plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
     parts = name.lower().split("_")

@@ -19,7 +19,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.safety import coasts_out
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
-from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracked, usual_weights

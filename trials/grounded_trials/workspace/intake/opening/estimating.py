@@ -29,7 +29,7 @@ from grounded.places import probe
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.command_steps import stands_still
-from grounded_trials.logs.inspection.inspect_pairs import velocities
+from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.logs.resample import stamped_otherwise
 from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec

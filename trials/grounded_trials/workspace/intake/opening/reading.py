@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
+from grounded.units import same_unit
 from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import Gridded
 from grounded_trials.logs.signal_report import SignalReport
-from grounded_trials.logs.stated_units import same_unit
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS

@@ -1,0 +1,639 @@
+"""One assignment: which number of a log is which state or input of a model.
+
+Every number has points for every role, the sum of named evidence:
+
+    name        the words in its path, common names of such quantities     (`names`)
+    unit        stated by the log, or by the ROS message type              (`stated_units`)
+    kind        a command for an input, what is measured for a state; a number that changes
+    joint       the names and the order of joints                          (`joint_names`)
+    home        states come from one message rather than from many
+    derivative  where the model has dq/dt = w, w follows q in the samples  (`relations`)
+    motion      the model's steps, among assignments that are left         (`steps`)
+
+`linear_sum_assignment` takes the assignment of most points, so that no guess overwrites another.
+What leads its rivals by `SURE` and rests on more than one unit or an order is sure; the rest is
+listed. A role that no name fits gets a number only if as many fit as there are such roles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from grounded.findings import Finding, found
+from grounded.model import Model
+from grounded.units import DEGREES, factor_between
+from grounded_trials.logs.inspection import names as words
+from grounded_trials.logs.inspection.guess import Guess
+from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspection.joint_names import (
+    NAMED,
+    Joint,
+    by_efforts,
+    in_order,
+    joint_names,
+    joint_units,
+    of_joint,
+)
+from grounded_trials.logs.inspection.relations import (
+    COMBINATIONS,
+    FOLLOWS,
+    SAME,
+    SURELY,
+    Follows,
+    Signals,
+    follows,
+    scale_of,
+    velocities,
+)
+from grounded_trials.logs.inspection.steps import by_groups, by_inputs
+from grounded_trials.logs.stated_units import (
+    LENGTHS,
+    Stated,
+    is_angle,
+    unit_of,
+    without_role,
+)
+
+LEAST = 2.0  # points from which a number is proposed whatever else there is
+SURE = 1.5  # lead over the next number, to be sure
+LEAD = 0.75  # lead of a number without a name over those that fit worse
+MOST = 20  # largest number of candidates
+FEW, MANY = 8, 60  # most numbers without a name that are tried as rates beside known ones; at all
+LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
+AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
+STATED, HOME, POSE, ALIVE, CAP = 1.8, 0.75, 2.2, -3.0, 5.0  # points, see `_Table`
+_POSE = ("position.x", "position.y", "@rpy.yaw")
+
+
+@dataclass(frozen=True)
+class _Role:
+    name: str
+    unit: str
+    sent: bool  # an input
+
+
+@dataclass(frozen=True)
+class _Number:
+    path: str
+    topic: TopicReport
+    field: FieldReport
+    said: str  # the unit that the log states
+    known: str  # the unit by convention
+    command: bool  # on a topic of commands
+
+    @property
+    def moves(self) -> bool:
+        return self.field.low != self.field.high
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is a joint's position or speed, a pose or odometry: no command."""
+        kind, away = self.topic.type, not self.command
+        joint = kind.endswith("/JointState") and ".effort[" not in self.path
+        return (away and (joint or kind.endswith(words.POSES))) or kind.endswith(words.MEASURED)
+
+
+def assigned(
+    log: LogReport,
+    states: Mapping[str, str],
+    inputs: Mapping[str, str],
+    model: Model | None = None,
+    joints: Mapping[str, tuple[str, ...]] | None = None,
+    given: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
+    """Return guesses for the states and for the inputs, in their order.
+
+    Args:
+        log: an inspected log.
+        states: units of the states by name, "" where unknown.
+        inputs: units of the inputs by name.
+        model: whose equations relate them; None: names and units alone decide.
+        joints: the result of `joint_names`, if already known.
+        given: numbers that are taken for some states and inputs, as guesses.
+    """
+    joints = joint_names(log) if joints is None else joints
+    table = _Table(log, states, inputs, joints)
+    for name, path in ((n, p) for n, p in given.items() if n in table.row):
+        table.add(name, path, 2 * CAP, found("start.given", name))
+        table.doubted.add((name, path))
+    signals = None
+    if model is not None and table.numbers:
+        angles = {n.path for n in table.numbers if n.known == "rad" or n.said in ("", "rad", "deg")}
+        signals = Signals(log, angles, table.stated)
+        table.look(model, signals)
+    guesses = {guess.name: guess for guess in table.solved()}
+    if model is not None and signals is not None:
+        for pair in velocities(model).items():
+            if set(pair) <= guesses.keys():
+                guesses |= _followed(guesses, pair, signals, table)
+        guesses = _by_steps(guesses, model, signals, table)
+        guesses = guesses if given else _the_rest(guesses, model, signals, table)
+    done = [table.finished(guess) for guess in guesses.values()]
+    return tuple(done[: len(states)]), tuple(done[len(states) :])
+
+
+class _Table:
+    """The points of every number for every role, and why."""
+
+    def __init__(
+        self,
+        log: LogReport,
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
+        joints: Mapping[str, tuple[str, ...]],
+    ) -> None:
+        self.log, self.joints, self.stated = log, joints, Stated.by(log.files)
+        self.units = {**states, **inputs}
+        self.roles = [_Role(n, u, False) for n, u in states.items()]
+        self.roles += [_Role(n, u, True) for n, u in inputs.items()]
+        by_joint = joint_units(joints)
+        self.numbers = [
+            _Number(
+                one.path,
+                topic,
+                one,
+                self.stated.unit(one.path),
+                unit_of(one.path, by_joint),
+                bool(words.COMMAND_TOPIC.search(topic.topic.lower())),
+            )
+            for topic in log.topics
+            for one in topic.fields
+            if not words.PARTS.search(one.path)
+        ]
+        self.at = {number.path: k for k, number in enumerate(self.numbers)}
+        self.row = {role.name: r for r, role in enumerate(self.roles)}
+        self.points = np.zeros((len(self.roles), len(self.numbers)))
+        self.why: dict[tuple[str, str], list[Finding]] = {}
+        self.named, self.doubted = set[tuple[str, str]](), set[tuple[str, str]]()
+        for role in self.roles:
+            paths = [number.path for number in self.numbers]
+            called = words.meanings(role.name, role.unit * role.sent, paths, [*states])
+            for number in self.numbers:
+                self._by_itself(role, number, called)
+        self._by_joints()
+        self._at_home()
+
+    def add(self, name: str, path: str, points: float, *why: Finding) -> None:
+        """Add evidence for a number in a role."""
+        if path in self.at:
+            self.points[self.row[name], self.at[path]] += points
+            self.why.setdefault((name, path), []).extend(why)
+
+    def _by_itself(self, role: _Role, number: _Number, called: Sequence[str]) -> None:
+        """Count what a number's name, unit and kind say."""
+        topic, one, r = number.topic, number.field, self.row[role.name]
+        own = role.name, number.path
+        if role.sent and number.measured:
+            self.points[r, self.at[number.path]] = -2 * CAP
+            return
+        name = words.name_points(called, role.name, topic, one, is_input=role.sent)
+        if not name and not role.sent and number.moves:
+            name = words.STEM * words.is_stem(role.name, role.unit, number.path)
+        points = name
+        if name:
+            self.named.add(own)
+            points -= 3.0 * (one.low is None) + 2.0 * (one.not_finite > 0.1 * topic.messages)
+            points -= 1.0 * (not number.moves) + 1.0 * (topic.messages < 3)
+        elif not number.moves or one.low is None:
+            return
+        if role.unit in ("", "1"):
+            points += STATED * bool(number.said and role.unit) * self._fits(role, number)
+        elif number.said or number.known:
+            fits = self._fits(role, number)
+            points += (STATED if number.said else 0.5) if fits else -0.5 if number.said else -1.5
+            unit = number.said or number.known
+            code = "start.unit" if fits else "start.unit_other"
+            self.why.setdefault(own, []).append(found(code, role.name, unit=unit, model=role.unit))
+            if not fits and not number.said:
+                self.doubted.add(own)
+        if role.unit in LENGTHS and is_angle(number.path):
+            points -= 1.5
+        if role.sent and number.command and number.moves:
+            points += 1.0 + 0.9 * words.has_words(number.path, role.name) * (not name)
+        self.points[r, self.at[number.path]] += points
+
+    def _fits(self, role: _Role, number: _Number) -> bool:
+        return factor_between(number.said or number.known, role.unit) is not None
+
+    def _by_joints(self) -> None:
+        """Count the names of joints, and their order where no name says more."""
+        bare = {}
+        for role in self.roles:
+            own = of_joint(role.name, role.unit, self.joints, self.log, sent=role.sent)
+            self._joint(role.name, own)
+            fits = own or self.points[self.row[role.name]].max(initial=0.0) >= LEAST
+            bare[role.name] = "" if fits else role.unit
+        for name, own in in_order(bare, self.joints, self.log).items():
+            self._joint(name, own)
+
+    def _joint(self, name: str, own: Mapping[str, Joint]) -> None:
+        for path, one in own.items():
+            self.add(name, path, one.points, one.why)
+            if one.doubted:
+                self.doubted.add((name, path))
+            if one.points >= NAMED - SURE:
+                self.named.add((name, path))
+
+    def _at_home(self) -> None:
+        """Count that states come from one message, that a pose is measured, and what changes."""
+        states = [role for role in self.roles if not role.sent]
+        homes: dict[str, set[str]] = {}
+        for role in states:
+            for number in self._fitting(role.name):
+                homes.setdefault(number.topic.topic, set()).add(role.name)
+        bonus = []
+        for role in states:
+            row, fitting = self.points[self.row[role.name]], self._fitting(role.name)
+            best = max((row[self.at[n.path]] for n in fitting), default=0.0)
+            reckoned = {k: n for n in fitting if (k := _pose(n.path)) and _reckons(n.topic)}
+            for number in fitting:
+                points = HOME * len(homes[number.topic.topic])
+                points += 0.1 * float(np.log10(1 + number.topic.rate_hz))
+                wheels = reckoned.get(_pose(number.path))
+                often = wheels and number.topic.rate_hz >= AS_OFTEN * wheels.topic.rate_hz
+                near = row[self.at[number.path]] > best - SURE
+                if often and near and wheels and number.topic.type.endswith(words.POSES):
+                    points += POSE
+                    self.add(role.name, number.path, 0, found("start.pose", wheels.topic.topic))
+                    self.doubted.add((role.name, number.path))
+                alive = [n for n in fitting if n.moves and _alike(n.path, number.path)]
+                if not number.moves and number.field.low is not None and alive:
+                    here = row[self.at[number.path]] + points
+                    points += ALIVE
+                    for one in alive:
+                        if here >= row[self.at[one.path]] + HOME * len(homes[one.topic.topic]):
+                            self.add(role.name, one.path, 0, found("start.still", number.path))
+                            self.doubted.add((role.name, one.path))
+                bonus.append((role.name, number.path, points))
+        for name, path, points in bonus:
+            self.add(name, path, points)
+
+    def _fitting(self, name: str) -> list[_Number]:
+        """Return the numbers that would be proposed for a role."""
+        row = self.points[self.row[name]]
+        return [number for number in self.numbers if row[self.at[number.path]] >= LEAST]
+
+    def factor(self, name: str, path: str) -> float:
+        """Return the factor from the unit that the log states for a number to a role's."""
+        return self.stated.factor(path, self.units[name])
+
+    def taken(self) -> dict[str, str]:
+        """Return the number of each role, as far as one has enough points: {name: path}."""
+        from scipy.optimize import linear_sum_assignment
+
+        roles, numbers = self.points.shape
+        order = np.outer(np.arange(roles), np.arange(numbers)) - roles * np.arange(numbers)
+        gain = self.points + 1e-6 * order  # ties go in the log's order
+        gain = np.where(self.points >= LEAST, gain, -1e6)
+        rows, columns = linear_sum_assignment(
+            np.hstack([gain, np.zeros((roles, roles))]), maximize=True
+        )
+        pairs = zip(rows, columns, strict=True)
+        return {self.roles[r].name: self.numbers[k].path for r, k in pairs if k < numbers}
+
+    def look(self, model: Model, signals: Signals) -> None:
+        """Count what the samples say of rates, speeds, angles' commands and efforts."""
+        first = self.taken()
+        for role in (one for one in self.roles if one.sent):
+            if path := by_efforts(role.name, self.joints, signals, self.log):
+                self.add(role.name, path, CAP, found("start.effort", path))
+                self.doubted.discard((role.name, path))
+            angle = first.get(without_role(role.name), "")
+            path = first.get(role.name, "")
+            if angle and path.endswith("@rpy." + path.rpartition(".")[2]) and angle != path:
+                value = _lagged(signals, angle, path)
+                if value < FOLLOWS:
+                    self.add(role.name, path, -2 * CAP)
+        for pair in velocities(model).items():
+            if set(pair) <= self.row.keys():
+                self._relate(pair, first, signals)
+        self._speed(model, signals)
+
+    def _relate(self, pair: tuple[str, str], first: Mapping[str, str], signals: Signals) -> None:
+        """Count how well candidates for a rate follow those for its position."""
+        q, w = pair
+        taken = {path for name, path in first.items() if name not in pair}
+        free = [n for n in self.numbers if n.moves and n.path not in taken]
+        sent = {path for name, path in first.items() if self.roles[self.row[name]].sent}
+        own = {name: [p for p in self._near(name) if p not in sent] for name in pair}
+        few = FEW if any(name in first for name in self.row) else MANY
+        bare = [name for name in pair if not own[name]]
+        if bare and len(free) <= few:
+            own |= {name: self._possible(name, free) for name in bare}
+        like = self._likes(own[q], own[w], signals)
+        best = max((abs(one.correlation) for one in like.values()), default=0.0)
+        if not bare and best < FOLLOWS and len(free) <= MANY:  # a name may mislead
+            more = self._likes(own[q][:1], self._possible(w, free), signals)
+            if any(abs(one.correlation) >= FOLLOWS for one in more.values()):
+                like |= more
+                for path in own[w]:
+                    self.add(w, path, -CAP)
+        before = self.points.copy()
+        rows = self.row[q], self.row[w]
+        gains: dict[tuple[str, str], float] = {}
+        for (a, b), one in like.items():
+            if abs(one.correlation) < FOLLOWS:
+                continue
+            slope = one.slope * self.factor(w, b) / self.factor(q, a)
+            fits = abs(slope * scale_of(slope) - 1) < SAME
+            same = abs(abs(one.slope) - 1) < SAME  # as logged
+            if bare and not (fits or same) and abs(one.correlation) < SURELY:
+                continue  # neither name nor size: a voltage follows the speed that it drives
+            if few == MANY and len(bare) == 2 and not self._tenfold(one):
+                continue
+            fits = fits or (same and bool(self.stated.unit(a)) != bool(self.stated.unit(b)))
+            points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
+            for key, other in ((q, a), (w, b)):
+                partner = (rows[1], b) if key == q else (rows[0], a)
+                lost = before[partner[0]].max() - before[partner[0], self.at[partner[1]]]
+                gains[key, other] = max(gains.get((key, other), 0.0), points - min(lost, CAP))
+        for (name, path), points in gains.items():
+            self.add(name, path, points)
+
+    def _near(self, name: str) -> list[str]:
+        """Return the numbers that rival for a role, best first."""
+        row = self.points[self.row[name]]
+        order = [k for k in np.argsort(-row, kind="stable") if row[k] >= LEAST]
+        return [self.numbers[k].path for k in order if row[k] > row[order[0]] - SURE]
+
+    def _possible(self, name: str, free: Iterable[_Number]) -> list[str]:
+        """Return the numbers without a name whose unit is possible for a role."""
+        unit = self.units[name]
+        return [
+            n.path
+            for n in free
+            if not (unit in LENGTHS and is_angle(n.path))
+            and (not unit or not (n.said or n.known) or self._has(n, unit))
+        ]
+
+    @staticmethod
+    def _tenfold(like: Follows) -> bool:
+        """Return whether a number is surely a rate, in units that differ by a power of ten."""
+        power = 10.0 ** round(np.log10(max(like.slope, 1e-9)))
+        return like.correlation > SURELY and abs(like.slope / power - 1) < SAME
+
+    @staticmethod
+    def _has(number: _Number, unit: str) -> bool:
+        return factor_between(number.said or number.known, unit) is not None
+
+    def _likes(
+        self, first: Sequence[str], second: Sequence[str], signals: Signals
+    ) -> dict[tuple[str, str], Follows]:
+        """Return how each number follows each."""
+        signals.read([*first, *second])
+        pairs = [(a, b) for a in first for b in second if a != b]
+        return {pair: signals.follows(*pair) for pair in pairs}
+
+    def _speed(self, model: Model, signals: Signals) -> None:
+        """Count how an unnamed number follows the speed of the position."""
+        name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
+        first = self.taken()
+        if name not in self.row or name in first or not all(axis in first for axis in position):
+            return
+        axes, taken = [first[axis] for axis in position], {*first.values()}
+        bare = [n.path for n in self.numbers if n.moves and n.path not in taken]
+        bare = [p for p in bare if p.partition("[")[0].endswith(".data")][:COMBINATIONS]
+        signals.read([*axes, *bare] * bool(axes))
+        for path in bare * bool(axes):
+            if gridded := signals.grid((*axes, path)):
+                step, (*places, speed) = gridded
+                by = [
+                    self.stated.factor(p, model.states[n])
+                    for n, p in zip(position, axes, strict=True)
+                ]
+                moved = [f * np.diff(p) for f, p in zip(by, places, strict=True)]
+                way = np.concatenate([[0.0], np.cumsum(np.sqrt(sum(m**2 for m in moved)))])
+                like = follows(way, speed * self.stated.factor(path, self.units[name]), step)
+                if like.correlation > FOLLOWS:
+                    why = found(
+                        "start.speed",
+                        name,
+                        of=tuple(position),
+                        correlation=like.correlation,
+                        slope=like.slope,
+                    )
+                    self.add(name, path, LEAST + _capped(like), why)
+                    self.doubted.add((name, path))
+
+    def solved(self) -> list[Guess]:
+        """Return the assignment of most points, and where it leaves roles what else fits them."""
+        taken = self.taken()
+        sent = {path for name, path in taken.items() if self.roles[self.row[name]].sent}
+        made = []
+        for role in self.roles:
+            path, name = taken.get(role.name, ""), role.name
+            away = {*taken.values()} - sent if role.sent else sent
+            near = tuple(p for p in self._near(name) if p != path and p not in away)
+            sure = not near and (name, path) in self.named - self.doubted
+            why = tuple(self.why.get((name, path), ()))
+            made.append(Guess(name, path, "", bool(path) and sure, near, None, why))
+        alone = self._alone(taken)
+        return [alone.get(guess.name, guess) for guess in made]
+
+    def _alone(self, taken: Mapping[str, str]) -> dict[str, Guess]:
+        """Return roles without enough points, with a number if as many fit, or with what fits."""
+        left = [n for n in self.numbers if n.moves and n.path not in {*taken.values()}]
+        lost = [role for role in self.roles if role.name not in taken]
+        tops: dict[str, list[str]] = {}
+        for role in lost:
+            row = self.points[self.row[role.name]]
+            fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
+            tops[role.name] = [p for p in fits if fits[p] > max(fits.values()) - LEAD]
+        made, given = {}, set[str]()
+        for role in lost:
+            name, top = role.name, tops[role.name]
+            alike = [other for other, some in tops.items() if some == top]
+            sole = all(some == top or not {*some} & {*top} for some in tops.values())
+            said = all(self.stated.unit(path) for path in top)
+            if top and sole and len(top) == len(alike) and (said or len(top) == 1):
+                path = top[alike.index(name)]
+                number = self.numbers[self.at[path]]
+                clear = number.command and self.points[self.row[name], self.at[path]] >= SURE
+                sure = clear or len(lost) == len(left) == 1
+                why = found("start.alone", name, numbers=tuple(top), command=int(number.command))
+                rest = tuple(p for p in top if p != path)
+                known = tuple(self.why.get((name, path), ()))
+                made[name] = Guess(name, path, "", not rest and sure, rest, None, (*known, why))
+                given.add(path)
+        for role in (one for one in lost if one.name not in made):
+            made[role.name] = self._offered(role, [n for n in left if n.path not in given])
+        return made
+
+    def _offered(self, role: _Role, left: Sequence[_Number]) -> Guess:
+        """Return a role without a number: the commands, what has points, or what is possible."""
+        row, possible = self.points[self.row[role.name]], {*self._possible(role.name, left)}
+        may = [n for n in left if not (role.sent and n.measured)]
+        some = [n for n in may if role.sent and n.command]
+        some = some or [n for n in may if row[self.at[n.path]] > 0]
+        some = some or [n for n in may if n.path in possible and not n.said]
+        some = some or [n for n in self.numbers if (role.name, n.path) in self.named]
+        some.sort(key=lambda n: -float(row[self.at[n.path]]))
+        empty = [t.topic for t in self.log.topics if not t.messages]
+        empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
+        why = (found("start.no_messages", *empty),) if empty and role.sent else ()
+        return Guess(role.name, "", "", False, tuple(n.path for n in some)[:MOST], None, why)
+
+    def finished(self, guess: Guess) -> Guess:
+        """Return a guess with its clock, its range, and the unit that the log states."""
+        path, wanted = guess.path or next(iter(guess.others), ""), self.units[guess.name]
+        if path not in self.at:
+            return replace(guess, clock="log")
+        number = self.numbers[self.at[path]]
+        clock = self.log.clock(number.topic)
+        if not guess.path:
+            return replace(guess, clock=clock, scale=self.factor(guess.name, path))
+        guess = replace(guess, clock=clock, field=number.field)
+        if len(guess.others) > 3:
+            guess = replace(guess, others=guess.others[:3])
+        factor = self.factor(guess.name, path)
+        if number.said and guess.scale == 1 and factor_between(f"{number.said}/s", wanted):
+            why = found("start.unit_other", guess.name, unit=number.said, model=wanted)
+            return guess.because(why, sure=False)  # deg, of a rate
+        return replace(guess, scale=guess.scale * factor) if abs(factor - 1) > 1e-9 else guess
+
+
+def _capped(like: Follows) -> float:
+    """Return the points of a relation: beyond CAP more of them only break ties."""
+    return min(like.points, CAP) + 0.01 * like.points
+
+
+def _pose(path: str) -> str:
+    return next((one for one in _POSE if path.endswith(one)), "")
+
+
+def _reckons(topic: TopicReport) -> bool:
+    """Check whether a topic's pose is most likely integrated from its own speed."""
+    moves = any(f.path.endswith("twist.linear.x") and f.low != f.high for f in topic.fields)
+    wheels = not words.NO_WHEELS.search(topic.topic.lower())
+    return topic.type.endswith("/Odometry") and moves and wheels
+
+
+def _alike(path: str, other: str) -> bool:
+    """Check whether two numbers have the same name in their messages, or units that may agree."""
+    return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
+
+
+def _lagged(signals: Signals, angle: str, command: str) -> float:
+    """Return the largest correlation of an angle with its command up to LATEST earlier."""
+    gridded = signals.grid((angle, command))
+    if gridded is None:
+        return 1.0
+    step, (moved, sent) = gridded
+    most = max(min(round(LATEST / step), len(moved) - 20), 0)
+    pairs = [(moved[k:], sent[: len(sent) - k]) for k in range(most + 1)]
+    alive = [(a, c) for a, c in pairs if a.std() > 1e-9 and c.std() > 1e-9]
+    return max((float(np.corrcoef(a, c)[0, 1]) for a, c in alive), default=0.0)
+
+
+def _followed(
+    guesses: Mapping[str, Guess], pair: tuple[str, str], signals: Signals, table: _Table
+) -> dict[str, Guess]:
+    """Return a position and its rate with what their samples say of signs, units and each other.
+
+    Where a load swings, its angular acceleration is opposite to the angle: with the columns
+    exchanged the rate follows the derivative of the position, too, but with the opposite sign or
+    another size. Only the right order has both right.
+    """
+    q, w = (guesses[name] for name in pair)
+    if not (q.path and w.path):
+        return {}
+    logged, back = signals.follows(q.path, w.path), signals.follows(w.path, q.path)
+    by = table.factor(q.name, q.path), table.factor(w.name, w.path)
+    slope, size = logged.slope * by[1] / by[0], logged.correlation
+    near = abs(slope - 1) < SAME
+    other = back.correlation >= SURELY and abs(back.slope - 1) <= SAME
+    exchanged = found("start.exchanged", q.path, w.path, correlation=back.correlation)
+    crossed = other and not (near and size > FOLLOWS)
+    if crossed and not (size < -SURELY and abs(slope + 1) < SAME):
+        return {q.name: replace(q, sure=False), w.name: w.because(exchanged, sure=False)}
+    if abs(size) < FOLLOWS:
+        why = found("start.unfollowed", w.name, of=q.path, correlation=size)
+        return {w.name: w.because(why, sure=False)} if logged.correlation else {}
+    scale, stated = scale_of(slope), [table.stated.unit(one.path) for one in (q, w)]
+    fits = abs(slope * scale - 1) < SAME
+    why = found("start.follows", w.name, of=q.path, correlation=size, sign=int(np.sign(slope)))
+    if fits:
+        if abs(scale) == DEGREES:  # the position is in degrees
+            q = q.because(found("start.in_degrees", q.name), sure=False)
+            q, scale = replace(q, scale=1 / DEGREES), scale / DEGREES
+        elif abs(scale) != 1:
+            w = w.because(found("start.in_degrees", w.name))
+        w = replace(w, scale=scale)
+        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
+        alone = not q.others and (q.name, q.path) not in table.doubted
+        if kind and alone and size > SURELY and min(abs(slope - 1), abs(logged.slope - 1)) < SAME:
+            q = replace(q, sure=True)
+        if w.sure and alone and slope > 0 and scale == q.scale == 1:
+            q = replace(q, sure=True)
+        plain = not w.others and (w.name, w.path) not in table.doubted
+        w = replace(w, sure=w.sure or (q.sure and plain))
+    elif abs(abs(logged.slope) - 1) < SAME and bool(stated[0]) != bool(stated[1]):
+        same = found("start.same_unit", q.name, w.name)
+        q, w = (q, w.because(same)) if stated[0] else (q.because(same), w)
+        w = replace(w, scale=scale * (by[0] if stated[0] else 1.0))
+        q = replace(q, scale=1.0 if stated[0] else by[1])
+        kind = not q.others and (q.name, q.path) not in table.doubted and bool(stated[0])
+        q = replace(q, sure=q.sure or kind)
+        w = replace(w, sure=q.sure and not w.others and size > SURELY)
+    else:
+        w = w.because(found("start.times", w.name, of=q.path, slope=slope), sure=False)
+    w = w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)
+    return {q.name: q, w.name: w}
+
+
+def _by_steps(
+    guesses: Mapping[str, Guess], model: Model, signals: Signals, table: _Table
+) -> dict[str, Guess]:
+    """Return the guesses after the model's steps have chosen among those that are left."""
+    measured = joint_units(table.joints)
+    signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
+    moving = [n.path for n in table.numbers if n.moves]
+    signals.read(moving * (len(moving) <= 2 * FEW))
+    bare = [
+        pair
+        for pair in velocities(model).items()
+        if not any((name, guesses[name].path) in table.named for name in pair)
+    ]
+    guesses = {**guesses, **by_groups(model, guesses, bare, signals, measured)}
+    return guesses | by_inputs(model, guesses, signals)
+
+
+def _the_rest(
+    guesses: Mapping[str, Guess], model: Model, signals: Signals, table: _Table
+) -> dict[str, Guess]:
+    """Give inputs without a name the numbers that are left, if as many: in the log's order, unsure.
+
+    Only if the states are known, or are rates of those: a number that is left is no state then.
+    """
+    lost = [name for name in model.input_names if not guesses[name].path]
+    known = {name for name in model.state_names if guesses[name].path}
+    known |= {w for q, w in velocities(model).items() if q in known}
+    used = {guess.path for guess in guesses.values()}
+    left = [n for n in table.numbers if n.moves and n.path not in used]
+    named = any((name, guesses[name].path) in table.named for name in model.state_names)
+    if (
+        not lost
+        or len(left) != len(lost)
+        or known < {*model.state_names}
+        or len(lost) > 1 < named + 1
+    ):
+        return dict(guesses)
+    pairs = list(zip(lost, left, strict=True))
+    if any(n.said and factor_between(n.said, model.inputs[name]) is None for name, n in pairs):
+        return dict(guesses)
+    paths = tuple(number.path for number in left)
+    more = {
+        name: replace(
+            guesses[name],
+            path=number.path,
+            others=tuple(path for path in paths if path != number.path),
+            reasons=(found("start.left", name, numbers=paths),),
+        )
+        for name, number in pairs
+    }
+    done = by_inputs(model, {**guesses, **more}, signals)
+    return {**guesses, **more} | {name: replace(one, sure=False) for name, one in done.items()}

@@ -1,0 +1,184 @@
+"""How well the name of a number fits a state or input: usual names, in any order of words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from grounded.units import factor_between
+from grounded_trials.formats.message_path import AXES, WORLD
+from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
+from grounded_trials.logs.stated_units import (
+    bare_command,
+    in_english,
+    unit_in_name,
+    without_role,
+    without_unit,
+)
+
+MEASURED = ("/Odometry", "/Imu")  # messages that hold no commands
+
+_YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
+_TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch", "tilt", "lean")
+_MEANINGS: dict[str, tuple[str, ...]] = {
+    "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting", "x0", "pos"),
+    "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing", "y0"),
+    "z": ("position.z", "translation.z", "z", "altitude", "height"),
+    "psi": _YAW,
+    "yaw": _YAW,
+    "heading": _YAW,
+    "theta": _TURN,
+    "th": _TURN,
+    "pitch": ("@rpy.pitch", "pitch", "theta", "tilt", "lean"),
+    "pitch_rate": (
+        *("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
+        *("tilt_rate", "lean_rate"),
+    ),
+    "phi": ("@rpy.roll", "roll", "phi"),
+    "roll": ("@rpy.roll", "roll", "phi"),
+    **{f"v{axis}": (f"@{WORLD}.{axis}", f"linear.{axis}", f"v{axis}") for axis in AXES},
+    "v": ("linear.x", "speed", "velocity", "vel", "v"),
+    "speed": ("speed", "linear.x", "velocity", "vel", "v"),
+    "u": ("linear.x", "u", "surge"),
+    "w": ("linear.z", "w", "heave"),
+    "p": ("angular.x", "angular_velocity.x", "p"),
+    "q": ("angular.y", "angular_velocity.y", "q"),
+    "r": ("angular.z", "angular_velocity.z", "yaw_rate", "r"),
+    "omega": ("angular.z", "angular_velocity.z", "yaw_rate", "omega"),
+    "yaw_rate": ("angular.z", "angular_velocity.z", "yaw_rate"),
+    "delta": ("steering_angle", "delta", "steering"),
+    "steering": ("steering", "steering_angle", "steer", "delta", "angular.z"),
+    "turn": ("turn", "angular.z", "angular_velocity.z", "turn_rate", "yaw_rate", "omega", "w"),
+    "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
+    "thrust": ("thrust", "force.z", "throttle"),
+    "brake": ("brake",),
+    "torque": ("torque", "effort", "tau"),
+}
+NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
+    "V": ("voltage", "volts", "volt"),
+    "A": ("current", "amps", "ampere"),
+    "N m": ("torque", "effort", "tau"),
+    "N": ("force", "thrust"),
+}
+_BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, not the speed
+_COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
+_RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
+_COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
+COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
+_ANGLES = ("roll", "pitch", "yaw")
+# no signals by themselves
+PARTS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
+_QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
+POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
+NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels
+    "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
+)
+_WORD = re.compile(r"[a-z]+")
+_FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
+_HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
+_RATE = re.compile(r"_(rate|speed|velocity|vel|omega|dot)$")
+WORTH, LESS, TOPIC, STEM = 4.0, 0.3, 3.0, 3.0  # points of the usual name, less of each further one
+
+
+def is_command(path: str) -> bool:
+    """Return whether a word of a path says that it is a command."""
+    return bool({*_COMMANDED}.intersection(_WORD.findall(path.lower())))
+
+
+def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) -> tuple[str, ...]:
+    """Return the usual names of a state or input, its own first.
+
+    Args:
+        name: of the state or input.
+        unit: of an input, by which it may be called; "" for a state.
+        paths: of the log's numbers: north and east are axes only if it has both.
+        states: names of the model's states: beside a surge u, v is the sway.
+    """
+    if name == "v" and "u" in states:
+        return (name, *_BESIDE_U)
+    said = {without_unit(path).lower().rpartition(".")[2] for path in paths}
+    plane = all(said.intersection(axis) for axis in _COMPASS)
+    left = () if plane else {one for axis in _COMPASS for one in axis}
+    usual = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(unit, ()))
+    return (name.lower(), *(one for one in usual if one not in left))
+
+
+def name_points(
+    called: Sequence[str], name: str, topic: TopicReport, field: FieldReport, *, is_input: bool
+) -> float:
+    """Return how well a number's name fits, 0 for not at all.
+
+    Args:
+        called: the usual names of the state or input, see `meanings`.
+        name: of the state or input.
+        topic: the number's topic.
+        field: the number.
+        is_input: whether a command is sought.
+    """
+    rest = field.path[len(topic.topic) :]
+    inside, apart = (one.lower().strip('".') for one in (rest, _HUMP.sub("_", rest)))
+    plain = bare_command if is_input else without_unit
+    bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
+    ways = {inside, bare, apart, in_english(inside), in_english(bare), _FLAT.sub(r".\1.", inside)}
+    best = max(_fit(called, one, topic.topic.lower()) for one in ways)
+    folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
+    if is_input and inside in ("data", "value") and {*called} & {*folders}:
+        best = max(best, TOPIC)
+    if best <= 0 and is_input and COMMAND_TOPIC.search(topic.topic.lower()):
+        state = without_role(name)  # the command of a state, such as roll_command
+        usual = (state, *_MEANINGS.get(state, ())) if state != name else ()
+        best = max((_fit(usual, one, topic.topic.lower()) for one in ways), default=0.0)
+    if best <= 0:
+        return 0.0
+    words = {*_WORD.findall(field.path.lower()), *_WORD.findall(in_english(inside))}
+    commanded = any(word in words for word in _COMMANDED)
+    return best + (0.5 if is_input else -2.0) * commanded + 0.5 * (topic.stamped and not is_input)
+
+
+def is_stem(name: str, unit: str, path: str) -> bool:
+    """Return whether a state's name begins like a number in its kind of unit.
+
+    So `wheel_rpm` is the state wheel_speed [rad/s].
+    """
+    stem = _RATE.sub("", name.lower())
+    last = re.split(r"[/.]", without_unit(path).lower())[-1].strip('"')
+    known = stem != name.lower() and unit not in ("", "1") and last == stem
+    return known and factor_between(unit_in_name(path), unit) is not None
+
+
+def has_words(path: str, name: str) -> bool:
+    """Return whether the last name of a path has all words of a name, and is not their rate.
+
+    So `voltage` is `motor_voltage`, but not `voltage_rate`.
+    """
+    last = re.split(r"[./]", path.lower())[-1]
+    said = {*_WORD.findall(last), *_WORD.findall(in_english(last))}
+    words = {*_WORD.findall(name.lower())}
+    long = bool(words) and all(len(word) > 1 for word in words)
+    return long and words <= said and not (said - words) & _RATES
+
+
+def _fit(called: Sequence[str], inside: str, topic: str) -> float:
+    """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
+    best = 0.0
+    for rank, meaning in enumerate(called):
+        if WORLD in inside and WORLD not in meaning:
+            continue  # its last letter is an axis, not a name
+        worth = WORTH - LESS * max(rank - 1, 0)
+        if inside == meaning or inside.endswith("." + meaning):
+            best = max(best, worth + (0.5 if "." in meaning else 0.0))
+        last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
+        if inside in ("data", "value") and last == meaning:
+            best = max(best, worth)
+        elif len(meaning) > 1:
+            words = set(_WORD.findall(_named(inside, last)))
+            rate = words & _RATES - set(_WORD.findall(meaning))  # `yaw_rate` is not a yaw
+            best = max(best, worth - 1.0) if meaning in words and not rate else best
+    return best
+
+
+def _named(inside: str, last: str) -> str:
+    """Return the text whose words name a number: a topic of one number, or a table's column."""
+    if inside in ("data", "value"):
+        return last
+    return "" if "." in inside or "[" in inside or last not in ("npz", "csv", "run") else inside

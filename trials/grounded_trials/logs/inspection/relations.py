@@ -1,0 +1,188 @@
+"""What the samples of a log say of each other: which number follows the derivative of which.
+
+`Signals` reads the samples once and puts them on a common grid; `follows` compares two of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.model import Model
+from grounded.places import integrals
+from grounded.units import DEGREES
+from grounded_trials.formats.messages import Floats
+from grounded_trials.logs.inspection.inspect_log import LogReport
+from grounded_trials.logs.samples import Samples, tidy
+from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+from grounded_trials.logs.stated_units import Stated
+from grounded_trials.within import OverBudget
+
+SLOPE = 0.01  # tolerance of the factor 1 in q' = w
+FOLLOWS, SURELY = 0.8, 0.95  # correlation of a rate with a derivative: named so, or not
+SAME = 0.15  # relative tolerance of the size of a rate
+COMBINATIONS, LONGEST = 64, 20_000  # largest number of combinations tried; samples of a grid
+ROWS = 20  # fewest samples that are compared
+SPAN = 5  # samples over which a slope is taken
+
+
+@dataclass(frozen=True)
+class Follows:
+    """Correlation of two signals, and how many times as large the second is."""
+
+    correlation: float
+    slope: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether the second is the derivative of the first, in sign and size."""
+        return self.correlation > SURELY and abs(self.slope - 1) < SAME
+
+    @property
+    def points(self) -> float:
+        """What it says for the two being a position and its rate: the share it explains [nats]."""
+        return float(-np.log(max(1 - self.correlation**2, 1e-12)))
+
+
+def follows(q: Floats, w: Floats, step: float) -> Follows:
+    """Compare w with the derivative of q, both averaged over a few samples.
+
+    Args:
+        q: (N,) position.
+        w: (N,) rate.
+        step: sample time [s].
+    """
+    slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
+    mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
+    good = np.isfinite(slope) & np.isfinite(mean)
+    a, b = slope[good], mean[good]
+    if len(a) < ROWS or a.std() < 1e-9 or b.std() < 1e-9:
+        return Follows(0.0, 1.0)
+    a, b = a - a.mean(), b - b.mean()
+    return Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
+
+
+def scale_of(slope: float) -> float:
+    """Return the factor that a rate must be multiplied by: a sign, and degrees of either."""
+    sign, size = float(np.sign(slope)), abs(slope)
+    if abs(size / DEGREES - 1) < SAME:
+        return sign / DEGREES
+    return sign * DEGREES if abs(size * DEGREES - 1) < SAME else sign
+
+
+def velocities(model: Model) -> dict[str, str]:
+    """Return the states whose rate is another state of the model: {q: w}."""
+    names = model.state_names
+    own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
+    return {names[r.i]: names[r.j] for r in own}
+
+
+def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
+    """Return which numbers are the rate of which: {position: (rate, factor of the rate)}.
+
+    Only pairs whose units differ by a power of ten; each number is in one pair at most.
+    """
+    return Signals(log, (), Stated.by(log.files)).rates(paths)
+
+
+class Signals:
+    """The samples of a log's numbers, read once, and put on a common grid on request.
+
+    Args:
+        log: an inspected log.
+        angles: paths of numbers that may wrap, in radians or degrees.
+        stated: the units that the log states.
+    """
+
+    def __init__(self, log: LogReport, angles: Collection[str], stated: Stated) -> None:
+        self.stated = stated
+        self._clocks = {
+            f.path: "header" if t.stamped and not log.simulated else "log"
+            for t in log.topics
+            for f in t.fields
+        }
+        self._files, self._angles = log.files, angles
+        self.found: dict[str, Samples] = {}
+        self._missing: set[str] = set()
+
+    def read(self, paths: Iterable[str]) -> None:
+        """Read the samples of further paths."""
+        more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
+        specs = {p: SignalSpec(p, clock=self._clocks.get(p, "log")) for p in more}  # type: ignore[arg-type]
+        try:
+            series = read_signals(self._files, specs) if specs else {}
+        except OverBudget:
+            raise
+        except GroundedError:
+            series = _one_by_one(self._files, specs)
+        for path, one in series.items():
+            try:
+                found = tidy(path, one, unwrap="@rpy" in path)
+            except GroundedError:
+                continue
+            self.found[path] = _unwound(found) if path in self._angles else found
+        self._missing |= {*more} - self.found.keys()
+
+    def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
+        """Interpolate signals on a common grid.
+
+        Returns:
+            Its step [s] and one column per path; None if the signals don't overlap.
+        """
+        self.read(paths)
+        if not all(path in self.found and len(self.found[path].t) > ROWS for path in paths):
+            return None
+        samples = [self.found[path] for path in paths]
+        start, stop = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
+        step = max(s.interval for s in samples)
+        step = max(step, (stop - start) * 1e-9 / LONGEST)
+        t = np.arange(start, stop, round(step * 1e9), dtype=np.int64)
+        if len(t) < ROWS:
+            return None
+        at = (t - start) * 1e-9
+        return step, [np.interp(at, (s.t - start) * 1e-9, s.y) for s in samples]
+
+    def follows(self, a: str, b: str) -> Follows:
+        """Return how b follows the derivative of a, as logged; a correlation of 0 if unknown."""
+        gridded = self.grid((a, b)) if a != b else None
+        if gridded is None:
+            return Follows(0.0, 1.0)
+        step, (q, w) = gridded
+        return follows(q, w, step)
+
+    def rates(self, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
+        """Return the same as `rates_among`."""
+        self.read(paths)
+        found = []
+        for a, b in permutations(paths, 2):
+            like = self.follows(a, b)
+            power = 10.0 ** round(np.log10(max(like.slope, 1e-9)))
+            if like.correlation > SURELY and abs(like.slope / power - 1) < SAME:
+                found.append((like.correlation, a, b, 1 / power))
+        pairs: dict[str, tuple[str, float]] = {}
+        for _, a, b, times in sorted(found, reverse=True):
+            if not {one for q, (w, _) in pairs.items() for one in (q, w)} & {a, b}:
+                pairs[a] = (b, times)
+        return pairs
+
+
+def _unwound(angle: Samples) -> Samples:
+    """Unwrap an angle that jumps by a full turn, in radians or degrees."""
+    jump, width = np.abs(np.diff(angle.y)).max(initial=0.0), np.ptp(angle.y)
+    turns = [turn for turn in (2 * np.pi, 360.0) if 0.9 * turn < jump <= width < 1.02 * turn]
+    return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle
+
+
+def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
+    found: dict[str, Series] = {}
+    for path, spec in specs.items():
+        try:
+            found |= read_signals(files, {path: spec})
+        except GroundedError:
+            continue
+    return found
