@@ -263,6 +263,8 @@ def _read(kind: Any, value: Any) -> Any:
         return {str(key): _read(of[1], item) for key, item in (value or {}).items()}
     if issubclass(kind, Document):
         return kind(**_given(kind, {} if value is None else dict(value)))
+    if reads := getattr(kind, "from_json", None):
+        return reads(value)
     return kind() if value is None else kind(value)  # str, int, bool
 
 
@@ -285,7 +287,7 @@ def plain(value: Any) -> Any:
         value: nested mappings, sequences, arrays, numbers, strings; anything else becomes its
             `str`.
     """
-    if isinstance(value, Result):
+    if hasattr(value, "to_json"):
         return value.to_json()
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

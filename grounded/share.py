@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.findings import Finding, found
 from grounded.trial import Trial
 
 STEPS, TRIALS = 100_000, 100  # control steps of all trials together, and trials, at most
@@ -20,10 +21,10 @@ STEPS, TRIALS = 100_000, 100  # control steps of all trials together, and trials
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """The trials that are used, and a sentence that says which these are; "" for all."""
+    """The trials that are used, and the finding that says which these are; None for all."""
 
     trials: list[Any]
-    sentence: str
+    finding: Finding | None = None
 
 
 def share_of(trials: Sequence[Trial], steps: int = STEPS, most: int = TRIALS) -> Share:
@@ -39,18 +40,14 @@ def share_of(trials: Sequence[Trial], steps: int = STEPS, most: int = TRIALS) ->
     """
     total = sum(trial.steps for trial in trials)
     if total <= steps and len(trials) <= most:
-        return Share([*trials], "")
+        return Share([*trials])
     cut = [trial.until(steps) for trial in trials]
     length = np.array([trial.steps for trial in cut])
     for count in range(min(len(cut), most), 0, -1):
         chosen = np.unique(np.linspace(0, len(cut) - 1, count).astype(int))
         if (used := int(length[chosen].sum())) <= steps:
             break
-    which = f"{len(chosen)} of {len(cut)} trials, at equal distances" * (len(chosen) < len(cut))
-    first = "the first steps" + " of each longer one" * bool(which)
-    which = ", ".join(filter(None, [which, first * any(t.steps > steps for t in trials)]))
-    return Share(
-        [cut[i] for i in chosen],
-        f"of {total:,} steps {used:,} were used, as many as are looked at together: {which}. "
-        "Name some with --trials to use others",
-    )
+    kept = len(chosen) if len(chosen) < len(cut) else None
+    first = any(trial.steps > steps for trial in trials)
+    told = found("model.share", used=used, total=total, kept=kept, trials=len(cut), first=first)
+    return Share([cut[i] for i in chosen], told)

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.errors import GroundedError
+from grounded.findings import Weight
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, chosen_trials, parallel
 from grounded_cli.console.terminal import (
     field,
-    lines,
     names_in,
-    number,
     remark,
     show,
     show_json,
@@ -24,14 +23,12 @@ from grounded_cli.console.terminal import (
     tinted,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import percent, with_unit
+from grounded_trials.wording import percent
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.engine import Engine
-
-REGIONS = 3  # named in the details
 
 
 @click.command("diagnose")
@@ -56,7 +53,7 @@ REGIONS = 3  # named in the details
 @partial(parallel, by_itself=True)
 @click.option("--instruments", is_flag=True, help="Check the sensors only; takes some seconds.")
 @click.option(
-    "--details", is_flag=True, help="Also rival effects, whole trials, look-alikes, utilities."
+    "--details", is_flag=True, help="Also all findings, errors, rival effects and places."
 )
 @in_workspace
 @as_json
@@ -112,9 +109,7 @@ def command(
     if json_:
         show_json(found.to_json())
     else:
-        model = workspace.base_model
-        nominal = {name: param.value for name, param in model.params.items()}
-        _show(found, nominal, model.inputs, details=details)
+        _show(found, workspace.base_model.inputs, details=details)
         show("\n" + field("next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent
@@ -124,42 +119,32 @@ def command(
         show(f"\n{next_line(found.then)}")
 
 
-def _show(
-    found: Diagnosis, nominal: dict[str, float], inputs: Collection[str] = (), *, details: bool
-) -> None:
+def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
-    from grounded.diagnosis.tables import error_table
-    from grounded_trials.report.diagnosis_notes import caveats, held_out, pattern_line
-    from grounded_trials.report.diagnosis_words import (
-        agreement_lines,
-        correction_line,
-        error_lines,
-        in_vain,
-    )
+    from grounded.diagnosis.tables import effect_table, error_table
+    from grounded.diagnosis.telling import FINDINGS, sentence, told
 
-    show(_verdict(found))
+    said, kind = told(found), found.kind
+    first, *others = [sentence(one) for one in said.lines]
+    show(field("verdict", f"{kind}: {first}").replace(kind, tinted(kind), 1))
+    for label, text in zip(("errors", "open"), others, strict=False):
+        show(field(label, text))
+    if said.rows:
+        show("\n" + table(said.rows, said.header) + "\n")
     _instruments(found.preflight, inputs)
-    for text in caveats(found):
-        show(field("caveats", text))
-    if found.prediction_error:
-        rows, header = error_table(found, whole_trials=details)
-        show("\n" + table(rows, header))
-        adopted = "model.py: without what was adopted; now: with it; " * ("now" in header)
-        _note(f"{adopted}open loop, {held_out(found)}")
-    if not found.no_cause:
-        _effects(found, details=details)
-    _places(found, details=details)
-    if details:
-        for title, text in error_lines(found, nominal):
-            show(field(title, text))
-        for text in in_vain(found):
-            show(field("dropped", text))
-        if text := pattern_line(found):
-            show(field("pattern", text))
-    if found.correction is not None and (details or found.correction.adoptable):
-        show(field("correction", correction_line(found.correction)))
-    for title, text in agreement_lines(found):
-        show(field(title, text))
+    kept = said.findings if details else said.findings[:FINDINGS]
+    for one in kept:
+        show(field("note" if one.weight is Weight.NOTE else "warning", one.sentence))
+    if more := len(said.findings) - len(kept):
+        show(field("", f"{more} more with --details"))
+    if details and not found.no_cause:
+        for rows, header in (error_table(found), effect_table(found)):
+            if rows:
+                show("\n" + table(rows, header))
+        places = [(c.name, percent(c.share)) for c in found.where.channels if c.share > 0]
+        places += [(f"where {r.told}", percent(r.share)) for r in found.where.regions]
+        if places:
+            show("\n" + table(places, ("one-step errors beyond the noise", "share")))
 
 
 def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
@@ -181,59 +166,3 @@ def _unheld(alone: Sequence[str], odd: bool) -> None:
         show(field("unchecked", f"{text} were not checked"))
     if not odd:
         show("no fault found in the sensors" + " by themselves" * bool(alone))
-
-
-def _note(text: str) -> None:
-    """Print what the columns of a table mean."""
-    show("\n".join(lines(text, "  ", "  ")))
-
-
-def _verdict(found: Diagnosis) -> str:
-    """Return the kind of verdict, then a line per cause and sentence."""
-    from grounded_trials.report.diagnosis_words import verdict_lines
-
-    causes, others = verdict_lines(found)
-    shown = [field("verdict", found.kind).replace(found.kind, tinted(found.kind), 1)]
-    for line in (*(f"- {cause}" for cause in causes), *others):
-        shown += lines(line, "  ", "    ")
-    return "\n".join(shown)
-
-
-def _places(found: Diagnosis, *, details: bool) -> None:
-    """Print where the gap lies: a line, or with `details` a table of channels and regions."""
-    from grounded.diagnosis.error_report import furthest
-    from grounded_trials.report.diagnosis_notes import LEAST_SHARE, regions, where_line
-
-    if not (line := where_line(found)):
-        return
-    if not details:
-        return show("\n" + field("where", line))
-    channels = [c for c in found.where.channels if c.share >= LEAST_SHARE]
-    rows = [(c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit)) for c in channels]
-    show("\n" + table(rows, ("where", "share of the gap", "rms")))
-    row = furthest(found.prediction_error)
-    ahead = f" {row.horizon_s:.3g} s ahead" if row else ""
-    _note(
-        "share: of the squared one-step errors beyond the noise; rms: of the predictions of the "
-        f"model before this diagnosis{ahead}"
-    )
-    for text in regions(found, REGIONS):
-        show(field("", text))
-
-
-def _effects(found: Diagnosis, *, details: bool) -> None:
-    """Print the claimed effects and what ties with them, or with `details` all rivals."""
-    from grounded.diagnosis.tables import WITHOUT, effect_table, of_delays, of_rivals
-    from grounded_trials.report.diagnosis_notes import deviations
-
-    rows, header = effect_table(found, rivals=details)
-    tied = " (a tied effect: in place of the claimed one)" * bool(found.indistinguishable)
-    if rows:
-        show("\n" + table(rows, header))
-        _note(
-            f"{WITHOUT}; evidence: log-likelihood lost without it"
-            + tied
-            + f"; {of_rivals(found)}" * ("alone [nats]" in header)
-            + f"; {deviations(found)}"
-            + (f"; {rows_apart}" if (rows_apart := of_delays(found)) else "")
-        )

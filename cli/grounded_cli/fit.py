@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,29 +15,24 @@ from grounded_cli.console.terminal import (
     lines,
     names_in,
     number,
-    remark,
     show,
     show_json,
     stages,
     table,
+    tell,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import count, or_zero, shown
+from grounded_trials.wording import or_zero, shown
 
 if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.fit import Fit
     from grounded.fit.result import FittedValue
     from grounded.model import Model
-    from grounded_trials.workspace.fitting import Fitted
 
-STANDS_IN = (
-    "fitted parameters can also compensate for effects that the equations lack (a mass for a "
-    "friction): `grounded diagnose` separates the two, on the same trials"
-)
 HELD_OUT = (
     "rms, open loop, of each group of trials (or piece of a single log), predicted with values "
-    "from the others, as `grounded diagnose` does"
+    "from the others"
 )
 
 
@@ -72,9 +66,9 @@ def command(
         raise GroundedError(
             "--params names no parameter: expected names such as a1,L; omit it to fit all"
         )
-    with stages() as tell:
+    with stages() as stage:
         done = workspace.fit(
-            names, trials=trials, latency=latency, apply=apply_, engine=engine, progress=tell
+            names, trials=trials, latency=latency, apply=apply_, engine=engine, progress=stage
         )
     if json_:
         show_json(done.to_json())
@@ -84,59 +78,17 @@ def command(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
-    if told := _unknown_times(done):
-        show("\n".join(lines(told, "  ", "  ")))
-    if found.at_bounds:
-        show("\n".join(lines(_stopped(found.at_bounds), "  ", "  ")))
-    if done.not_fitted:
-        show("\n".join(lines(_not_fitted(done.not_fitted), "  ", "  ")))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
-    of = f" of {listed(done.trials)}" * bool(trials)
-    remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}{of}")
+    tell(done.findings)
     if apply_:
         show("\nwritten to grounded.toml [model] params")
     elif found.helps:
-        remark("note", STANDS_IN)
         show("\nto write the values to grounded.toml, add --apply")
     else:
         show("\nnothing was written: these values don't clearly reduce the held-out errors")
     show(next_line(done.then))
-
-
-def _not_fitted(delays: Sequence[str]) -> str:
-    """Say that the intervals take adopted delays as exact, and what estimates these too."""
-    return (
-        f"{listed(delays)} kept {'its' if len(delays) == 1 else 'their'} d, which the intervals "
-        "take as exact: they are too narrow; `grounded fit --latency` fits one delay of all inputs "
-        "in its place"
-    )
-
-
-def _unknown_times(done: Fitted) -> str:
-    """Say why intervals of times are as wide as they are; "" if it is by the data alone."""
-    why = list[str]()
-    if done.rows_s:
-        rows = f"the {done.rows_s:.3g} s between rows of the log"
-        why.append(f"{rows}, which do not say when in between a command was sent")
-    from grounded.diagnosis.tables import in_between
-
-    text = f"interval of a delay, to each side: {'; '.join(why)}" if why else ""
-    if done.interpolated_s:
-        text += "; " * bool(text)
-        text += f"std of delays and time constants: {in_between(done.interpolated_s)}"
-    return text
-
-
-def _stopped(names: Sequence[str]) -> str:
-    """Say what parameters at their bounds mean for the others."""
-    many = len(names) > 1
-    return (
-        f"{listed(names)} stopped at {'their bounds' if many else 'its bound'}, and the trials ask "
-        "for more, so the other intervals say little: the model lacks something, which "
-        "`grounded diagnose` looks for, or the bounds in the model file are too narrow"
-    )
 
 
 def _parameters(found: Fit) -> str:

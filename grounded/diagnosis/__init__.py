@@ -5,8 +5,9 @@ Read `diagnose` first; its docstring lists the stages. `report` holds the result
     likelihood/    likelihood of the trials under a hypothesis and its noise
     hypotheses/    search for the effects: hypotheses are made, fitted and compared
     validation/    held-out prediction errors in units, and the decision what is claimed
+    writer         the result: facts, `remarks` and `next_step` as findings
+    telling        what is told of it, in lines, a table and findings; takes the words of the catalogue
     excitation     the next trial, which would separate tied effects, from `patterns`
-    verdict        the result in words; `next_trial` says what to run next
-    tables         the result in rows, for terminal, page and notebook
+    tables         errors, compared effects and sensors in rows
     pictures       the result in figures
 """

@@ -15,7 +15,7 @@ agreement         agreement of the trials; changes between two groups of them
 prediction_error  where the gap is, by channel, time and region
 split             explained, unexplained and irreducible parts of the error
 unconfirmed       effects that only few trials show, and where
-verdict           the result in sentences (next_trial); `writer` assembles the `report`
+writer            the facts of the result; remarks and next_step: its findings; telling: its lines
 excitation        the next trial, to separate two explanations that tie
 """
 
@@ -53,12 +53,12 @@ from grounded.diagnosis.validation.limits import (
     without_others,
 )
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import MOST_EFFECTS, interrupted, with_faults
-from grounded.diagnosis.writer import Writer
+from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.effects import Effect, Library, param_name
 from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, type_of
+from grounded.findings import found
 from grounded.frozen import positive, whole_number
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -189,15 +189,18 @@ def diagnose(
             sound.first,
             sound.exact,
             uncertain,
+            looked.findings,
         )
         groups = [k < sound.first for k in range(data.count)]
-        found = written.diagnosis(compared(search, decision.fit, groups) if compare else None)
+        result = written.diagnosis(compared(search, decision.fit, groups) if compare else None)
 
-    said = with_faults(found.verdict, looked.findings)
-    said = interrupted(said) if loop.cut_short else said
-    delays = _sensor_delays(found, data.model, options.but)
+    delays = _sensor_delays(result, data.model, options.but)
     older = late_as_positions(looked.findings, delays, options.but)
-    return replace(found, verdict=said, preflight=(*looked.findings, *older))
+    result = replace(result, preflight=(*result.preflight, *older))
+    if loop.cut_short:
+        again, cut = replace(result.verdict, again=True), found("gap.interrupted")
+        result = replace(result, verdict=again, findings=(*result.findings, cut))
+    return result
 
 
 def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
@@ -251,8 +254,8 @@ def _sound(
         interpolated_s=options.interpolated_s,
     )
     known = limits(data, looked.left_out)
-    told = filter(None, [share.sentence for share in shares])
-    known = replace(known, sentences=(*known.sentences, *copies, *more, *told))
+    told = filter(None, [share.finding for share in shares])
+    known = replace(known, findings=(*known.findings, *copies, *more, *told))
     exact = bool(copies or more) and not (scattered(trials) or scattered(compare))
     return _Sound(data, looked, known, sum(trial.known_steps >= 2 for trial in trials), exact)
 
@@ -349,11 +352,11 @@ class Loop:
         grown(self.search, self.search.chosen(self.most), self.most)
 
 
-def _sensor_delays(found: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:
+def _sensor_delays(result: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:
     """Return the delays of sensors that are part of the model or claimed, by effect [s]."""
     late = [name for name in adopted if name.startswith(SENSOR_DELAY)]
     known = {name: model.params[param_name(name, "d")].value for name in late}
-    for row in found.ranking:
+    for row in result.ranking:
         if row.claimed and row.effect.startswith(SENSOR_DELAY):
             known[row.effect] = known.get(row.effect, 0.0) + row.values["d"]
     return known

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from grounded.result import Document, measured_alike, number, percent, with_unit
+from grounded.result import Document, with_unit
 
 ABOVE = 1.3  # times the noise floor, above which a leftover is stated
 WIDE = 2.0  # times the noise floor, above which a leftover puts claims that gain little in doubt
@@ -58,15 +58,6 @@ class Region(Document):
     def of_time(self) -> bool:
         """Whether it is a part of the run's time, `t > 3.2`, to which no robot can go."""
         return self.when.startswith("t ")
-
-    @property
-    def phrase(self) -> str:
-        """The region in a sentence: `where v > 0.5 m/s`, `after 3.2 s`, `in the first 3.2 s`."""
-        if not self.of_time:
-            return f"where {self.told}"
-        _, sign, level = self.when.split()
-        at = with_unit(level, self.unit)
-        return f"after {at}" if sign == ">" else f"in the first {at}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,15 +251,6 @@ def furthest(rows: Sequence[RulerRow]) -> RulerRow | None:
     return next((row for row in reversed(ahead) if not row.drowned), ahead[0] if ahead else None)
 
 
-def runaway(rows: Sequence[RulerRow]) -> str:
-    """Return a sentence on predictions of whole trials that run away despite the claim, or ""."""
-    whole = next((row for row in rows if row.whole_trial), None)
-    names = () if whole is None else whole.runs_away.get("with_effects", ())
-    if not names:
-        return ""
-    return f"Open-loop predictions of whole trials diverge for {', '.join(names)}."
-
-
 @dataclass(frozen=True, eq=False)
 class Identifiable(Document):
     """How well the trials identify one uncertain parameter, with all others free.
@@ -333,16 +315,6 @@ class Part(Document):
     end: float = field(metadata={"key": "to"})
     share: float
 
-    @property
-    def when(self) -> str:
-        """`t0001, from 0 to 1 s`."""
-        return f"{self.trial or 'the log'}, from {number(self.start)} to {number(self.end)} s"
-
-    @property
-    def phrase(self) -> str:
-        """`87 % of it in t0001, from 0 to 1 s`."""
-        return f"{percent(self.share)} of it in {self.when}"
-
 
 @dataclass(frozen=True, eq=False)
 class Remainder(Document):
@@ -375,28 +347,6 @@ class Remainder(Document):
     def wide(self) -> bool:
         """Whether the error is so far above the floor that what is claimed may stand in for it."""
         return self.error > WIDE * self.floor > 0
-
-    def sentence(self) -> str:
-        """Return it as one clause."""
-        where = "" if self.region is None else f", mostly {self.region.phrase}"
-        where = f", {self.part.phrase}" if self.part else where
-        if not math.isfinite(self.error):
-            return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
-        ahead, name = f"{number(self.horizon_s)} s ahead", self.channel
-        errors, unit = [self.error], self.error_unit
-        if not self.above and math.isfinite(self.size):
-            [off, _] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
-            noise = (
-                "of which noise may be any part"
-                if self.floor_at_most
-                else "which may be noise alone"
-            )
-            return (
-                f"the rate of {name} lacks {number(self.size)} {self.unit} rms{where}: small but "
-                f"lasting, while {ahead} {name} is off by {off}, {noise}"
-            )
-        [off, noise] = beside_noise(errors, self.floor, unit, at_most=self.floor_at_most)
-        return f"{name} is still off by {off} {ahead}{noise}{where}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,18 +384,3 @@ def doubt_of(unsure: float) -> float:
         unsure: standard deviation of the floor's logarithm, `RulerRow.floor_unsure`.
     """
     return max(ABOVE, math.exp(SURE * unsure))
-
-
-def beside_noise(errors: Sequence[float], floor: float, unit: str, *, at_most: bool) -> list[str]:
-    """Return errors as text in one unit, then the noise as `" (noise: 0.1 rad)"`.
-
-    Args:
-        errors: one or more.
-        floor: the error from noise alone; if it is not known, the last text is empty.
-        unit: unit of all of them.
-        at_most: `floor` is an upper bound.
-    """
-    if not 0 < floor < math.inf:
-        return [*measured_alike(errors, unit), ""]
-    *told, noise = measured_alike([*errors, floor], unit)
-    return [*told, f" (noise: {'at most ' * at_most}{noise})"]

@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import value_called
+from grounded.diagnosis.causes import value_called
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
@@ -51,16 +51,15 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Effect, Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.effects.actuator import delay_again
 from grounded.effects.memory import shifted
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
 from grounded.policy import Policy
-from grounded.result import measured_alike
 from grounded.task import Task
 from grounded.trial import Trial
 
 NOTHING = 0.1  # nats below which no trial can separate two effects
-HIDDEN = 0.1  # part of the expected evidence found in the trials, below which something hides it
 REPLAYED = 4  # most recent trials whose commands are used to calibrate the expected evidence
 ADAPTED = 12  # iterations in which a rival is fitted to a run
 TWICE = 0.8  # two runs are asked for if they leave less than this part of what one leaves of `+-`
@@ -73,7 +72,7 @@ LITTLE = 1e-6  # fraction of a value's information, and of its size, that counts
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A policy to run, the evidence expected of it [nats], and a sentence that describes it.
+    """A policy to run, the evidence expected of it [nats], and the next step that runs it.
 
     `about`: the two effects that it separates, or the value whose `+-` it reduces most.
     `little`: whether that is too little to be worth a trial. `std`: the standard deviation of that
@@ -83,7 +82,7 @@ class Probe:
     policy: Policy
     expected: float
     about: tuple[str, ...]
-    sentence: str
+    step: Finding
     little: bool = False
     std: float = np.nan
     runs: int = 1
@@ -156,31 +155,14 @@ def probe(
         return None
     most, chosen, words = best
     expected = trust * most
-    if most < NOTHING:
-        text = (
-            f"None of the runs that were tried would distinguish {group[0]} from {group[1]}: with "
-            "the other values refitted, both predict the same"
-        )
-        claimed = next((name for name in group[:2] if name in diagnosis.effects), "")
-        if claimed and not diagnosis.contested:
-            text += f", so adopt the claimed one, {claimed}"
-        return Probe(chosen, expected, (group[0], group[1]), text, little=True)
-    if expected < NATS <= most and trust < HIDDEN:
-        text = (
-            f"No probe is sure to distinguish {group[0]} from {group[1]}: by the model, the trials "
-            "so far should have done so, but the rest that it lacks hides the difference"
-        )
-        return Probe(chosen, expected, (group[0], group[1]), text, little=True)
-    gain = f"{expected:,.{int(expected < 100)}f} nats"
-    tells = f"expected to distinguish {group[0]} from {group[1]} by {gain}"
-    if little := expected < NATS:
-        tells = (
-            "no candidate inside the limits is informative enough: the most informative, "
-            f"{words}, is {tells} ({NATS:g} needed); record larger inputs or another manoeuvre"
-        )
-    else:
-        tells = f"{words}: {tells}"
-    return Probe(chosen, expected, (group[0], group[1]), tells, little)
+    pair = {"effect": group[0], "others": group[1]}
+    if expected >= NATS:
+        step = found("gap.next.probe", *group[:2], nats=expected, probe=words, **pair)
+        return Probe(chosen, expected, (group[0], group[1]), step)
+    claimed = next((name for name in group[:2] if name in diagnosis.effects), None)
+    claimed = claimed if most < NOTHING and not diagnosis.contested else None
+    step = found("gap.next.no_probe", *group[:2], claimed=claimed, **pair)
+    return Probe(chosen, expected, (group[0], group[1]), step, little=True)
 
 
 def _teaching(
@@ -239,27 +221,17 @@ def _teaching(
     name = list(spreads)[k]
     of = data.model.params[name].unit if name in sizes else spreads[name].unit
     now = float(spreads[name].std)
-    then, little = now * shrunk, False
-    ends = [f"+- {text}" for text in measured_alike((then, now), of)]
-    about = "perhaps to about" if shrunk == MOST else "to"
-    made = diagnosis.made or Made()
-    called = value_called(name, made.effects)
-    tells = f"would determine {called} {about} {ends[0]} (now {ends[1]})"
-    sentence = f"{words}{', run twice,' if again else ':'} {tells}"
-    if diagnosis.motions == 1 < len(trials) and words != BASE:
-        sentence = f"{words}: would show whether {called}, so far from one motion, holds in another"
-    elif shrunk > 1 - TEACHES:
-        same = "as now" if ends[0] == ends[1] else f"now {ends[1]}"
-        way = f"{words}{', run twice' * again}"
-        sentence = (
-            f"no candidate inside the limits teaches much: the one that would teach most is {way}, "
-            f"and with its log {called} would be known to {ends[0]} ({same})"
-        )
-        little = True
-    elif well[k]:
-        sentence = f"the value that a probe would tell most about, {called}, is well known already"
-        little = True
-    return Probe(chosen, gain, (name,), sentence, little, then, 1 + again)
+    then, called = now * shrunk, value_called(name, (diagnosis.made or Made()).effects)
+    motion = diagnosis.motions == 1 < len(trials) and words != BASE
+    little = not motion and (shrunk > 1 - TEACHES or bool(well[k]))
+    step = found("gap.next.no_probe", name, value=called)
+    if motion:
+        step = found("gap.next.probe", name, probe=words, motion=True)
+    elif not little:
+        ends = {"then": Quantity(then, of), "now": Quantity(now, of)}
+        twice_run = 2 if again else None
+        step = found("gap.next.probe", name, probe=words, value=called, runs=twice_run, **ends)
+    return Probe(chosen, gain, (name,), step, little, then, 1 + again)
 
 
 def _left(groups: Array, J: Array, prior: Array, stated: Array, misfit: float) -> tuple[Array, ...]:

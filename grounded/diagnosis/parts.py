@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
 
-from grounded.accounts.finding import Finding, late_effects
+from grounded.accounts.finding import Finding as Fault
+from grounded.accounts.finding import late_effects
 from grounded.diagnosis.error_report import (
     BRIEF,
     Combination,
@@ -26,40 +27,33 @@ from grounded.diagnosis.error_report import (
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.ruler_words import objection
+from grounded.diagnosis.errors_told import objection
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import Document, number
+from grounded.findings import Finding
+from grounded.result import Document, figure, number, or_zero, seen, spread, with_unit
 
 Kind = Literal["effect", "several", "none", "unknown"]
+LARGE, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
+NEXT = "gap.next."  # before the codes of next steps
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Document):
-    """The verdict: its kind, the effects that it claims, and sentences that explain them.
+    """The verdict: its kind, and the effects that it claims.
 
-    `sentences` has one entry per line, `sentence` joins them. One is made of `clauses`, one per
-    cause in the order of `Diagnosis.credit`, or per group of `causes`; before it is `comparison`,
-    of two groups of trials. `parameters` are off. `look_for`: number of effects that a
-    deeper diagnosis may name, or 0. `again`: whether to diagnose again once these effects, as many
-    as can be named, are adopted. `limit`: why no cause is named, an entry of `unknowable`.
+    `causes` has the words of each entry of `Diagnosis.credit`. `parameters` are off. `look_for`:
+    number of effects that a deeper diagnosis may name, or 0. `again`: whether to diagnose again
+    once these effects, as many as can be named, are adopted. `limit`: the code of the finding for
+    which no cause is named.
     """
 
     kind: str  # one of `Kind`
     effects: tuple[str, ...] = ()
-    sentence: str = ""
     causes: tuple[str, ...] = ()
-    sentences: tuple[str, ...] = ()
-    clauses: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     look_for: int = 0
     again: bool = field(metadata=BRIEF, default=False)
     limit: str = field(metadata=BRIEF, default="")
-    comparison: str = field(metadata=BRIEF, default="")
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """The sentences; in older documents, all of them as one."""
-        return self.sentences or (self.sentence or self.kind,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +65,19 @@ class Estimate(Document):
     interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
     unit: str = ""
     stopped: str = field(metadata=BRIEF, default="")  # the bound that it reached (`Param`)
+
+    @property
+    def text(self) -> str:
+        """The value with as many digits as its +- supports: `1.5763 +- 0.0012 N/V`."""
+        value, std = self.value, self.std
+        if not (0 < std < math.inf and math.isfinite(value)) or or_zero(std, value) == 0:
+            return with_unit(number(value), self.unit)
+        value = seen(value, std)
+        places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
+        digits = min(max(places, 3), MOST_DIGITS)
+        large = abs(value) >= LARGE  # a few digits would give it a power of ten
+        shown = figure(value, digits) if large else f"{value:#.{digits}g}".rstrip(".")
+        return with_unit(f"{shown if value else 0} +- {spread(std)}", self.unit)
 
     def moved(self, by: float) -> Estimate:
         """Return the estimate shifted by a constant."""
@@ -117,7 +124,6 @@ class Unconfirmed(Document):
     """
 
     effect: str
-    meaning: str = ""
     params: Mapping[str, Estimate] = field(default_factory=dict)
     evidence: float = math.nan  # [nats]
     trial: str = ""
@@ -127,21 +133,6 @@ class Unconfirmed(Document):
     region: Region | None = None
     repeats: bool = False
     trials: tuple[str, ...] = field(metadata=BRIEF, default=())
-
-    def sentence(self) -> str:
-        """Return it as one clause."""
-        few, all_ = self.seen
-        if self.repeats:
-            made = f"{few} of {all_}" if few < all_ else f"all {all_}"
-            rest = f"or anything else that repeats with the motion of {made} trials"
-            return f"unconfirmed: {self.meaning}, {rest}"
-        place = self.region if self.region and not self.region.of_time else None
-        where = f", mostly {place.phrase}" if place else ""
-        start, end = number(self.start), number(self.end)
-        when = (
-            f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"
-        )
-        return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,15 +249,13 @@ class Diagnosed(Document):
     leftover: tuple[Remainder, ...] = ()
     unconfirmed: tuple[Unconfirmed, ...] = ()  # likely effects that are not claimed
     correction: Correction | None = None  # if there is a leftover
-    next_trial: str = ""
-    unknowable: tuple[str, ...] = ()  # what these trials can't identify
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
     identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
     combinations: tuple[Combination, ...] = ()  # values that show only in combination
     prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
     credit: tuple[Credit, ...] = ()  # largest first
-    preflight: tuple[Finding, ...] = ()  # of the sensors, before any physics
+    preflight: tuple[Fault, ...] = ()  # of the sensors, before any physics
     per_trial: tuple[TrialValue, ...] = ()
     agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
@@ -279,6 +268,8 @@ class Diagnosed(Document):
     steps: int = 0
     candidates: int = 0
     made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
+    tracked: tuple[str, ...] = ()  # states that the task follows, the most important first
+    findings: tuple[Finding, ...] = ()  # what is told of it, and the next trial
     probe: str = field(metadata=BRIEF, default="")  # candidate that separates tied explanations
     then: NextCommand | None = field(metadata={"key": ""}, default=None)  # next command
 
@@ -308,24 +299,25 @@ class Diagnosed(Document):
         return {n: self.values(n) for n in self.acting or self.effects if n in own}
 
     @property
-    def sentence(self) -> str:
-        """The verdict in words."""
-        return self.verdict.sentence
-
-    @property
     def contested(self) -> bool:
         """Whether the claim should not be adopted, see `objection`."""
-        return bool(self.objection)
+        ties = [group for group in self.indistinguishable if group not in self.equivalent]
+        rows, left = self.prediction_error, self.leftover
+        return objection(rows, self.agreement, self.effects, ties, left) is not None
 
     @property
-    def objection(self) -> str:
-        """Why the claim should not be adopted; "" if it may be."""
-        ties = [group for group in self.indistinguishable if group not in self.equivalent]
-        return objection(self.prediction_error, self.agreement, self.effects, ties, self.leftover)
+    def next_trial(self) -> str:
+        """What to run next, in words; "" in a document of an older version."""
+        return next((one.sentence for one in self.findings if one.code.startswith(NEXT)), "")
+
+    def asking(self, step: Finding, probe: str = "") -> Self:
+        """Return the diagnosis with another next step, and the candidate that it runs."""
+        kept = (one for one in self.findings if not one.code.startswith(NEXT))
+        return replace(self, findings=(*kept, step), probe=probe)
 
     @property
     def no_cause(self) -> bool:
-        """Whether the data are insufficient to name any cause; figures are meaningless then."""
+        """Whether the data are insufficient to name any cause; figures mean nothing then."""
         return bool(self.verdict.limit)
 
     def ranked(self, effect: str) -> Ranked | None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import called
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
@@ -34,7 +33,7 @@ def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tupl
                 unit = model.inputs[name]
                 of = f"{size * room:.2g} {unit}" if unit != "1" else f"{size * room:.2g}{limits}"
                 made = replace(policy, feedforward=feedforward)
-                yield f"{OWN} with {words} of {of} added to {called(model, name)}", made
+                yield f"{OWN} with {words} of {of} added to {name}", made
 
 
 def patterns(t: Any) -> list[tuple[str, Array]]:

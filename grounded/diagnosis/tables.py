@@ -1,24 +1,20 @@
-"""A diagnosis in rows and lines, shared by terminal, page and notebook."""
+"""A diagnosis in rows: prediction errors, compared effects, faults of the sensors."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from html import escape
 
 from grounded.accounts.finding import Finding
-from grounded.diagnosis.cause_words import OWN, give_or_take, times_of
-from grounded.diagnosis.error_report import CALIBRATION, TIMES, RulerRow, furthest
+from grounded.diagnosis.error_report import RulerRow, furthest
+from grounded.diagnosis.errors_told import telling
 from grounded.diagnosis.parts import Diagnosed, Estimate, Ranked
-from grounded.diagnosis.ruler_words import told_row
-from grounded.result import figure, html_table, or_zero, percent, shown, with_unit
+from grounded.result import figure, or_zero, percent, shown
 
 Cells = tuple[str, ...]
 WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
 UNBOUNDED = 1e6
 INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
-WITHOUT = "without: how much larger errors are without it, in the mean over states and horizons"
-EFFECTS = 8  # rows of the table of effects, more if more are claimed or tied
 
 
 def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
@@ -27,52 +23,31 @@ def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[lis
     Args:
         diagnosis: the result.
         whole_trials: whether to add the errors over whole trials to those a horizon ahead. They
-            are added in any case if the sentence gives them.
+            are added in any case if these are told.
     """
-    told = told_row(diagnosis.prediction_error)
-    whole_trials = whole_trials or (told is not None and told.whole_trial)
-    ahead = [row for row in [furthest(diagnosis.prediction_error)] if row]
-    whole = [row for row in diagnosis.prediction_error if row.whole_trial]
-    columns = {
-        "outset": "model.py",
-        "crude": "crude",
-        "calibrated": "calibrated",
-        "with_effects": "as diagnosed",
-        "noise_floor": "noise",
-    }
-    if any(row.outset for row in ahead):
-        columns["crude"] = "now"
-    if any(row.floor_bound for row in ahead):
-        columns["noise_floor"] = "noise, at most"
-    few = diagnosis.no_cause  # values of one short log say nothing of another
-    for key in ("outset", "calibrated"):
-        if not any(getattr(row, key) for row in ahead) or (few and key == "calibrated"):
-            del columns[key]
-    told_rows = (*ahead, *(whole if whole_trials or not ahead else ()))
-
-    def repeats_crude(key: str) -> bool:
-        pairs = (
-            (_cell(row, "crude", name), _cell(row, key, name))
-            for row in told_rows
-            for name in row.unit_by_channel
-        )
-        return all(now == then for now, then in pairs)
-
-    if "calibrated" in columns and repeats_crude("calibrated"):  # no other parameters were likelier
+    rows_of = diagnosis.prediction_error
+    row = telling(rows_of)
+    ahead = [one for one in [furthest(rows_of)] if one]
+    whole = [one for one in rows_of if one.whole_trial]
+    if not (whole_trials or not ahead or (row is not None and row.whole_trial)):
+        whole = []
+    shown_rows = (*ahead, *whole)
+    columns = {"crude": "crude", "calibrated": "calibrated", "with_effects": "as diagnosed"}
+    if any(one.outset for one in ahead):
+        columns = {"outset": "model.py"} | columns | {"crude": "now"}
+    if diagnosis.no_cause or not diagnosis.verdict.causes:  # what was fitted is no finding
+        columns = {k: v for k, v in columns.items() if k in ("outset", "crude")}
+    elif not any(one.calibrated for one in ahead):
         del columns["calibrated"]
-    nothing_claimed = not diagnosis.verdict.causes and repeats_crude("with_effects")
-    if few or nothing_claimed:
-        del columns["with_effects"]
+    columns["noise_floor"] = "noise" + ", at most" * any(one.floor_bound for one in ahead)
     rows: list[Cells] = []
-    for row in told_rows:
-        when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
-        for name, unit in row.unit_by_channel.items():
-            if math.isnan(row.crude.get(name, math.nan)):
-                continue  # the state has no sensor
-            if not any(getattr(row, key).get(name) for key in columns):
-                continue  # it never moved
-            figures = (_cell(row, key, name) for key in columns)
-            rows.append((f"{name}, {when}", *figures, shown(unit)))
+    for one in shown_rows:
+        when = "whole trial" if one.whole_trial else f"{one.horizon_s:.3g} s ahead"
+        for name, unit in one.unit_by_channel.items():
+            known = not math.isnan(one.crude.get(name, math.nan))  # else it has no sensor
+            if known and any(getattr(one, key).get(name) for key in columns):  # else it never moved
+                figures = (_cell(one, key, name) for key in columns)
+                rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
 
 
@@ -83,16 +58,13 @@ def _cell(row: RulerRow, column: str, name: str) -> str:
     return figure(value, 3) if math.isfinite(value) else "-"
 
 
-def credit_of(diagnosis: Diagnosed, effect: str) -> str:
-    """Return how much larger errors are without a cause, `+7 %` or `2.4 times`; "" if unknown."""
-    return next((larger(c.times) for c in diagnosis.credit if c.of == effect), "")
-
-
 def larger(times: float) -> str:
     """Return `+7 %`, or `2.4 times` from a factor of 2 on; "" for NaN."""
     if math.isnan(times):  # a document of an older version
         return ""
-    return f"+{percent(times - 1)}" if times < 2 else times_of(times)
+    if times < 2:
+        return f"+{percent(times - 1)}"
+    return f"{float(f'{times:.2g}'):,g} times"
 
 
 def instrument_lines(findings: Iterable[Finding]) -> list[str]:
@@ -124,75 +96,22 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     return lines
 
 
-def effect_table(diagnosis: Diagnosed, *, rivals: bool = True) -> tuple[list[Cells], Cells]:
+def effect_table(diagnosis: Diagnosed) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the effects that were compared, the claimed ones first.
 
-    Every claimed effect and every tied one has a row; rivals fill the table up to EFFECTS rows. The
-    evidence of a rival is what it gains alone, so it has a column of its own.
-
-    Args:
-        diagnosis: the result.
-        rivals: whether to list effects that are neither claimed nor tied with a claimed one.
+    Evidence is what is lost without an effect that is claimed or tied; `alone` is what another one
+    gains in place of all claimed ones.
     """
     beside = weighed_beside(diagnosis)
-    own = [r for r in diagnosis.ranking if r.effect in beside]
-    others = [r for r in diagnosis.ranking if r.effect not in beside] if rivals else []
-    others = others[: max(EFFECTS - len(own), 0)]
-    columns = 2 if others else 1  # of evidence
     rows: list[Cells] = [
         (
             ("* " if r.claimed else "  ") + r.effect,
-            credit_of(diagnosis, r.effect),
-            *((_evidence(r), "") if r in own else ("", _evidence(r)))[:columns],
+            *((_evidence(r), "") if r.effect in beside else ("", _evidence(r))),
             values_of(r),
         )
-        for r in (*own, *others)
+        for r in diagnosis.ranking
     ]
-    if rows and (share := credit_of(diagnosis, CALIBRATION)):
-        blank = ("", "")[:columns]
-        rows.insert(0, ("  (calibration)", share, *blank, OWN))
-    evidence = ("evidence [nats]", "alone [nats]")[:columns]
-    return rows, ("effect (*: claimed)", "without", *evidence, "value")
-
-
-def of_rivals(diagnosis: Diagnosed) -> str:
-    """Say what the evidence of an effect that was not claimed means; "" if there is none."""
-    beside = weighed_beside(diagnosis)
-    if all(row.effect in beside for row in diagnosis.ranking):
-        return ""
-    text = "log-likelihood less that of the likeliest model without effects; negative where "
-    text += "parameters alone explain more"
-    if not any(row.claimed for row in diagnosis.ranking):
-        return f"alone: its {text}"
-    return f"alone: in place of what is claimed, its {text}; beside that, it gains too little"
-
-
-def of_delays(diagnosis: Diagnosed) -> str:
-    """Say where the +- of times comes from, if it is not from the noise.
-
-    The rows of a log may not tell when a command was sent, and states may be interpolated. "" if
-    neither is so, or if no such time is claimed.
-    """
-    made, why = diagnosis.made, list[str]()
-    claimed = [row.effect.partition(":")[0] for row in diagnosis.ranking if row.claimed]
-    if made is None:
-        return ""
-    if made.rows_s and "delay" in claimed:
-        why.append(
-            f"+- of a delay: mostly half of the {made.rows_s:.3g} s between rows of the log, which "
-            "do not say when in between a command was sent"
-        )
-    if made.interpolated_s and (TIMES.keys() & claimed or credit_of(diagnosis, CALIBRATION)):
-        why.append(f"+- of times: {in_between(made.interpolated_s)}")
-    return "; ".join(why)
-
-
-def in_between(seconds: float) -> str:
-    """Say by how much times are uncertain since states were interpolated."""
-    return (
-        f"at least {1e3 * seconds:.2g} ms, since states were interpolated between the samples of "
-        "the log, where a response may begin early"
-    )
+    return rows, ("effect (*: claimed)", "evidence [nats]", "alone [nats]", "value")
 
 
 def weighed_beside(diagnosis: Diagnosed) -> set[str]:
@@ -211,16 +130,8 @@ def _evidence(row: Ranked) -> str:
 
 def values_of(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
-    unknown = {
-        name
-        for name, e in row.params.items()
-        if math.isfinite(e.std) and undetermined(INTERVAL * e.std, e.value)
-    }
-    if unknown and unknown == set(row.params):
-        return "its values are not determined"
     return ", ".join(
-        f"{name} is not determined" if name in unknown else f"{name} = {_value(e)}"
-        for name, e in row.params.items()
+        f"{name} = {'unknown' if _unknown(e) else e.text}" for name, e in row.params.items()
     )
 
 
@@ -229,28 +140,5 @@ def undetermined(width: float, value: float) -> bool:
     return width > max(WIDEST * abs(value), UNBOUNDED)
 
 
-def _value(e: Estimate) -> str:
-    if not math.isfinite(e.std):
-        return with_unit(f"{figure(e.value, 3)} (any value fits)", e.unit)
-    return give_or_take(e) if e.std else with_unit(figure(e.value, 3), e.unit)
-
-
-def as_html(diagnosis: Diagnosed, everything: str) -> str:
-    """Return HTML for a notebook: verdict, sensors, errors and effects; the rest is folded.
-
-    Args:
-        diagnosis: the result; `.plot()` draws it.
-        everything: the whole document as HTML.
-    """
-    said = "".join(f"<p>{escape(line)}</p>" for line in diagnosis.verdict.lines)
-    parts = [f"<b>{escape(diagnosis.kind)}</b>{said}"]
-    if sensors := instrument_lines(diagnosis.preflight):
-        parts.append(f"<b>Sensors</b><ul>{''.join(f'<li>{escape(s)}</li>' for s in sensors)}</ul>")
-    if diagnosis.prediction_error and not diagnosis.no_cause:
-        parts.append(html_table(*error_table(diagnosis)))
-    if diagnosis.ranking and not diagnosis.no_cause:
-        parts.append(html_table(*effect_table(diagnosis)))
-    if diagnosis.next_trial:
-        parts.append(f"<p><b>Next trial</b>: {escape(diagnosis.next_trial)}</p>")
-    parts.append(f"<details><summary>The whole document</summary>{everything}</details>")
-    return "".join(parts)
+def _unknown(e: Estimate) -> bool:
+    return e.std == math.inf or undetermined(INTERVAL * e.std, e.value)

@@ -8,47 +8,48 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.cause_words import acts_reversed, sign_only
+from grounded.accounts.finding import Finding as Fault
+from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
+    AT_MOST,
     Change,
     ChannelShare,
+    Credit,
     Gap,
     Identifiable,
+    Remainder,
     RulerRow,
     UtilityPrediction,
     Where,
     furthest,
 )
+from grounded.diagnosis.errors_told import excess, objection, open_noise
 from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.next_trial import CHANGED, at_bounds, next_trial
-from grounded.diagnosis.parts import Estimate, NoiseLevels, Ranked, Score, TrialGroup
+from grounded.diagnosis.next_step import next_step
+from grounded.diagnosis.parts import Estimate, NoiseLevels, Ranked, Score, TrialGroup, Verdict
+from grounded.diagnosis.remarks import remarks
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.ruler_words import objection, open_noise
-from grounded.diagnosis.unconfirmed import another_look, marked, unconfirmed, unrepeatable
+from grounded.diagnosis.unconfirmed import marked, unconfirmed
 from grounded.diagnosis.validation.agreement import Compared, by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
-from grounded.diagnosis.validation.limits import Limits, identifiable, joints_without_input
+from grounded.diagnosis.validation.limits import Limits, identifiable
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import verdict
 from grounded.effects import acting_order, wrapping_order
+from grounded.findings import Finding, found
 from grounded.places import position
+from grounded.result import listed, number
 from grounded.task import Task
 from grounded.trial import Trial
 
-HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more; of a gap
-WRONG_TERM = (  # advice beside a gap without a cause
-    "Without another trial: multiply each term of the rate of {} in the model file that may be "
-    'wrong by a parameter of its own (`Param(1.0, "1", 0.0, 2.0)`) and diagnose again; one that '
-    "comes out far from 1 is why."
-)
+MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
+NAMED = 3  # parameters in the words of a cause
 
 
 class Writer:
@@ -68,10 +69,12 @@ class Writer:
         first: int,
         exact: bool,
         uncertain: Predictor,
+        preflight: Sequence[Fault] = (),
     ) -> None:
         self.decision, self.ruler, self.known = decision, ruler, known
         self.adopted, self.ahead = adopted, ahead
         self.most, self.tick, self.task, self.trials = most, tick, task, trials
+        self.preflight = tuple(preflight)
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
@@ -98,33 +101,17 @@ class Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
-        off, region = open_noise(rows), None
-        if remainder:
-            off, region = remainder[0].channel, remainder[0].region
-        there = region is not None and region.occupancy < HALF and not region.of_time
-        when = region.phrase if region and there else ""
-        noise = not remainder  # no gap is named then
         named = [row.effect for row in ranking if row.claimed]
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         if remainder and not named:  # what is left elsewhere is no gap
             off_too = [data.model.state_names.index(one.channel) for one in remainder]
             gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
         channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
-        first = channels[0] if remainder and not named and channels[0].share > HALF else None
-        begins = first.name if first else off  # a position only sums up what its speed misses
-        part = remainder[0].part if remainder else None
-        look = off and another_look(
-            self.task, self.trials, off, when, noise=noise, begins=begins, part=part
-        )
-        if remainder and part is None and not simulated(data.model):
-            look += f" {WRONG_TERM.format(begins)}"
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
         told = {one.effect for one in seen}.union(*groups)
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         ties = [group for group in groups if group not in same]
-        worse = objection(rows, agreement, named, ties, remainder)
-        lost, ended = self.unrepeatable(), at_bounds(self.claims)
         moved, parameters = len(data.groups), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
         combinations = self.claims.by_priors.combinations
@@ -140,28 +127,8 @@ class Writer:
             )
             for one in identified
         )
-        said = verdict(
-            self.claims,
-            ranking,
-            groups,
-            remainder,
-            rows,
-            credit,
-            seen,
-            same,
-            self.most,
-            one_motion=moved == 1 < data.count,
-            identified=identified,
-            combinations=combinations,
-            per_trial=values,
-            agreement=() if apart else agreement,
-            changed=apart.changed if apart else None,
-            adopted=self.adopted,
-            tracked=() if self.task is None else _tracked(self.task),
-            alike=alike,
-        )
-        differ = bool(apart and apart.changed) and not self.known.no_cause
-        return Diagnosis(
+        said = self.verdict(ranking, remainder, rows, credit)
+        found = Diagnosis(
             verdict=said,
             where=Where(
                 channels=channels,
@@ -192,22 +159,6 @@ class Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=CHANGED
-            if differ
-            else next_trial(
-                self.claims,
-                look,
-                groups,
-                seen,
-                same,
-                lost,
-                worse,
-                self.adopted,
-                ended=ended,
-                flip=next((n for n in named if _to_flip(n, ranking, ended)), "").partition(":")[2],
-                noise=noise,
-            ),
-            unknowable=(*self.known.sentences, *joints_without_input(data.model, named)),
             noise=self.noise(),
             parameters=parameters,
             identifiable=identified,
@@ -232,6 +183,72 @@ class Writer:
             score=self.score(),
             steps=data.steps,
             candidates=len(self.search.candidates),
+            preflight=self.preflight,
+            tracked=() if self.task is None else _tracked(self.task),
+        )
+        return replace(found, findings=self.findings(found))
+
+    def findings(self, d: Diagnosis) -> tuple[Finding, ...]:
+        """What is told beside the diagnosis' lines, and the next step."""
+        known, rows = self.known.findings, d.prediction_error
+        off = d.leftover[0].channel if d.leftover else open_noise(rows)
+        ties = [group for group in d.indistinguishable if group not in d.equivalent]
+        doubt = objection(rows, d.agreement, d.effects, ties, d.leftover)
+        step = next_step(d, self.claims, doubt, off, self.task, self.trials, self.adopted)
+        more = ()
+        if d.leftover and len(self.claims.names) == self.most and not d.no_cause:
+            more = (found("gap.more", most=self.most, deeper=d.verdict.look_for > 0),)
+        return (*known, *more, *remarks(d, self.data.model, self.adopted), step)
+
+    def verdict(
+        self,
+        ranking: Sequence[Ranked],
+        remainder: Sequence[Remainder],
+        rows: Sequence[RulerRow],
+        credit: Sequence[Credit],
+    ) -> Verdict:
+        """The kind of the verdict, and the causes in words."""
+        claims, row = self.claims, furthest(rows)
+        if claims.known.no_cause:
+            return Verdict("unknown", limit=claims.known.findings[0].code)
+        claimed = tuple(row.effect for row in ranking if row.claimed)
+        if not claimed:
+            bound = row is not None and (row.floor_at_most or row.floor_from == AT_MOST)
+            unsure = bound and not excess(rows) and not self.adopted
+            return Verdict("unknown" if remainder or unsure else "none")
+        more = 0
+        if remainder and len(claims.names) == self.most:
+            more = min(self.most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
+        off = tuple(self.data.model.param_names[one.index] for one in claims.moved)
+        return Verdict(
+            "effect" if len(claimed) == 1 else "several",
+            effects=claimed,
+            causes=self.causes(ranking, credit, off),
+            parameters=off,
+            look_for=more if more > self.most else 0,
+            again=0 < more <= self.most,
+        )
+
+    def causes(
+        self, ranking: Sequence[Ranked], credit: Sequence[Credit], off: Sequence[str]
+    ) -> tuple[str, ...]:
+        """The words of each cause, the largest first."""
+        params, known = self.data.model.params, self.claims.parameters()
+        values = {row.effect: row.params for row in ranking}
+        effects = {effect.name: effect for effect in self.best.hypothesis.effects}
+        parts = [
+            found(
+                "model.parameter",
+                name=value_called(name, self.adopted),
+                value=known[name].text,
+                old=number(params[name].value),
+            ).sentence
+            for name in off[:NAMED]
+        ]
+        parts += [f"{len(off) - NAMED} more"] * (len(off) > NAMED)
+        return tuple(
+            meaning(effects[one.of], values[one.of]) if one.of in effects else listed(parts)
+            for one in credit
         )
 
     def score(self) -> Score:
@@ -240,10 +257,6 @@ class Writer:
         crude = ruler.score(self.decision.crude)
         chosen = crude + ruler.gain(self.decision.crude, self.best).mean
         return Score(crude, chosen, chosen + choice.lost, choice.standard_error)
-
-    def unrepeatable(self) -> dict[str, str]:
-        """The trials that nobody can or should repeat."""
-        return {} if self.task is None else unrepeatable(self.task, self.trials)
 
     def channels(self, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
         """Each state's part of the gap, NaN of NaN, with the ruler's errors a second ahead."""
@@ -300,16 +313,6 @@ def _tracked(task: Task) -> tuple[str, ...]:
     first = position(task.model)
     rates = {n for n in names if task.model.states[n].endswith("/s")}
     return tuple(sorted(names, key=lambda n: (n not in first, n in rates)))
-
-
-def _to_flip(name: str, ranking: Sequence[Ranked], ended: bool) -> bool:
-    """Return whether an input's sign is to be flipped before anything is adopted.
-
-    If parameters ended at their bounds, the strength of a reversed input is not known.
-    """
-    own = [row.params for row in ranking if row.effect == name]
-    gain = name.startswith("input_gain:")
-    return any(sign_only(name, one) or (ended and gain and acts_reversed(one)) for one in own)
 
 
 def _identified(

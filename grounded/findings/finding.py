@@ -64,7 +64,8 @@ class Finding:
         """What was found, and what to do where the entry has a remedy."""
         entry = entry_of(self.code)
         facts = {"about": self.about, **self.facts}
-        return "; ".join(filled(text, facts) for text in (entry.short, entry.remedy) if text)
+        texts = (filled(text, facts).strip() for text in (entry.short, entry.remedy))
+        return "; ".join(text for text in texts if text)
 
     def weighing(self, weight: Weight) -> Finding:
         """Return it with another weight."""
@@ -87,6 +88,26 @@ class Finding:
             "then": then,
         }
 
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Finding:
+        """Return the finding that `to_json` wrote, of this version."""
+
+        def fact(value: Any) -> Fact:
+            if isinstance(value, dict):
+                number, std = (math.nan if x is None else x for x in (value["value"], value["std"]))
+                return Quantity(number, value["unit"], std)
+            return tuple(value) if isinstance(value, list) else value
+
+        then, nats = document["then"], document["nats"]
+        return cls(
+            document["code"],
+            tuple(document["about"]),
+            {name: fact(value) for name, value in document["facts"].items()},
+            Weight(document["weight"]),
+            math.nan if nats is None else nats,
+            then and NextCommand(then["command"], tuple(then["arguments"])),
+        )
+
 
 def found(
     code: str,
@@ -94,8 +115,9 @@ def found(
     nats: float = math.nan,
     then: NextCommand | None = None,
     weight: Weight | None = None,
-    **facts: Fact,
+    **facts: Fact | None,
 ) -> Finding:
-    """Return a finding with the weight of its entry, see `Finding`."""
+    """Return a finding with the weight of its entry, see `Finding`; facts that are None are left out."""
     weighs = weight or Weight(entry_of(code).weight)
-    return Finding(code, about, facts, weighs, nats, then)
+    known = {name: value for name, value in facts.items() if value is not None}
+    return Finding(code, about, known, weighs, nats, then)

@@ -11,6 +11,7 @@ A slot is `{name}` or `{name:how}`:
     {name:.3g}         a number by Python's format
 
 `[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or 0 as a number.
+`[[name? ...]]` is kept where the fact `name` is none of these, `[[!name? ...]]` where it is one.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any
 from grounded.result import figure, listed, measured, percent, with_error, with_unit
 
 _CLAUSE = re.compile(r"\[\[(.*?)\]\]", re.S)
+_IF = re.compile(r"(!?)(\w+)\?\s*")
 _SLOT = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 
 
@@ -35,8 +37,12 @@ def filled(text: str, facts: Mapping[str, Any]) -> str:
     """
 
     def clause(match: re.Match[str]) -> str:
-        names = [name for name, _ in _SLOT.findall(match[1])]
-        return match[1] if all(_known(facts.get(name)) for name in names) else ""
+        test = _IF.match(match[1])
+        text = match[1][test.end() :] if test else match[1]
+        if test and _known(facts.get(test[2])) is bool(test[1]):
+            return ""
+        names = [name for name, _ in _SLOT.findall(text)]
+        return text if all(_known(facts.get(name)) for name in names) else ""
 
     return _SLOT.sub(lambda m: shaped(facts[m[1]], m[2] or ""), _CLAUSE.sub(clause, text))
 
@@ -63,7 +69,7 @@ def shaped(value: Any, how: str) -> str:
     if "/" in how:
         one, several = how.split("/")
         return one if number == 1 else several
-    if how.isalpha():
+    if how.replace(" ", "").isalpha():
         return f"{number} {how}{'s' * (number != 1)}"
     if how:
         return f"{number:{how}}"

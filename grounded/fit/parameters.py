@@ -139,7 +139,7 @@ def fit(
         if isinstance(found, GroundedError):
             return nothing(given, data, asked, delayed, found)
         tick("predict")
-        return report(given, asked, found, looked.findings).of_share(share.sentence)
+        return report(given, asked, found, looked.findings, share.finding)
 
 
 def prediction_error(

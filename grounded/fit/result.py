@@ -1,8 +1,8 @@
-"""The result of a fit: values with intervals, and a sentence that says how it ended."""
+"""The result of a fit: values with intervals, and how it ended as findings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.finding import Finding
+from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
@@ -25,9 +25,11 @@ from grounded.diagnosis.validation.gain import LEAST, Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.errors import GroundedError
+from grounded.findings import Finding
+from grounded.findings import found as finding
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Result, document, listed
+from grounded.result import Result, document
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +73,24 @@ class Fit(Result):
     model: Model  # the model with the fitted values
     latency: Array  # (m,) [s]
     loglik: float  # minus infinity if nothing was fitted
-    status: str  # converged, or why it stopped
-    sentence: str
+    status: str  # converged, still rising or diverged
     samples: int
     nats: float = 0.0  # log evidence over the values as given
     before: PredictionError | None = None  # of held-out trials; None if none could be held out
     after: PredictionError | None = None
     gain: Gain | None = None  # of the held-out errors, and the same the other way round
     loss: Gain | None = None
-    preflight: tuple[Finding, ...] = ()  # findings about the sensors
+    preflight: tuple[Fault, ...] = ()  # findings about the sensors
+    findings: tuple[Finding, ...] = ()  # how it ended, and what the values rest on
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)  # (k, k)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
 
-    def of_share(self, sentence: str) -> Fit:
-        """Return the fit with a sentence added on which share of the trials it used; "": all."""
-        return replace(self, sentence=f"{self.sentence}; {sentence}") if sentence else self
+    @property
+    def sentence(self) -> str:
+        """The findings in words."""
+        return "; ".join(one.sentence for one in self.findings)
 
     @property
     def helps(self) -> bool:
@@ -122,6 +125,7 @@ class Fit(Result):
             params={name: vars(e) for name, e in self.params.items()},
             status=self.status,
             sentence=self.sentence,
+            findings=[one.to_json() for one in self.findings],
             samples=self.samples,
             at_bounds=list(self.at_bounds),
             applied=False,
@@ -198,7 +202,8 @@ def report(
     model: Model,
     asked: Sequence[str],
     found: Found,
-    findings: Sequence[Finding] = (),
+    findings: Sequence[Fault] = (),
+    share: Finding | None = None,
 ) -> Fit:
     """Build the `Fit` of a finished search.
 
@@ -207,6 +212,7 @@ def report(
         asked: the parameters that were to be fitted.
         found: the end of the search.
         findings: what the sensors show by themselves.
+        share: which part of the trials was used; None for all.
     """
     search, best, data = found.search, found.best, found.search.data
     params, (std, half) = dict[str, FittedValue](), found.sure
@@ -248,14 +254,14 @@ def report(
         latency=latency,
         loglik=best.loglik,
         status=status,
-        sentence=status,
         samples=int(data.seen[1:].sum()),
         nats=np.inf if found.crude is None else search.score(best) - search.score(found.crude),
         preflight=tuple(findings),
         covariance=covariance,
         **more,
     )
-    return replace(made, sentence="; ".join(_said(made)))
+    told = (*_said(made), *([share] if share else []))
+    return replace(made, findings=told)
 
 
 def nothing(
@@ -273,25 +279,25 @@ def nothing(
     for name, inputs in delayed.items():
         start = float(data.latency[inputs[0]])
         params[name] = FittedValue(start, np.inf, 0.0, np.inf, "s", False, start)
-    said = f"nothing was fitted: {why}"
-    return Fit(params, model, data.latency, -np.inf, "diverged", said, int(data.seen[1:].sum()))
+    said, samples = finding("model.fit_failed", why=str(why)), int(data.seen[1:].sum())
+    return Fit(params, model, data.latency, -np.inf, "diverged", samples, findings=(said,))
 
 
-def _said(found: Fit) -> list[str]:
-    """Return the parts of the sentence: how it ended, what is not identified or at a bound."""
-    parts = [found.status]
+def _said(found: Fit) -> Iterator[Finding]:
+    """Yield how it ended, and what is not identified or at a bound."""
+    yield finding(
+        "model.fitted",
+        settled="yes" if found.status == "converged" else "no",
+        samples=found.samples,
+    )
     lost = [name for name, e in found.params.items() if not e.identified]
     tied = {one: [n for n, e in found.params.items() if one in e.only_with] for one in lost}
     if alone := [name for name in lost if not tied[name]]:
-        parts.append(f"the data do not identify {', '.join(alone)}, held as before")
-    parts += [
-        f"the data tell only combinations of {listed([one, *others])}: {one} is held as before, "
-        "and what is fitted of the others is right only if that is"
-        for one, others in tied.items()
-        if others
-    ]
+        yield finding("model.not_told", *alone)
+    for one, others in tied.items():
+        if others:
+            yield finding("model.given", *others, rests=(one,))
     if found.at_bounds:
-        parts.append("at a bound: " + ", ".join(found.at_bounds))
+        yield finding("model.at_bound", *found.at_bounds)
     if not found.helps:
-        parts.append("the values before are as likely, or predict held-out trials as well")
-    return parts
+        yield finding("model.fit_no_better")

@@ -240,7 +240,8 @@ def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, A
     try:
         diagnose_in(case, without=without)
     except GroundedError as error:
-        write_diagnosis(case.reports, Diagnosis(Verdict("unknown", sentence=f"refused: {error}")))
+        refused = found("gap.refused", why=str(error))
+        write_diagnosis(case.reports, Diagnosis(Verdict("unknown"), findings=(refused,)))
     return {"case": name, "cpu_s": time.process_time() - begin}
 
 

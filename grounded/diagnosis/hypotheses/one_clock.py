@@ -38,15 +38,6 @@ class OneClock:
     states: tuple[str, ...]
     whole: bool
 
-    def sentence(self) -> str:
-        """Return an explanation for the user."""
-        commands = "the commands" if self.whole else f"the commands of {_and(self.inputs)}"
-        sensors = "all sensors" if self.whole else f"the sensors of {_and(self.states)}"
-        return (
-            f"A delay of {commands} cannot be told from one of {sensors} in a log; plans are the "
-            "same for both."
-        )
-
 
 def one_clock(
     model: Model, effects: Sequence[Effect], shown: Sequence[str], still: Collection[str] = ()
@@ -89,8 +80,3 @@ def _parts(model: Model) -> list[set[str]]:
             parts.remove(other)
             one |= other
     return parts
-
-
-def _and(names: Sequence[str]) -> str:
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last

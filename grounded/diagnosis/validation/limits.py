@@ -1,7 +1,7 @@
 """Limits of the data, checked before anything is claimed: which effects can't be identified.
 
 If a state never moved, an input never changed, or there is a single trial or only a few steps, an
-effect may exist but can't be identified. It is not a candidate then, and a sentence says why.
+effect may exist but can't be identified. It is not a candidate then, and a finding says why.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.finding import Finding
+from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.by_priors import information
 from grounded.effects import (
@@ -35,10 +34,10 @@ from grounded.effects import (
 )
 from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.places import LITTLE, integrals, told_by
-from grounded.result import listed
 from grounded.trial import Trial
 
 FEW_STEPS = 30
@@ -53,9 +52,9 @@ QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 @dataclass(frozen=True)
 class Limits:
-    """What can't be identified: sentences for the user, and whether no cause may be named."""
+    """What can't be identified, and whether no cause may be named, for the first of these."""
 
-    sentences: tuple[str, ...]
+    findings: tuple[Finding, ...]
     no_cause: bool
 
 
@@ -66,55 +65,31 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
         data: the trials.
         left_out: names of states whose sensors are redundant and were left out.
     """
-    found, no_cause = [], False
+    told, no_cause, model = list[Finding](), False, data.model
     if data.count < 2 and len(data.valid) < PIECES:
-        found.append(
-            "one trial alone confirms nothing; run a second one, or one of "
-            f"{PIECES * SHORTEST_PIECE} steps or more"
-        )
+        told.append(found("model.one_trial", steps=PIECES * SHORTEST_PIECE))
         no_cause = True
     if data.steps < FEW_STEPS:
-        found.append(
-            f"{data.steps} steps in all are too few to tell an effect from noise; record "
-            f"{FEW_STEPS} or more"
-        )
+        told.append(found("model.few_steps", steps=data.steps, needed=FEW_STEPS))
         no_cause = True
     still, unmoved = constant_inputs(data), still_states(data)
     if still or unmoved:
-        found.append(_stood_still(still, unmoved))
-    if len(still) == data.model.m and not released(data):
-        no_cause = True
+        told.append(found("model.still", *still, *unmoved))
+    no_cause |= len(still) == model.m and not released(data)
     if data.skipped:
-        slow = simulated(data.model)
-        why = "simulator steps are slow" if slow else "to limit memory"
-        used = f"{len(data.valid)} of {len(data.valid) + data.skipped} stretches of the trials"
-        found.append(f"{used} were used, those with most motion ({why})")
-    names = data.model.state_names
-    empty = [name for name, told in zip(names, data.told, strict=True) if not told]
+        used = len(data.valid)
+        told.append(found("model.stretches", used=used, all=used + data.skipped))
+    names = model.state_names
+    empty = [name for name, seen in zip(names, data.told, strict=True) if not seen]
     spared = {*left_out, *(names[i] for i, log in data.behind.items() if names[log] in left_out)}
-    for name in (name for name in empty if name not in spared):
-        found.append(f"state {name} was never measured")
-    if {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}:
-        no_cause = True
-    return Limits(tuple(found), no_cause)
+    if missing := [name for name in empty if name not in spared]:
+        told.append(found("model.unmeasured", *missing))
+    no_cause |= {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}
+    return Limits(tuple(told), no_cause)
 
 
-def _stood_still(inputs: Sequence[str], states: Sequence[str]) -> str:
-    """Return one sentence on all inputs that never changed and all states that never moved."""
-    told = [
-        f"{kind}{'s' * (len(names) > 1)} {listed(names)} never {moved}"
-        for kind, names, moved in (("input", inputs, "changed"), ("state", states, "moved"))
-        if names
-    ]
-    if not states:
-        own = "its actuator" if len(inputs) == 1 else "their actuators"
-        return f"{told[0]}, so effects of {own} can't be identified"
-    one = len(inputs) + len(states) == 1
-    return f"{', and '.join(told)}, so effects on {'it' if one else 'them'} can't be identified"
-
-
-def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
-    """Return a sentence for each joint whose friction is claimed as two effects on two axes.
+def joints_without_input(model: Model, claimed: Collection[str]) -> list[Finding]:
+    """Return a finding for each joint whose friction is claimed as two effects on two axes.
 
     Friction in a joint acts on every acceleration through the inertia matrix. Where no input acts
     on the joint (a pole on its cart), that matrix is not known from the model, and the friction is
@@ -126,39 +101,32 @@ def joints_without_input(model: Model, claimed: Collection[str]) -> list[str]:
     """
     moved = moved_model(model)  # its true speeds, not those that an adopted filter makes of them
     rates = {moved.state_names[one.j] for one in integrals(moved) if one.exact}
-    found = []
+    told = []
     for v in sorted(rates):
         own = [f"{kind}:{v}" for kind in FRICTIONS if f"{kind}:{v}" in claimed]
         onto = [name for w in sorted(rates - {v}) if (name := f"coupling:{w}<-{v}") in claimed]
         if own and onto:
-            found.append(
-                f"{listed([*own, *onto])} may be one cause: friction in the joint of {v}, which "
-                "acts on both through the inertia. To test it, write this torque into model.py "
-                'with an uncertain parameter (such as "b": Param(0, "N m s/rad", std=...)), or as '
-                "an input with a column of zeros in the log, and diagnose again"
-            )
-    return found
+            told.append(found("model.joint_friction", *own, *onto, joint=v))
+    return told
 
 
-def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
-    """Drop trials that equal an earlier one up to rounding; return the rest and a sentence each.
+def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
+    """Drop trials that equal an earlier one up to rounding; return the rest and a finding each.
 
     A copy has the same noise. If it were counted twice, it would confirm what a single run shows.
     """
     known: dict[tuple[int, ...], list[tuple[int, Trial]]] = {}
-    found, said = [], []
+    kept, told = [], []
     for k, trial in enumerate(trials):
         alike = known.setdefault(trial.states.shape, [])
         other = next(((i, t) for i, t in alike if _is_copy(trial, t)), None)
         if other is None:
             alike.append((k, trial))
-            found.append(trial)
+            kept.append(trial)
             continue
         name, first = (t.id or f"trial {i + 1}" for i, t in ((k, trial), other))
-        exact = trial.repeats(other[1])
-        same = f"is bit-identical to {first}" if exact else f"equals {first} up to rounding"
-        said.append(f"{name} {same} (a copy, or no noise at all): it counts once")
-    return found, said
+        told.append(found("model.copy", name, first=first))
+    return kept, told
 
 
 def _is_copy(trial: Trial, other: Trial) -> bool:
@@ -393,7 +361,7 @@ def _jointly(
     return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
 
 
-def with_measured_filters(model: Model, findings: Iterable[Finding]) -> Model:
+def with_measured_filters(model: Model, findings: Iterable[Fault]) -> Model:
     """Return the model with the constants of adopted sensor filters held that sensors show alone.
 
     The physics would shift them to fit what it lacks: 0.050 s, seen in the speed beside its

@@ -1,7 +1,221 @@
-"""Findings of a diagnosis: the gap between model and log, and its causes."""
+"""Findings of a diagnosis: the gap between model and log, its causes, and the next trial."""
 
 from __future__ import annotations
 
 from grounded.findings.catalogue import Entry
 
-ENTRIES: dict[str, Entry] = {}
+DIAGNOSE = "then diagnose again"
+
+ENTRIES: dict[str, Entry] = {
+    # the three lines of a diagnosis
+    "causes": Entry(
+        "note",
+        "{causes}[[; and {more:smaller cause}]][[tied?; one of these ties with another cause]]"
+        "[[left?; a gap remains beside this]]",
+    ),
+    "none": Entry(
+        "note", "the model explains these trials[[known? down to the noise]][[adopted? as adopted]]"
+    ),
+    "unknown": Entry(
+        "note",
+        "no known effect explains what the model leaves[[noise?, which may be noise]]"
+        "[[groups? if both groups get the same values]]",
+    ),
+    "too_few": Entry("note", "no cause can be named from these trials"),
+    "refused": Entry("warn", "the logs were refused: {why}"),
+    "errors": Entry(
+        "note",
+        "[[whole?over whole trials]][[{ahead:.3g} s ahead]] {who} misses {state} by {now:size}"
+        "[[ instead of {before:size}]][[ (noise: {bound:yes=at most ,no=}{noise:size})]]"
+        "[[, {state2} by {now2:size}]][[ instead of {before2:size}]][[inside?, not held out]]",
+    ),
+    "left": Entry(
+        "note",
+        "unexplained: {state} is off by {error:size} {ahead:.3g} s ahead"
+        "[[ (noise: {bound:yes=at most ,no=}{noise:size})]][[, mostly where {place}]]"
+        "[[, {part:%} of it in {trial} from {start:.3g} to {end:.3g} s]]"
+        "[[; {others:more state} {others:is/are} off]]",
+    ),
+    "lacks": Entry(
+        "note",
+        "small but lasting: the rate of {state} lacks {size} rms[[, mostly where {place}]]"
+        "[[; {others:more state} {others:is/are} off]]",
+    ),
+    "where": Entry(
+        "note",
+        "the gap is {share:%} in {state}[[ and {share2:%} in {state2}]]"
+        "[[, {part:%} of it where {place}]]",
+    ),
+    # what else is found
+    "changed": Entry(
+        "warn", "{value} changed from {first} to {second} between the two groups of trials"
+    ),
+    "unchanged": Entry("note", "nothing changed between the two groups beyond the noise"),
+    "tie": Entry(
+        "warn",
+        "these trials can't tell {effect} from {others}: each explains them",
+        "adopting writes {effect}",
+    ),
+    "equivalent": Entry(
+        "note", "no log can tell {effect} from {others} in this model; plans are the same for all"
+    ),
+    "alike": Entry("note", "{like} makes nearly the same log as {effect}"),
+    "worse": Entry(
+        "warn",
+        "predictions of {state} get worse [[{ahead:.3g} s ahead]][[whole? over whole trials]]: "
+        "{now:size} instead of {before:size}",
+    ),
+    "disagree": Entry(
+        "warn",
+        "the trials disagree on {quantity} of {effect}: {low} in {trial}, {high} in {trial2}"
+        "[[; it {goes_with}]]",
+    ),
+    "one_motion": Entry(
+        "note", "all trials repeat one motion: these values may not hold for another"
+    ),
+    "unconfirmed": Entry(
+        "note",
+        "unconfirmed: {effect} ({values}), which {seen} of {trials} trials show"
+        "[[repeats?, all of one motion]][[, mostly {trial}]][[ where {place}]]",
+    ),
+    "small": Entry(
+        "note", "{state} is off by {times:.2g} times the noise: too little to find a cause for"
+    ),
+    "noise": Entry(
+        "note",
+        "how much of the error of {state} is noise is not known",
+        "repeat one run to know it",
+    ),
+    "no_better": Entry(
+        "note", "{effect} alone is likely, but predictions do not clearly improve with it"
+    ),
+    "correction": Entry(
+        "note",
+        "a curve over {over} predicts {gain:%} of what no effect explains: no cause, but "
+        "correction:{state} can be adopted",
+    ),
+    "more": Entry(
+        "note",
+        "{most:cause} {most:is/are} named, as many as were looked for, and more is left",
+        "[[deeper? allow more with --max-effects]][[!deeper? adopt these and diagnose again]]",
+    ),
+    "interrupted": Entry(
+        "warn",
+        "interrupted while it looked for one more effect",
+        "diagnose again to look further",
+    ),
+    "sign": Entry(
+        "warn",
+        "{input} acts the other way round",
+        "flip its sign in model.py; if only the log has it so, multiply the scale in "
+        f"[log.input.{{input}}] by -1 and ingest the logs again; {DIAGNOSE}",
+    ),
+    "unit": Entry("warn", "{effect} is about a power of ten: is the log in another unit?"),
+    "corrected": Entry(
+        "warn",
+        "corrected here, but not in the stored trials: {about}",
+        "fix the program that writes the trials, and discard those that the search learned from",
+    ),
+    "not_compared": Entry(
+        "note",
+        "{effect} is part of the model and was not compared again with {others}, from which the "
+        "trials could not tell it",
+    ),
+    "utility": Entry(
+        "note",
+        "utilities of whole trials are predicted to {before:.3g} rms by the model[[, {after:.3g} "
+        "as diagnosed]]",
+    ),
+    # the next step: one of them
+    "next.record": Entry(
+        "note", "run another trial, or record a longer log, in which every input changes"
+    ),
+    "next.use": Entry(
+        "note", "diagnose all: {stored:stored trial} of this task can be diagnosed as well"
+    ),
+    "next.none": Entry("note", "no trial is needed[[adopted?: nothing more is found]]"),
+    "next.adopt": Entry(
+        "note",
+        "no trial is needed: {own:yes=fit the model's parameters,no=adopt the claimed effects}"
+        "[[left? and diagnose again]]",
+    ),
+    "next.doubt": Entry(
+        "note",
+        "adopt nothing yet: {why:worse=predictions get worse,little=predictions gain little,"
+        "disagree=the trials disagree} with {about}",
+        f"run another trial, {DIAGNOSE}",
+    ),
+    "next.changed": Entry(
+        "note",
+        "the robot changed between the two groups: adopt no value of both",
+        "diagnose the newer trials alone",
+    ),
+    "next.load": Entry(
+        "note",
+        "several joints with a wrong gain suggest a load or a wrong link mass",
+        f"give the model a parameter for it, {DIAGNOSE}",
+    ),
+    "next.bounds": Entry(
+        "note",
+        "{about} stopped at {about:its/their} bound, and the trials ask for more",
+        "widen it in the model file if the true value may lie beyond; else give bounds to a "
+        f"parameter that is constant; {DIAGNOSE}",
+    ),
+    "next.flip": Entry("note", f"flip the sign of {{input}}, {DIAGNOSE}"),
+    "next.apart": Entry(
+        "note",
+        "run a trial that may tell {effect} from {others}: small and large inputs of each sign, "
+        "slow and fast",
+    ),
+    "next.confirm": Entry(
+        "note",
+        "run another trial that shows {effect}[[, where {place}]][[repeats? in another motion]]: "
+        "few do[[ ({trial} best)]]",
+    ),
+    "next.look": Entry(
+        "note",
+        "look at the recording of {trial} from {start:.3g} to {end:.3g} s: was the robot held or "
+        "pushed then?",
+        "if so, discard it and ingest its log without that part",
+    ),
+    "next.repeat": Entry(
+        "note",
+        "[[run {candidate} twice more]][[log? record one run three times with the same inputs]], "
+        "to see how much of the error of {state} is noise",
+    ),
+    "next.elsewhere": Entry(
+        "note",
+        "run a trial[[ that spends more time where {place}]][[elsewhere? with other steps and "
+        "sweeps of {inputs}]], to see what {state} lacks",
+        '[[term? or multiply each term of the rate of {state} by a Param(1.0, "1", 0.0, 2.0) and '
+        "diagnose again: what comes far from 1 is why]]",
+    ),
+    "next.ended": Entry(
+        "note", "no trial is needed for the manoeuvre: the search has ended, with {candidate}"
+    ),
+    "next.undo": Entry(
+        "warn",
+        "the last {lost:candidate} planned with the adopted {about} lost",
+        f"undo the last adoption with `grounded adopt --undo`, {DIAGNOSE}",
+    ),
+    "next.fix": Entry(
+        "warn",
+        "fix the program that writes {about}, and discard the trials that the search learned from",
+    ),
+    "next.probe": Entry(
+        "note",
+        "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {nats:.3g} "
+        "nats]][[would tell {value} to +- {then:size}]][[ instead of {now:size}]]"
+        "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
+    ),
+    "next.unsafe": Entry(
+        "note", "none of the probes that were tried stays inside [safety] and near the trials"
+    ),
+    "next.no_run": Entry("note", "no run was complete: a probe varies the best candidate"),
+    "next.failed": Entry("warn", "no probe could be computed ({why})"),
+    "next.no_probe": Entry(
+        "note",
+        "no run inside the limits would tell [[{effect} from {others}]][[{value} better]]",
+        "[[claimed? adopt {claimed}]][[!claimed? record larger inputs or another manoeuvre]]",
+    ),
+}

@@ -7,14 +7,15 @@ together. reports/adoptions.json also records how sure the adopted values are (s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from grounded.diagnosis.cause_words import wider
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, settle
+from grounded.findings import found as found_
 from grounded.result import Result, listed
 from grounded_trials.store.documents import write_document
 from grounded_trials.workspace.adoptable import (
@@ -70,7 +71,7 @@ class Adopted(Result):
     logged: str = ""  # the trial that target.csv still repeats, if it ran no candidate
     jointly: tuple[str, ...] = ()  # parameters and effects determined only with the others
     rewritten: tuple[Rewritten, ...] = ()  # of effects that were adopted before
-    stopped: str = ""  # what to do about parameters that reached their bounds
+    findings: tuple[Finding, ...] = ()  # what an adoption leaves to be done or known
     along: tuple[str, ...] = ()  # late and filtering sensors that were adopted without being named
 
     def summary(self) -> str:
@@ -88,6 +89,7 @@ class Adopted(Result):
             "jointly": list(self.jointly),
             "along": list(self.along),
             "left": {name: one.value for name, one in self.left.items()},
+            "findings": [one.to_json() for one in self.findings],
         }
 
 
@@ -156,7 +158,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
     beside = (str(effect["name"]) for effect in adopted)
     left = left_behind(found) if parameters and physics and claimed else {}
-    return Adopted(
+    done = Adopted(
         tuple(adopted),
         own,
         claimed,
@@ -169,9 +171,56 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
             *(name for name in names if name in found.combined),
         ),
         rewritten=_rewritten(workspace, old, adopted),
-        stopped=wider(found.parameters) if parameters and physics and claimed else "",
         along=tuple(name for name in names if name not in asked),
     )
+    known_all = found.parameters if parameters and physics and claimed else {}
+    told = _told(done, asked, workspace.base_model.states, known_all)
+    return replace(done, findings=settle(told))
+
+
+def _told(
+    done: Adopted,
+    asked: Sequence[str],
+    units: Mapping[str, str],
+    known: Mapping[str, Estimate],
+) -> Iterator[Finding]:
+    """Yield what an adoption leaves to be done or known.
+
+    Args:
+        done: the adoption.
+        asked: the effects that the user named.
+        units: of the states.
+        known: the parameters that were calibrated beside the effects.
+    """
+    for effect in done.effects:
+        name = str(effect["name"])
+        family, _, state = name.partition(":")
+        if name not in asked or family not in ("sensor_bias", "sensor_scale", "sensor_delay"):
+            continue
+        if family == "sensor_bias":
+            b = effect["b"]
+            bias, way = Quantity(abs(b), units[state]), "low" if b < 0 else "high"
+            yield found_("model.biased", state, state=state, bias=bias, way=way)
+        elif family == "sensor_scale":
+            k = effect["k"]
+            way = "low" if k < 0 else "high"
+            yield found_("model.scaled", state, state=state, by=abs(k), way=way)
+        else:
+            yield found_("model.late", *state.split("+"), age=effect["d"])
+    if done.along:
+        yield found_("model.along", *done.along)
+    if not done.claimed:
+        yield found_("model.unclaimed", effect=asked[0])
+    if done.beside:
+        yield found_("model.beside", *done.beside)
+    for one in done.left.values():
+        ends = (Quantity(value, one.unit) for value in (one.kept, one.value))
+        kept, value = ends
+        yield found_("model.kept", one.called, name=one.called, kept=kept, value=value)
+    if stopped := [name for name, e in known.items() if e.stopped]:
+        yield found_("model.at_bound", *stopped)
+    if done.logged:
+        yield found_("model.logged_target", done.logged)
 
 
 def _as_estimated(

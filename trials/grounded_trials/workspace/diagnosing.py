@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -15,10 +14,9 @@ from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.progress import duration
-from grounded.result import begun
+from grounded.findings import Finding
+from grounded.findings import found as finding
 from grounded.share import Share
-from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, write_diagnosis
@@ -26,7 +24,7 @@ from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
-    from grounded.accounts.finding import Finding
+    from grounded.accounts.finding import Finding as Fault
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
@@ -37,8 +35,6 @@ if TYPE_CHECKING:
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
-
-PROBE = NextCommand("diagnose", ("--probe",))
 
 
 def diagnose_in(
@@ -63,17 +59,13 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
     from grounded_trials.workspace.adoptable import diagnosed_again
-    from grounded_trials.workspace.candidates.exported_files import to_run
     from grounded_trials.workspace.candidates.search_state import candidate_named
     from grounded_trials.workspace.next_step import (
         DIAGNOSE,
         EXPORT,
-        PROPOSE,
         REPORT,
-        TARGET,
         after_diagnosis,
         left_open,
-        nothing_to_do,
     )
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
@@ -84,9 +76,9 @@ def diagnose_in(
     library = (library or Library()).without(without)
     planner = workspace.planner
     share = chosen(workspace, trials)
-    second = chosen(workspace, compare) if compare else Share([], "")
+    second = chosen(workspace, compare) if compare else Share([])
     used, others = share.trials, second.trials
-    told = filter(None, [share.sentence, second.sentence])
+    told = filter(None, [share.finding, second.finding])
     memory = planner.plan.model.state_names[planner.task.model.n :]
     rows, early = unsure_times(workspace.whole_trials(), {one.id for one in (*used, *others)})
     options = DiagnosisOptions(
@@ -111,89 +103,46 @@ def diagnose_in(
         rows_s=rows,
         interpolated_s=early,
     )
-    began = time.monotonic()
     found = diagnose(planner.plan, lifted, options, compare=apart, engine=engine, progress=progress)
-    took = time.monotonic() - began
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    limits = (*found.unknowable, *_not_compared(workspace), *told)
-    found = replace(found, made=made, preflight=seen, ranking=known, unknowable=limits)
+    more = (*told, *_not_compared(workspace), *found.findings)
+    found = replace(found, made=made, preflight=seen, ranking=known, findings=more)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
     try:
-        identity, words = _probe(workspace, found, lifted + apart, library, write=probe)
+        identity, step = _probe(workspace, found, lifted + apart, library, write=probe)
     except Exception as error:  # a failed probe must not lose the diagnosis
         if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
         why = str(error) or type(error).__name__
-        identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
-    if words:
-        run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
-        run *= bool(identity)
-        found = replace(found, next_trial=f"{words}{run}", probe=identity)
-    if deeper := _deeper(found, took):
-        found = replace(found, next_trial=f"{found.next_trial} {deeper}")
-    undo = _in_vain(workspace, found)
-    if undo:
-        found = replace(found, next_trial=f"{undo} {found.next_trial}")
+        identity, step = "", finding("gap.next.failed", why=why)
+    found = found if step is None else found.asking(step, identity)
+    if undo := _in_vain(workspace, found):
+        found = found.asking(undo, identity)
     ran = tuple(trial.id for trial in used + others if trial.candidate)
     wrong = ran if any(one.log for one in in_the_log(measured)) else ()  # it affects every trial
     if wrong:
-        first = (
-            "First fix the program that writes the trials, and discard those the search learned "
-            "from."
-        )
-        found = replace(found, next_trial=f"{first} {found.next_trial}")
-    more = len(diagnosable(workspace)) - len(made.trials)
-    if unasked := found.no_cause and more > 0 and not share.sentence:
-        words = f"{count(more, 'stored trial')} of this task can be diagnosed as well."
-        found = replace(found, next_trial=words)
-    write_diagnosis(workspace.reports, found)  # again, now with `next_trial`
+        found = found.asking(finding("gap.next.fix", *wrong), identity)
+    left = len(diagnosable(workspace)) - len(made.trials)
+    if unasked := found.no_cause and left > 0 and share.finding is None:
+        found = found.asking(finding("gap.next.use", stored=left))
+    write_diagnosis(workspace.reports, found)  # again, now with the next step
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and left_open(found):
-        words = nothing_to_do(found, candidate_named(workspace, "best"))
-        found = replace(found, next_trial=words)
-    elif found.contested and then in (TARGET, PROPOSE):
-        which = "The next candidate will do: it is planned with the model as it is."
-        found = replace(found, next_trial=f"{found.next_trial} {which}")
+        best = candidate_named(workspace, "best")
+        found = found.asking(finding("gap.next.ended", candidate=best), identity)
     return replace(found, then=then)
 
 
-def _not_compared(workspace: Folder) -> Iterator[str]:
-    """Yield a sentence for each adopted effect that tied with others when it was adopted."""
+def _not_compared(workspace: Folder) -> Iterator[Finding]:
+    """Yield a finding for each adopted effect that tied with others when it was adopted."""
     same = equivalent_when_adopted(workspace)
     for name, others in tied_when_adopted(workspace).items():
-        if name in same:
-            yield (
-                f"{name} is part of the model and equivalent in it to {' or '.join(others)}: no "
-                "trial can tell them apart"
-            )
-            continue
-        yield (
-            f"{name} is part of the model, but when it was adopted the trials could not tell it "
-            f"from {' or '.join(others)}; this diagnosis does not compare them again"
-        )
-
-
-def _deeper(found: Diagnosis, took: float) -> str:
-    """Offer a diagnosis of more effects, with its time by that of this one; "" if none is due.
-
-    Args:
-        found: the diagnosis.
-        took: how long it took [s].
-    """
-    from grounded_trials.workspace.next_step import to_look_deeper
-
-    then = to_look_deeper(found)
-    if then is None:
-        return ""
-    least = duration(took * found.verdict.look_for / max(len(found.effects), 1))
-    return (
-        f"Or look for more causes before adopting these: `{rendered(then)}`, which takes {least} "
-        f"or more (this diagnosis took {duration(took)})."
-    )
+        code = "gap.equivalent" if name in same else "gap.not_compared"
+        yield finding(code, name, effect=name, others=others)
 
 
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
@@ -213,8 +162,8 @@ def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
     )
 
 
-def _in_vain(workspace: Folder, found: Diagnosis) -> str:
-    """Suggest undoing an adoption if later candidates lost in a row for no known cause; else "".
+def _in_vain(workspace: Folder, found: Diagnosis) -> Finding | None:
+    """Suggest undoing an adoption if later candidates lost in a row for no known cause.
 
     If predictions are better with the adopted effects than before, the losses have another cause.
     """
@@ -226,21 +175,16 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     paid = gain(found.prediction_error, "outset", "crude") > 0
     claims = found.kind in ("effect", "several")
     if not names or found.no_cause or claims or not left_open(found) or paid:
-        return ""
+        return None
     lost, model = 0, workspace.planner.fingerprint
     for tried in reversed(standing_in(workspace).history):
         if tried.accepted or tried.candidate.model != model:
             break
         lost += tried.accepted is False
-    if lost < LOST:
-        return ""
-    return (
-        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: undo the "
-        "last adoption with `grounded adopt --undo`, then diagnose again."
-    )
+    return finding("gap.next.undo", *names, lost=lost) if lost >= LOST else None
 
 
-def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault, ...]:
     """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
     from grounded.accounts.sound_trials import sound_trials
 
@@ -276,18 +220,15 @@ def unwritten_in(workspace: Folder) -> list[str]:
 
 def _probe(
     workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
-) -> tuple[str, str]:
-    """Write the candidate that would separate two tied effects; return (id, sentence).
+) -> tuple[str, Finding | None]:
+    """Write the candidate that would separate two tied effects; return its id and the next step.
 
     The candidate is one that `run` and `export` accept: inside the current [limits], and inside
     [safety] with a margin as large as runs have strayed. With `write` one is written even if
-    nothing is tied. The id is "" if none is written.
+    nothing is tied. The id is "" if none is written, the step None if that of the diagnosis holds.
     """
-    none = f"{found.next_trial.rstrip('.')}. No probe is written"
-    if found.no_cause:
-        return "", f"{none}: these trials can't identify any cause." * write
-    if found.changed and not write:
-        return "", ""  # of one of the two robots, which is to be diagnosed alone
+    if found.no_cause or (found.changed and not write):
+        return "", None  # the latter: of one of two robots, which is to be diagnosed alone
     from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.candidates.handover import outside_limits
@@ -297,17 +238,13 @@ def _probe(
     best = now.incumbent
     ties = {*found.indistinguishable} - {*found.equivalent}
     if best is None:
-        if write:
-            return "", f"{none}: a probe varies the best candidate, and no run was complete."
-        later = f"`{rendered(PROBE)}` makes the candidate once a run was complete"
-        return "", f"{found.next_trial.rstrip('.')} ({later}; or record such a log)." * bool(ties)
+        return "", finding("gap.next.no_run") if write else None
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
     offer = write or bool(ties)
-    why = "none of those tried stays inside [safety] and near the stored trials"
     plan = _near(planner, trials)
     for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
@@ -315,22 +252,18 @@ def _probe(
         if made is None:
             break
         worth = not made.little or (write and (not ties or made.expected >= NOTHING))
-        said = made.sentence
-        if found.contested or not (worth or ties):  # it is the trial that is asked for, if one
-            said = f"{found.next_trial} {begun(said)}"
-        if not worth:
-            return "", f"{said.rstrip('.')}.{' No probe is written.' * write}"
-        if not offer:
-            return "", f"{said.rstrip('.')} (`{rendered(PROBE)}` makes the candidate)."
+        asks = offer and not found.contested  # it is the trial that is asked for, if one
+        if not (worth and offer):
+            return "", made.step if asks else None
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
             while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
                 workspace.forget_trials()  # another process took the name
                 candidate = replace(candidate, id=workspace.next_id())
-            return saved.id, said
-        why = "; ".join(reasons).replace(candidate.id, "the best")
-    return "", f"{found.next_trial.rstrip('.')}; no candidate for it is offered: {why}" * offer
+            facts = {**made.step.facts, "candidate": saved.id}
+            return saved.id, replace(made.step, facts=facts)
+    return "", finding("gap.next.unsafe") if offer else None
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result, measured_alike
+from grounded.findings import Finding, Quantity, settle
+from grounded.findings import found as finding
+from grounded.result import Result
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
@@ -24,7 +26,7 @@ from grounded_trials.workspace.next_step import after_fit, to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
 if TYPE_CHECKING:
-    from grounded.accounts.finding import Finding
+    from grounded.accounts.finding import Finding as Fault
     from grounded.engine import Engine
     from grounded.fit import Fit
 
@@ -35,12 +37,24 @@ class Fitted(Result):
 
     fit: Fit
     applied: bool
-    preflight: tuple[Finding, ...]  # findings about the instruments
+    preflight: tuple[Fault, ...]  # findings about the instruments
     then: NextCommand  # the command to type next
     not_fitted: tuple[str, ...] = ()  # adopted delays that the intervals take as exact
     trials: tuple[str, ...] = ()  # the trials that were fitted
     rows_s: float = 0.0  # rows of a table, between which a command was sent; in delays' intervals
     interpolated_s: float = 0.0  # standard deviation of times by interpolated states; in them, too
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What to know of the fit, the heaviest first."""
+        told = list(self.fit.findings)
+        if self.not_fitted:
+            told.append(finding("model.delay_kept", *self.not_fitted))
+        if self.rows_s or self.interpolated_s:
+            told.append(finding("model.times", rows=self.rows_s, early=self.interpolated_s))
+        if self.fit.helps and not self.applied:
+            told.append(finding("model.stands_in"))
+        return settle(told)
 
     def summary(self) -> str:
         """Return the fitted values."""
@@ -55,6 +69,7 @@ class Fitted(Result):
             "rows_s": self.rows_s,
             "interpolated_s": self.interpolated_s,
             "preflight": [one.to_json() for one in self.preflight],
+            "findings": [one.to_json() for one in self.findings],
         }
 
 
@@ -93,7 +108,9 @@ def fit_in(
         progress=progress,
     )
     late = [n for n in found.params if n in adopted or n.startswith("latency")]
-    found = _as_rows_tell(found.of_share(share.sentence), late, rows)
+    found = _as_rows_tell(found, late, rows)
+    if share.finding is not None:
+        found = replace(found, findings=(*found.findings, share.finding))
     seen = where_to_mend(workspace, used, found.preflight)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
@@ -104,10 +121,9 @@ def fit_in(
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
     fitted = partial(fitted, rows_s=rows * bool(late), interpolated_s=early)
     if apply and not np.isfinite(found.loglik):
-        raise GroundedError(f"nothing was written: {found.sentence}", then=after_fit(workspace))
+        raise GroundedError(found.findings[0], then=after_fit(workspace))
     if apply and found.worse:
-        why = f"nothing was written: {_worse(found)}"
-        raise GroundedError(why, then=after_fit(workspace))
+        raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
         if not found.helps:
             return fitted(applied=False, then=after_fit(workspace))
@@ -158,19 +174,16 @@ def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
     return tuple(name for name in delays if param_name(name, "d") not in found.params)
 
 
-def _worse(found: Fit) -> str:
-    """Return a sentence on how much worse a fit predicts, with the most affected state."""
+def _worse(found: Fit) -> Finding:
+    """Return how much worse a fit predicts, with the most affected state."""
     before, after = found.before, found.after
     assert before is not None and after is not None
     ratio = np.nan_to_num(after.ahead / before.ahead, nan=-np.inf)
     i = int(np.argmax(ratio))
-    name, unit = before.names[i], found.model.states.get(before.names[i], "")
-    off, then = measured_alike([after.ahead[i], before.ahead[i]], unit)
-    return (
-        "the fitted values predict held-out trials worse than the model's current values "
-        f"({name} {before.horizon_s:.3g} s ahead: off by {off} instead of {then}); they compensate "
-        "for something else that the model lacks"
-    )
+    unit = found.model.states.get(before.names[i], "")
+    now, then = (Quantity(float(errors.ahead[i]), unit) for errors in (after, before))
+    ahead = before.horizon_s
+    return finding("model.fit_worse", state=before.names[i], ahead=ahead, now=now, before=then)
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:

@@ -54,7 +54,7 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
         document = read_document(path)
         from grounded.diagnosis.report import Diagnosis  # slow, and seldom needed
 
-        return _with_limit(Diagnosis.from_json(document))
+        return Diagnosis.from_json(document)
     except FileNotFoundError:
         return None
     except (ValueError, RecursionError, GroundedError) as error:
@@ -69,15 +69,6 @@ def readable_diagnosis(folder: Path) -> Diagnosis | None:
         return read_diagnosis(folder)
     except GroundedError:
         return None
-
-
-def _with_limit(found: Diagnosis) -> Diagnosis:
-    """Add `Verdict.limit` to a diagnosis of an older version, which has it only in the sentence."""
-    said = found.verdict
-    if said.limit or said.kind != "unknown":
-        return found
-    why = next((text for text in found.unknowable if text in said.sentence), "")
-    return replace(found, verdict=replace(said, limit=why))
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:
@@ -250,7 +241,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 
 def _new_repeats(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> tuple[str, ...]:
     """Return the runs of one candidate that tell the noise, if a diagnosis did not know it."""
-    from grounded.diagnosis.ruler_words import open_noise
+    from grounded.diagnosis.errors_told import open_noise
 
     if not open_noise(diagnosis.prediction_error):
         return ()

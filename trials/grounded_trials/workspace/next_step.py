@@ -236,30 +236,9 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 
 def left_open(found: Diagnosis) -> bool:
     """Return whether a diagnosis leaves something that noise is not known to explain."""
-    from grounded.diagnosis.ruler_words import open_noise
+    from grounded.diagnosis.errors_told import open_noise
 
     return found.kind != "none" or bool(open_noise(found.prediction_error))
-
-
-def nothing_to_do(found: Diagnosis, best: str) -> str:
-    """Return a text for a search that has ended although part of the gap is unexplained.
-
-    The verdict itself says which part that is.
-
-    Args:
-        found: the diagnosis of the current model and trials, without claims left to adopt.
-        best: the candidate that the search ended with.
-    """
-    return (
-        f"No trial is needed for the manoeuvre: the search has ended, with {best}. "
-        + "To learn more: " * (not found.contested)
-        + (found.next_trial if found.contested else _inside(found.next_trial))
-    )
-
-
-def _inside(sentence: str) -> str:
-    """Return a sentence to follow a colon."""
-    return f"{sentence[:1].lower()}{sentence[1:]}"
 
 
 def _standing_ahead(workspace: Folder) -> Standing:
@@ -293,7 +272,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """
     if (first := _to_read_again(workspace, diagnosis)) is not None:
         return first
-    from grounded.diagnosis.cause_words import sign_only
+    from grounded.diagnosis.causes import sign_only
     from grounded.diagnosis.error_report import gain
 
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
@@ -340,7 +319,7 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:
     """
     if diagnosis is None or since_diagnosis(workspace, diagnosis, usable_ids(workspace)).changed:
         return ""
-    then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.clauses or diagnosis.effects
+    then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
     if then is None or then.verb not in ("adopt", "fit") or not clauses:
         return ""
     more = f", and {count(len(clauses) - 1, 'more cause')}" * (len(clauses) > 1)
@@ -355,21 +334,3 @@ def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
     from grounded.effects.joint import like_a_load
 
     return like_a_load(workspace.planner.plan.model, effects)
-
-
-def to_look_deeper(diagnosis: Diagnosis) -> NextCommand | None:
-    """Return the same diagnosis with more effects allowed; None if this one left no more to name.
-
-    What it did name can be adopted before.
-    """
-    effects, made = diagnosis.verdict.look_for, made_from(diagnosis)
-    if not effects:
-        return None
-    asked: tuple[str, ...] = ()
-    if made.compared:
-        asked = ("--compare", ",".join(made.named), ",".join(made.compared))
-    elif made.named:
-        asked = ("--trials", ",".join(made.named))
-    if made.without:
-        asked += ("--without", ",".join(made.without))
-    return NextCommand("diagnose", (*asked, "--max-effects", str(effects)))

@@ -1,0 +1,166 @@
+"""remarks: what is found beside the lines of a diagnosis, as findings; words are in the catalogue."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+
+from grounded.accounts.finding import in_the_log
+from grounded.diagnosis.causes import effect_of, furthest_apart, sign_only, value_called
+from grounded.diagnosis.error_report import furthest
+from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise, worse_states
+from grounded.diagnosis.parts import Diagnosed, Estimate
+from grounded.diagnosis.tables import values_of
+from grounded.findings import Finding, Quantity, found
+from grounded.model import Model
+
+CLOSE = 0.2  # relative distance of a gain from a power of ten
+NEARLY = 0.95  # share of a claimed effect's signal from which another makes nearly the same
+
+
+def quantity(e: Estimate) -> Quantity:
+    """Return an estimate as a fact."""
+    return Quantity(e.value, e.unit, e.std)
+
+
+def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield what a person should know beside the verdict, the errors and the gap.
+
+    Args:
+        d: the diagnosis.
+        model: the model that was diagnosed.
+        adopted: adopted effects, whose values are parameters of the model.
+    """
+    if d.no_cause:
+        return
+    yield from _of_groups(d, adopted)
+    for group in d.indistinguishable:
+        same = group in d.equivalent
+        first, *others = group
+        yield found(f"gap.{'equivalent' if same else 'tie'}", *group, effect=first,
+                    others=tuple(others))  # fmt: skip
+    for one in d.lookalikes:
+        if one.share >= 1.0:
+            yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
+        elif one.share > NEARLY:
+            yield found("gap.alike", one.effect, effect=one.effect, like=one.like)
+    for one in d.unconfirmed:
+        yield found(
+            "gap.unconfirmed",
+            one.effect,
+            nats=one.evidence,
+            effect=one.effect,
+            values=", ".join(f"{name} = {e.text}" for name, e in one.params.items()),
+            seen=one.seen[0],
+            trials=one.seen[1],
+            repeats=one.repeats,
+            trial=None if one.repeats else one.trial,
+            place=one.region.told if one.region else None,
+        )
+    for row in (row for row in d.ranking if row.no_better):
+        yield found("gap.no_better", row.effect, nats=row.evidence, effect=row.effect)
+    if d.effects or d.verdict.parameters:
+        yield from _of_errors(d)
+        yield from _of_values(d, adopted)
+        yield from _of_model(d, model)
+    if d.motions == 1 < d.trials and (d.leftover or d.unconfirmed):
+        yield found("gap.one_motion")
+    if not d.leftover and (state := open_noise(d.prediction_error)):
+        yield found("gap.noise", state=state)
+    if d.correction is not None and d.correction.adoptable:
+        one = d.correction
+        yield found(
+            "gap.correction",
+            one.channel,
+            over=one.over,
+            gain=one.held_out_gain,
+            state=one.channel,
+        )
+    if odd := in_the_log(d.preflight):
+        yield found("gap.corrected", *(one.signal for one in odd))
+
+
+def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
+    """What changed between two groups of trials, or where trials disagree."""
+    for one in d.changed or ():
+        own = one.effect.startswith("parameter:")
+        value = value_called(one.quantity, adopted) if own else f"{one.quantity} of {one.effect}"
+        ends = {"first": quantity(one.first), "second": quantity(one.second)}
+        yield found("gap.changed", one.effect, nats=one.evidence, value=value, **ends)
+    if d.changed is not None and not d.changed:
+        yield found("gap.unchanged")
+    for one in d.agreement if d.changed is None else ():
+        values = [v for v in d.per_trial if (v.effect, v.quantity) == (one.effect, one.quantity)]
+        if one.agrees or len(values) < 2:
+            continue
+        low, high = furthest_apart(values)
+        ends = (Quantity(v.value, one.estimate.unit, v.std) for v in (low, high))
+        yield found(
+            "gap.disagree",
+            one.effect,
+            quantity=one.quantity,
+            effect=one.effect,
+            **dict(zip(("low", "high"), ends, strict=True)),
+            trial=low.trial,
+            trial2=high.trial,
+            goes_with=one.goes_with,
+        )
+
+
+def _of_errors(d: Diagnosed) -> Iterator[Finding]:
+    """Errors that grow, and those that stay above the noise without a cause."""
+    rows = d.prediction_error
+    _, row, name = lost_most(rows)
+    if row is not None and worse_states(rows):
+        ahead = 0.0 if row.whole_trial else row.horizon_s
+        ends = errors(row, name, now="with_effects", before="crude")
+        yield found("gap.worse", name, state=name, ahead=ahead, whole=row.whole_trial, **ends)
+    if (above := excess(rows)) and not d.leftover:
+        yield found("gap.small", above[1], state=above[1], times=above[0])
+
+
+def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
+    """What values rest on, stopped at, and may be zero."""
+    from grounded.diagnosis.likelihood.levels import SURE
+
+    rests: dict[tuple[str, ...], list[str]] = {}
+    for name, on in d.conditions.items():
+        rests.setdefault(on, []).append(value_called(name, adopted))
+    for on, names in rests.items():
+        yield found("model.given", *names, rests=on)
+    if stopped := [name for name, e in d.parameters.items() if e.stopped]:
+        yield found("model.at_bound", *stopped)
+    if lost := [name for name in d.parameters if name not in d.known_parameters]:
+        yield found("model.not_told", *(value_called(name, adopted) for name in lost))
+    of = {name: effect_of(name, adopted) for name in d.parameters}
+    for effect in sorted({*of.values()} - {""}):
+        name, *more = (name for name, own in of.items() if own == effect)
+        e = d.parameters[name]
+        if not more and abs(e.value) < SURE * e.std:
+            yield found("model.unneeded", effect, effect=effect, value=quantity(e))
+    for row in (row for row in d.ranking if row.claimed and row.effect.startswith("input_gain:")):
+        if sign_only(row.effect, row.params):
+            yield found("gap.sign", row.effect, input=row.effect.partition(":")[2])
+        elif _power_of_ten(1 + row.params["g"].value):
+            yield found("gap.unit", row.effect, effect=row.effect)
+
+
+def _power_of_ten(ratio: float) -> bool:
+    power = round(math.log10(ratio)) if ratio > 0 else 0
+    return power != 0 and abs(ratio / 10.0**power - 1) <= CLOSE
+
+
+def _of_model(d: Diagnosed, model: Model) -> Iterator[Finding]:
+    """What the model's structure lets a claimed effect stand for."""
+    from grounded import places
+    from grounded.diagnosis.validation.limits import joints_without_input
+
+    names = {*d.effects}
+    if any(name.startswith("sensor_scale:") for name in names):
+        for state, rate in places.only_read(model).items():
+            if f"sensor_scale:{state}" in names:
+                yield found("model.gear", state, state=state, rate=rate)
+    if any(name.startswith("sensor_bias:") for name in names):
+        level = [name for name in places.levelled(model) if f"sensor_bias:{name}" in names]
+        yield from [found("model.level", *level)] * bool(level)
+    yield from joints_without_input(model, d.effects)

@@ -1,0 +1,175 @@
+"""told: a diagnosis as lines, a table of causes, findings and the next step.
+
+Terminal, report, page, notebook and recording take all of it from here. The words stand in the
+catalogue (`gap`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from grounded.diagnosis.error_report import CALIBRATION
+from grounded.diagnosis.errors_told import errors, excess, noise_unknown, states_told, telling
+from grounded.diagnosis.parts import NEXT, Diagnosed
+from grounded.diagnosis.tables import Cells, values_of
+from grounded.findings import Finding, Quantity, found, settle
+from grounded.result import begun, measured, number, percent
+
+CAUSES = 3  # told in words; the table has all
+FINDINGS = 3  # told beside the lines; the others with --details
+LEAST_SHARE = 0.005  # of the gap: a channel below it is not told
+
+
+@dataclass(frozen=True)
+class Told:
+    """What is told of a diagnosis: findings by role, and the table of its causes."""
+
+    lines: tuple[Finding, ...]  # what, how good, and what is open
+    rows: tuple[Cells, ...]
+    header: Cells
+    findings: tuple[Finding, ...]  # all others, the heaviest first
+    next: str
+
+    def texts(self, most: int | None = FINDINGS) -> list[str]:
+        """Return the lines as sentences, and as many findings; None: all of them."""
+        return [sentence(one) for one in (*self.lines, *self.findings[:most])]
+
+
+def sentence(one: Finding) -> str:
+    """Return a finding as a sentence of its own."""
+    return f"{begun(one.sentence)}."
+
+
+def told(diagnosis: Diagnosed, now: str = "with_effects", before: str = "crude") -> Told:
+    """Return what is told of a diagnosis.
+
+    Args:
+        diagnosis: what was found.
+        now: the column of `RulerRow` with the errors of the model that is told.
+        before: the column of those before.
+    """
+    rows, header = cause_table(diagnosis)
+    rest = settle(one for one in diagnosis.findings if not one.code.startswith(NEXT))
+    lines = (_what(diagnosis), *_errors(diagnosis, now, before), *_open(diagnosis))
+    if diagnosis.no_cause:  # what was fitted then means nothing
+        lines, rows = lines[:1], ()
+    return Told(lines, rows, header, rest, diagnosis.next_trial)
+
+
+def cause_table(diagnosis: Diagnosed) -> tuple[tuple[Cells, ...], Cells]:
+    """Return rows and header of the causes, the largest first, each with what ties with it."""
+    rows, own = list[Cells](), diagnosis.known_parameters
+    for one in diagnosis.credit:
+        row = diagnosis.ranked(one.of)
+        values = "" if row is None else values_of(row)
+        if one.of == CALIBRATION:
+            names = [name for name in diagnosis.verdict.parameters if name in own]
+            texts = [(name, f"{own[name].text}{_was(diagnosis, name)}") for name in names]
+            shares = (percent(one.share), *("" for _ in texts))
+            rows += [(*text, share) for text, share in zip(texts, shares, strict=False)]
+            continue
+        rows.append((one.of, values, percent(one.share)))
+        groups = [group for group in diagnosis.indistinguishable if one.of in group]
+        for name in dict.fromkeys(name for group in groups for name in group if name != one.of):
+            tied = diagnosis.ranked(name)
+            rows.append((f"or {name}", "" if tied is None else values_of(tied), ""))
+    return tuple(rows), ("cause", "value", "share")
+
+
+def _was(d: Diagnosed, name: str) -> str:
+    known = {} if d.made is None else d.made.nominal
+    return f", was {number(known[name])}" if name in known else ""
+
+
+def _what(d: Diagnosed) -> Finding:
+    """The causes, or that there is none."""
+    causes, left = d.verdict.causes, any(one.above for one in d.leftover)
+    if d.no_cause:
+        return found("gap.too_few")
+    if causes:
+        tied = any(name in group for group in d.indistinguishable for name in d.effects)
+        more = len(causes) - CAUSES
+        words = "; ".join(causes[:CAUSES])
+        return found(
+            "gap.causes", *d.effects, causes=words, more=max(more, 0), tied=tied, left=left
+        )
+    row = telling(d.prediction_error)
+    if d.kind == "unknown":
+        return found("gap.unknown", noise=not d.leftover, groups=bool(d.changed))
+    known = row is not None and any(error > 0 for error in row.noise_floor.values())
+    adopted = bool(d.made and d.made.adopted)
+    return found("gap.none", known=known and not excess(d.prediction_error), adopted=adopted)
+
+
+def _errors(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
+    """How far predictions are off, and were."""
+    if (row := telling(d.prediction_error)) is None:
+        return
+    names = states_told(row, d.tracked)
+    facts: dict[str, Quantity] = {}
+    for end, name in zip(("", "2"), names, strict=False):
+        facts |= errors(row, name, **{f"now{end}": now, f"before{end}": before})
+        pair = [facts.get(f"{slot}{end}", Quantity(math.nan)) for slot in ("now", "before")]
+        if len({measured(one.value, one.unit) for one in pair}) == 1:
+            facts.pop(f"before{end}", None)
+    if "now" not in facts:
+        return
+    if not noise_unknown(row, names):  # beside a bound the error would look like noise
+        facts |= errors(row, names[0], noise="noise_floor")
+    yield found(
+        "gap.errors",
+        *names,
+        state=names[0],
+        state2=names[1] if len(names) > 1 else None,
+        whole=row.whole_trial,
+        ahead=0.0 if row.whole_trial else row.horizon_s,
+        who="it" if now == "with_effects" and d.verdict.causes else "the model",
+        bound="yes" if row.floor_bound else "no",
+        inside=row.held_out == "no",
+        **facts,
+    )
+
+
+def _open(d: Diagnosed) -> Iterator[Finding]:
+    """What no known effect explains, or else where the gap is."""
+    if d.leftover:
+        left, others = d.leftover[0], len(d.leftover) - 1
+        place = None if left.region is None else left.region.told
+        if not math.isfinite(left.error) or (not left.above and math.isfinite(left.size)):
+            size = Quantity(left.size, left.unit)
+            yield found("gap.lacks", left.channel, state=left.channel, size=size, place=place,
+                        others=others)  # fmt: skip
+            return
+        noise = Quantity(left.floor, left.error_unit) if 0 < left.floor < math.inf else None
+        facts = {} if left.part is None else {"part": left.part.share, "trial": left.part.trial}
+        yield found(
+            "gap.left",
+            left.channel,
+            state=left.channel,
+            error=Quantity(left.error, left.error_unit),
+            ahead=left.horizon_s,
+            noise=noise,
+            bound="yes" if left.floor_at_most else "no",
+            place=None if left.part else place,
+            start=left.part.start if left.part else None,
+            end=left.part.end if left.part else None,
+            others=others,
+            **facts,
+        )
+        return
+    channels = [one for one in d.where.channels if one.share >= LEAST_SHARE]  # NaN: only noise
+    if not channels:
+        return
+    first, second, region = channels[0], channels[1:2], d.where.regions[:1]
+    yield found(
+        "gap.where",
+        *(one.name for one in channels),
+        state=first.name,
+        share=first.share,
+        state2=second[0].name if second else None,
+        share2=second[0].share if second else None,
+        part=region[0].share if region else None,
+        place=region[0].told if region else None,
+    )
