@@ -53,8 +53,8 @@ def command(json_: bool) -> None:
         show(field("discarded", f"{name}{why and ': ' + why}"))
     if settled:
         show(f"\n{table(settled.rows, ('adopted', 'value'))}")
-        for text in filter(None, (settled.gained, settled.briefly)):
-            show("\n".join(wrapped(text, "  ", "  ")))
+        for one in filter(None, (settled.gained, settled.open)):
+            show("\n".join(wrapped(one.sentence, "  ", "  ")))
     if status.outdated:
         show("\n" * bool(settled) + field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")

@@ -6,7 +6,7 @@ Read `diagnose` first; its docstring lists the stages. `report` holds the result
     hypotheses/    search for the effects: hypotheses are made, fitted and compared
     validation/    held-out prediction errors in units, and the decision what is claimed
     writer         the result: facts, `remarks` and `next_step` as findings
-    telling        what is told of it, in lines, a table and findings; takes the words of the catalogue
+    telling        what is told of it: lines, a table, findings and the next step
     excitation     the next trial, which would separate tied effects, from `patterns`
     tables         errors, compared effects and sensors in rows
     pictures       the result in figures

@@ -1,4 +1,4 @@
-"""Which held-out prediction errors are told: the horizon, the states, and whether they are noise."""
+"""Which held-out prediction errors are told: the horizon, the states, whether they are noise."""
 
 from __future__ import annotations
 

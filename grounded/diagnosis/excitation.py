@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -155,7 +156,7 @@ def probe(
         return None
     most, chosen, words = best
     expected = trust * most
-    pair = {"effect": group[0], "others": group[1]}
+    pair: dict[str, Any] = {"effect": group[0], "others": group[1]}
     if expected >= NATS:
         step = found("gap.next.probe", *group[:2], nats=expected, probe=words, **pair)
         return Probe(chosen, expected, (group[0], group[1]), step)
@@ -228,7 +229,7 @@ def _teaching(
     if motion:
         step = found("gap.next.probe", name, probe=words, motion=True)
     elif not little:
-        ends = {"then": Quantity(then, of), "now": Quantity(now, of)}
+        ends: dict[str, Any] = {"then": Quantity(then, of), "now": Quantity(now, of)}
         twice_run = 2 if again else None
         step = found("gap.next.probe", name, probe=words, value=called, runs=twice_run, **ends)
     return Probe(chosen, gain, (name,), step, little, then, 1 + again)

@@ -1,16 +1,15 @@
-"""remarks: what is found beside the lines of a diagnosis, as findings; words are in the catalogue."""
+"""remarks: what is found beside the lines of a diagnosis; words are in the catalogue."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
+from typing import Any
 
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.causes import effect_of, furthest_apart, sign_only, value_called
-from grounded.diagnosis.error_report import furthest
 from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise, worse_states
 from grounded.diagnosis.parts import Diagnosed, Estimate
-from grounded.diagnosis.tables import values_of
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 
@@ -44,18 +43,18 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
             yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
         elif one.share > NEARLY:
             yield found("gap.alike", one.effect, effect=one.effect, like=one.like)
-    for one in d.unconfirmed:
+    for seen in d.unconfirmed:
         yield found(
             "gap.unconfirmed",
-            one.effect,
-            nats=one.evidence,
-            effect=one.effect,
-            values=", ".join(f"{name} = {e.text}" for name, e in one.params.items()),
-            seen=one.seen[0],
-            trials=one.seen[1],
-            repeats=one.repeats,
-            trial=None if one.repeats else one.trial,
-            place=one.region.told if one.region else None,
+            seen.effect,
+            nats=seen.evidence,
+            effect=seen.effect,
+            values=", ".join(f"{name} = {e.text}" for name, e in seen.params.items()),
+            seen=seen.seen[0],
+            trials=seen.seen[1],
+            repeats=seen.repeats,
+            trial=None if seen.repeats else seen.trial,
+            place=seen.region.told if seen.region else None,
         )
     for row in (row for row in d.ranking if row.no_better):
         yield found("gap.no_better", row.effect, nats=row.evidence, effect=row.effect)
@@ -67,15 +66,9 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
         yield found("gap.one_motion")
     if not d.leftover and (state := open_noise(d.prediction_error)):
         yield found("gap.noise", state=state)
-    if d.correction is not None and d.correction.adoptable:
-        one = d.correction
-        yield found(
-            "gap.correction",
-            one.channel,
-            over=one.over,
-            gain=one.held_out_gain,
-            state=one.channel,
-        )
+    if (curve := d.correction) is not None and curve.adoptable:
+        state, gain = curve.channel, curve.held_out_gain
+        yield found("gap.correction", state, over=curve.over, gain=gain, state=state)
     if odd := in_the_log(d.preflight):
         yield found("gap.corrected", *(one.signal for one in odd))
 
@@ -85,25 +78,28 @@ def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
     for one in d.changed or ():
         own = one.effect.startswith("parameter:")
         value = value_called(one.quantity, adopted) if own else f"{one.quantity} of {one.effect}"
-        ends = {"first": quantity(one.first), "second": quantity(one.second)}
-        yield found("gap.changed", one.effect, nats=one.evidence, value=value, **ends)
+        first, second = quantity(one.first), quantity(one.second)
+        yield found(
+            "gap.changed", one.effect, nats=one.evidence, value=value, first=first, second=second
+        )
     if d.changed is not None and not d.changed:
         yield found("gap.unchanged")
-    for one in d.agreement if d.changed is None else ():
-        values = [v for v in d.per_trial if (v.effect, v.quantity) == (one.effect, one.quantity)]
-        if one.agrees or len(values) < 2:
+    for test in d.agreement if d.changed is None else ():
+        values = [v for v in d.per_trial if (v.effect, v.quantity) == (test.effect, test.quantity)]
+        if test.agrees or len(values) < 2:
             continue
         low, high = furthest_apart(values)
-        ends = (Quantity(v.value, one.estimate.unit, v.std) for v in (low, high))
+        unit = test.estimate.unit
         yield found(
             "gap.disagree",
-            one.effect,
-            quantity=one.quantity,
-            effect=one.effect,
-            **dict(zip(("low", "high"), ends, strict=True)),
+            test.effect,
+            quantity=test.quantity,
+            effect=test.effect,
+            low=Quantity(low.value, unit, low.std),
+            high=Quantity(high.value, unit, high.std),
             trial=low.trial,
             trial2=high.trial,
-            goes_with=one.goes_with,
+            goes_with=test.goes_with,
         )
 
 
@@ -113,7 +109,7 @@ def _of_errors(d: Diagnosed) -> Iterator[Finding]:
     _, row, name = lost_most(rows)
     if row is not None and worse_states(rows):
         ahead = 0.0 if row.whole_trial else row.horizon_s
-        ends = errors(row, name, now="with_effects", before="crude")
+        ends: dict[str, Any] = errors(row, name, now="with_effects", before="crude")
         yield found("gap.worse", name, state=name, ahead=ahead, whole=row.whole_trial, **ends)
     if (above := excess(rows)) and not d.leftover:
         yield found("gap.small", above[1], state=above[1], times=above[0])

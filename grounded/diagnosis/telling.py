@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.errors_told import errors, excess, noise_unknown, states_told, telling
@@ -52,7 +53,7 @@ def told(diagnosis: Diagnosed, now: str = "with_effects", before: str = "crude")
     """
     rows, header = cause_table(diagnosis)
     rest = settle(one for one in diagnosis.findings if not one.code.startswith(NEXT))
-    lines = (_what(diagnosis), *_errors(diagnosis, now, before), *_open(diagnosis))
+    lines = (_what(diagnosis), *errors_line(diagnosis, now, before), *open_line(diagnosis))
     if diagnosis.no_cause:  # what was fitted then means nothing
         lines, rows = lines[:1], ()
     return Told(lines, rows, header, rest, diagnosis.next_trial)
@@ -103,12 +104,12 @@ def _what(d: Diagnosed) -> Finding:
     return found("gap.none", known=known and not excess(d.prediction_error), adopted=adopted)
 
 
-def _errors(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
+def errors_line(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
     """How far predictions are off, and were."""
     if (row := telling(d.prediction_error)) is None:
         return
     names = states_told(row, d.tracked)
-    facts: dict[str, Quantity] = {}
+    facts: dict[str, Any] = {}
     for end, name in zip(("", "2"), names, strict=False):
         facts |= errors(row, name, **{f"now{end}": now, f"before{end}": before})
         pair = [facts.get(f"{slot}{end}", Quantity(math.nan)) for slot in ("now", "before")]
@@ -132,7 +133,7 @@ def _errors(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
     )
 
 
-def _open(d: Diagnosed) -> Iterator[Finding]:
+def open_line(d: Diagnosed) -> Iterator[Finding]:
     """What no known effect explains, or else where the gap is."""
     if d.leftover:
         left, others = d.leftover[0], len(d.leftover) - 1
@@ -143,7 +144,9 @@ def _open(d: Diagnosed) -> Iterator[Finding]:
                         others=others)  # fmt: skip
             return
         noise = Quantity(left.floor, left.error_unit) if 0 < left.floor < math.inf else None
-        facts = {} if left.part is None else {"part": left.part.share, "trial": left.part.trial}
+        facts: dict[str, Any] = (
+            {} if left.part is None else {"part": left.part.share, "trial": left.part.trial}
+        )
         yield found(
             "gap.left",
             left.channel,
@@ -153,8 +156,6 @@ def _open(d: Diagnosed) -> Iterator[Finding]:
             noise=noise,
             bound="yes" if left.floor_at_most else "no",
             place=None if left.part else place,
-            start=left.part.start if left.part else None,
-            end=left.part.end if left.part else None,
             others=others,
             **facts,
         )

@@ -111,7 +111,6 @@ class Writer:
         told = {one.effect for one in seen}.union(*groups)
         ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
-        ties = [group for group in groups if group not in same]
         moved, parameters = len(data.groups), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
         combinations = self.claims.by_priors.combinations
@@ -195,7 +194,7 @@ class Writer:
         ties = [group for group in d.indistinguishable if group not in d.equivalent]
         doubt = objection(rows, d.agreement, d.effects, ties, d.leftover)
         step = next_step(d, self.claims, doubt, off, self.task, self.trials, self.adopted)
-        more = ()
+        more: tuple[Finding, ...] = ()
         if d.leftover and len(self.claims.names) == self.most and not d.no_cause:
             more = (found("gap.more", most=self.most, deeper=d.verdict.look_for > 0),)
         return (*known, *more, *remarks(d, self.data.model, self.adopted), step)

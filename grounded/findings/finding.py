@@ -117,7 +117,7 @@ def found(
     weight: Weight | None = None,
     **facts: Fact | None,
 ) -> Finding:
-    """Return a finding with the weight of its entry, see `Finding`; facts that are None are left out."""
+    """Return a finding with the weight of its entry; facts that are None are left out."""
     weighs = weight or Weight(entry_of(code).weight)
     known = {name: value for name, value in facts.items() if value is not None}
     return Finding(code, about, known, weighs, nats, then)

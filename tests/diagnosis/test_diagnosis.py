@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 
 from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -16,7 +17,6 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.parts import Ranked
 from grounded.diagnosis.validation.blame import fewest, loss, still
-from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from small_tasks import DT, plain_task, pushed_cart

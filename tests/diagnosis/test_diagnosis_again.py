@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.cause_words import meaning
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.cause_words import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch

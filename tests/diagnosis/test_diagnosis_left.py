@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from grounded.diagnosis.cause_words import give_or_take
+
 from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.measured import Measured

@@ -5,12 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from grounded import Trial
-from grounded.diagnosis.error_report import AT_MOST, Remainder, RulerRow, furthest, runaway
 from grounded.diagnosis.next_trial import LOG, LOST
-from grounded.diagnosis.parts import Agreement, Verdict
-from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.ruler_words import (
     in_doubt,
     objection,
@@ -20,9 +15,14 @@ from grounded.diagnosis.ruler_words import (
     telling,
     worsened,
 )
+from grounded.diagnosis.verdict import verdict
+
+from grounded import Trial
+from grounded.diagnosis.error_report import AT_MOST, Remainder, RulerRow, furthest, runaway
+from grounded.diagnosis.parts import Agreement, Verdict
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import error_table
 from grounded.diagnosis.unconfirmed import unrepeatable
-from grounded.diagnosis.verdict import verdict
 from small_tasks import cart_task
 
 

@@ -4,17 +4,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-
 from grounded.diagnosis.cause_words import meaning
+from grounded.diagnosis.verdict import verdict
+from grounded_trials.report.diagnosis_words import calibrated_sentence
+
 from grounded.diagnosis.error_report import Credit
 from grounded.diagnosis.parts import Estimate, Identifiable, Ranked, Verdict
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.tables import EFFECTS, effect_table
 from grounded.diagnosis.validation.blame import Blame
-from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 from grounded.model import Model, Param
-from grounded_trials.report.diagnosis_words import calibrated_sentence
 
 MODEL = Model(
     states={"x": "m", "v": "m/s"},

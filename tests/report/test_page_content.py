@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded_trials.report.page.causes import adopted, causes
 
 from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.calmed import WINDOWS
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import bias_figure, error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED, Log
-from grounded_trials.report.page.causes import adopted, causes
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
 from grounded_trials.report.settled import Settled

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import click
 import pytest
+from grounded.diagnosis.verdict import MOST_EFFECTS
 
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.verdict import MOST_EFFECTS
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded_cli.main import COMMANDS, cli

@@ -24,6 +24,7 @@ import numpy as np
 from grounded.diagnosis.parts import Verdict
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import found
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, made_folder, write_atomically

@@ -97,6 +97,7 @@ ENTRIES: dict[str, Entry] = {
         "interpolation of states]] at best, which is in their intervals",
     ),
     # an adoption
+    "adopted": Entry("note", "adopted: {about}"),
     "unclaimed": Entry(
         "note",
         "{effect} was not claimed: its values were fitted in place of what was, and the "
@@ -114,7 +115,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "biased": Entry(
         "note",
-        "the robot is steered by its sensor of {state}, which reads {bias} too {way:low=low,high=high}",
+        "the robot is steered by its sensor of {state}, which reads {bias} too {way}",
         "add that to {state} where [task] start and the target are true values, not its readings; "
         "or correct the readings ([log.state.{state}] offset) and remove the effect",
     ),

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.verdict import _level, verdict
 
 from facts import holds
 from grounded import Model, Param, Trial
@@ -13,7 +14,6 @@ from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.hypotheses.lookalike import related
 from grounded.diagnosis.parts import Estimate, Ranked
 from grounded.diagnosis.validation.blame import Blame
-from grounded.diagnosis.verdict import _level, verdict
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.places import levelled, only_read

@@ -6,18 +6,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.next_trial import CHANGED
+from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
+from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 
 from cli import grounded
 from facts import holds
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
-from grounded.diagnosis.next_trial import CHANGED
 from grounded.diagnosis.parts import Changed, Estimate, Made
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.ruler import repeated
-from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
 from grounded.effects import Library
-from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 from small_tasks import pushed_cart
 
 FEW = (

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.verdict import verdict
 
 from grounded import Model, Param, Search, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -18,7 +19,6 @@ from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.measured import losses, shares
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 from grounded.experiments.pendulum import model as real_pendulum
 from grounded.experiments.pendulum import pendulum_task

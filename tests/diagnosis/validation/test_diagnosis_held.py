@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from grounded.diagnosis.verdict import _causes
+from grounded_trials.report.diagnosis_words import error_lines, held_sentence
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
@@ -13,9 +15,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation import claims as claims_of
 from grounded.diagnosis.validation.blame import Blame
-from grounded.diagnosis.verdict import _causes
 from grounded.effects import Library
-from grounded_trials.report.diagnosis_words import error_lines, held_sentence
 
 DT = 0.05
 TRUE = {"m": 1.25, "k": 1.5, "b": 0.6}  # in the model: 1, 1, 0.5

@@ -26,10 +26,11 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
+from grounded_trials.report.settled import Settled, lines_since, told_since
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
-from grounded_trials.workspace.next_step import EXPORT, left_open, nothing_to_do, outlook
+from grounded_trials.workspace.next_step import outlook
 from grounded_trials.workspace.off_target import (
     UNSURE,
     WITHIN,
@@ -43,7 +44,7 @@ from grounded_trials.workspace.off_target import (
 )
 
 if TYPE_CHECKING:
-    from grounded_trials.report.settled import Settled
+    from grounded.diagnosis.telling import Told
     from grounded_trials.workspace.adoptable import Better
 
 One = TypeVar("One")
@@ -125,14 +126,21 @@ class Findings:
         return outlook(self.standing, self.then)
 
     @property
+    def told(self) -> Told | None:
+        """What is told of the last diagnosis now; None if there is none."""
+        one = self.diagnosis
+        return None if one is None else told_since(one, self.since, self.settled)
+
+    @property
+    def lines(self) -> list[str]:
+        """The same as sentences, after what was adopted."""
+        one = self.diagnosis
+        return [] if one is None else lines_since(one, self.since, self.settled)
+
+    @property
     def next_trial(self) -> str:
         """The trial that the last diagnosis asks for; "" if it is outdated, see `Since`."""
-        if self.diagnosis is None or self.since.sentence:
-            return ""
-        best = self.standing.incumbent
-        if self.then == EXPORT and best is not None and left_open(self.diagnosis):
-            return nothing_to_do(self.diagnosis, best.candidate.id)
-        return self.diagnosis.next_trial
+        return self.told.next if self.told is not None else ""
 
     @property
     def ahead_s(self) -> float:

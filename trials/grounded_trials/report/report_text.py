@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from grounded.diagnosis.tables import WITHOUT, effect_table, error_table, of_delays
 from grounded.errors import NextCommand
 from grounded.search.certainty import by_starts, explained, share_of_cost
 from grounded.search.pictures import few
-from grounded_trials.report.diagnosis_words import error_lines, verdict_lines
 from grounded_trials.report.findings import (
     Findings,
     by_state,
@@ -20,7 +18,6 @@ from grounded_trials.report.findings import (
     selection,
 )
 from grounded_trials.report.forecast import forecast_error
-from grounded_trials.report.settled import so_far
 from grounded_trials.wording import (
     count,
     figure,
@@ -142,27 +139,14 @@ def _biases(findings: Findings, table: Table) -> str:
 
 
 def _diagnosis(findings: Findings, table: Table) -> str:
-    diagnosis, since = findings.diagnosis, findings.since
-    if diagnosis is None:
+    if findings.diagnosis is None:
         told = f"not diagnosed yet: {rendered(DIAGNOSE, findings.folder)}"
         if not (findings.runs or findings.logs):
             told = "nothing to diagnose yet: no trial and no log of data is stored"
         return "\n".join(["gap to the model", *_wrapped(told)])
-    lines = ["gap to the model"]
-    shown = so_far(diagnosis, since, findings.settled)
-    causes, others = verdict_lines(diagnosis)
-    for line in (*shown, *(f"- {cause}" for cause in causes), *others):
-        lines += _wrapped(line)
-    before = {} if since.changed else findings.values
-    for title, text in error_lines(diagnosis, before):
-        lines += _wrapped(f"{title}: {text}")
-    if diagnosis.prediction_error and not diagnosis.no_cause:
-        lines += ["", table(*error_table(diagnosis, whole_trials=False))]
-    rows, header = effect_table(diagnosis, rivals=False)
-    if rows and not diagnosis.no_cause:
-        known = any(row[1] for row in rows)
-        notes = "; ".join(filter(None, (WITHOUT * known, of_delays(diagnosis))))
-        lines += ["", table(rows, header), *(_wrapped(notes) if notes else ())]
+    lines = ["gap to the model", *(part for line in findings.lines for part in _wrapped(line))]
+    if (said := findings.told) is not None and said.rows:
+        lines += ["", table(said.rows, said.header)]
     return "\n".join(lines)
 
 

@@ -17,7 +17,6 @@ from grounded.figures.figure import typeset
 from grounded.result import Result
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
@@ -46,11 +45,8 @@ class Report(Result):
         """Return the candidates, the diagnosis in three lines and the next command as HTML."""
         from html import escape
 
-        findings, diagnosis = self.findings, self.findings.diagnosis
-        said: list[str] = []
-        if diagnosis is not None:
-            said = told(diagnosis, findings.task, findings.since, findings.settled)
-        lines = "".join(f"<p>{escape(typeset(line))}</p>" for line in said)
+        findings = self.findings
+        lines = "".join(f"<p>{escape(typeset(line))}</p>" for line in findings.lines)
         lines += f"<p>next: <code>{escape(findings.next_command)}</code></p>"
         whole = f"<details><summary>All numbers</summary>{super()._repr_html_()}</details>"
         return f"{findings.standing._repr_html_()}{lines}{whole}"
@@ -83,12 +79,11 @@ class Report(Result):
             verdict = {"kind": diagnosis.kind, "effects": diagnosis.effects}
             document["verdict"] = verdict | {"sentence": diagnosis.sentence}
             document["outdated"] = findings.since.sentence or None
-        settled = findings.settled
-        document["adopted"] = (
-            None
-            if settled is None
-            else {"clauses": settled.adopted, "gained": settled.gained, "left": settled.left}
-        )
+            document["findings"] = [one.to_json() for one in diagnosis.findings]
+        if (settled := findings.settled) is None:
+            return document | {"adopted": None}
+        gained, left = (one and one.sentence for one in (settled.gained, settled.open))
+        document["adopted"] = {"clauses": settled.adopted, "gained": gained, "left": left}
         return document
 
 

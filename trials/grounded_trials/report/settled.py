@@ -1,4 +1,4 @@
-"""Describes what was adopted: the model's changes from model.py, their gain, what is still open.
+"""What was adopted: the model's changes from model.py, what they gained, what is still open.
 
 The gain is the one measured by the last diagnosis, if that was made with the current planning model
 or claims what was adopted since. Otherwise no gain is reported.
@@ -7,25 +7,20 @@ or claims what was adopted since. Otherwise no gain is reported.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
-from grounded.diagnosis.cause_words import GIVEN, ended, give_or_take, meaning
+from grounded.diagnosis.errors_told import telling
 from grounded.diagnosis.parts import Estimate, Made
 from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.telling import Told, errors_line, open_line, sentence, told
 from grounded.errors import GroundedError
-from grounded.model import Model, Param
+from grounded.findings import Finding, found
 from grounded.result import begun, listed, number
-from grounded.task import Task
-from grounded_trials.report.diagnosis_words import made_from
-from grounded_trials.report.three_lines import gained, still_open, three_lines
-from grounded_trials.wording import ALONE, changed
 from grounded_trials.workspace.adoptable import joined
 from grounded_trials.workspace.adopting import (
     as_adopted,
     conditions_when_adopted,
-    equivalent_when_adopted,
     left_behind,
     tied_when_adopted,
 )
@@ -38,30 +33,32 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.user_files.config import ModelTable
 
-NOW = "the model now"
 WRITTEN = 1e-6  # relative difference of a value and what `adopt` writes of it
 
 
 @dataclass(frozen=True)
 class Settled:
-    """What was adopted; `closed`: everything that the last diagnosis claims has been adopted."""
+    """What was adopted, and the prediction errors that a diagnosis measured of the model now.
 
-    adopted: tuple[str, ...]  # one clause each: effects, then parameters
-    gained: str = ""  # "" if no diagnosis measured the current planning model
-    left: str = ""
+    `closed`: everything that the last diagnosis claims has been adopted. `open`: what is still
+    open, if the diagnosis says so of the model now.
+    """
+
+    rows: tuple[tuple[str, str], ...]  # name and values of each effect and parameter
     closed: bool = False
-    rows: tuple[tuple[str, str], ...] = ()  # name and values of each, as short as can be
-    briefly: str = ""  # `left` without what ties, and with names instead of clauses
+    gained: Finding | None = None
+    open: Finding | None = None
+
+    @property
+    def adopted(self) -> tuple[str, ...]:
+        """Name and values in one text each."""
+        return tuple(f"{name}: {values}" for name, values in self.rows)
 
     @property
     def lines(self) -> list[str]:
-        """The sentences, one per line."""
-        return self.told("; ".join(self.adopted))
-
-    def told(self, adopted: str) -> list[str]:
-        """Return the sentences, one per line, with these words on what was adopted."""
-        found = [f"Found and adopted: {adopted}.", self.gained, self.left]
-        return [line for line in found if line]
+        """What was adopted, what it gained and what is open, as sentences."""
+        first = found("model.adopted", *(name for name, _ in self.rows))
+        return [sentence(one) for one in (first, self.gained, self.open) if one]
 
 
 def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> Settled | None:
@@ -72,40 +69,27 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
         diagnosis: the last diagnosis.
         since: changes since then.
     """
-    table, task = workspace.config.model, workspace.origin
-    known, ties = _Known(diagnosis, as_adopted(workspace)), tied_when_adopted(workspace)
-    rests = {
-        name: on
-        for name, on in conditions_when_adopted(workspace).items()
-        if name not in table.params or known.adopted(name, table.params[name])  # else fitted since
-    }
-    clauses = [_clause(effect, task.model, known, rests) for effect in table.effects]
-    clauses += _moved(task.model, table.params, diagnosis.jointly if diagnosis else set(), rests)
-    if not clauses:
-        return None
-    rows = tuple(_rows(task.model, table, known, ties, rests))
-    found = Settled(tuple(clauses), rows=rows)
-    names = [str(effect["name"]) for effect in table.effects]
-    same = equivalent_when_adopted(workspace)
-    unsure = [
-        f"{c}{_or_else(ties.get(n, ()), n in same)}" for n, c in zip(names, clauses, strict=False)
-    ]
-    with_ties = replace(found, adopted=(*unsure, *clauses[len(names) :]))
-    if diagnosis is None or diagnosis.no_cause:
-        return with_ties
+    rows = tuple(_rows(workspace, _Known(diagnosis, as_adopted(workspace))))
+    if not rows or diagnosis is None or diagnosis.no_cause:
+        return Settled(rows) if rows else None
     if not since.changed:
-        text = gained(diagnosis, task, now="crude", before="outset", who=NOW)
-        causes = diagnosis.verdict.causes or diagnosis.effects
-        left, briefly = (_still(diagnosis, some, since) for some in (causes, diagnosis.effects))
-        return replace(with_ties, gained=text, left=left, briefly=briefly)
-    if not _as_claimed(diagnosis, table):
-        return with_ties
-    before = "outset" if gained(diagnosis, task, before="outset") else "crude"
-    text = gained(diagnosis, task, before=before, who=NOW)
-    repeated = bool(since.repeats)
-    left, briefly = (still_open(diagnosis, ties=ties, repeated=repeated) for ties in (True, False))
-    told = found if set(ties) <= set(diagnosis.effects) else with_ties  # `left` has its ties
-    return replace(told, gained=text, left=left, closed=True, briefly=briefly)
+        return Settled(rows, gained=_error(diagnosis, "crude", "outset"), open=_open(diagnosis))
+    if not _as_claimed(diagnosis, workspace.config.model):
+        return Settled(rows)
+    gained = _error(diagnosis, "with_effects", "outset") or _error(diagnosis)
+    return Settled(rows, closed=True, gained=gained, open=_open(diagnosis))
+
+
+def _error(d: Diagnosis, now: str = "with_effects", before: str = "crude") -> Finding | None:
+    """Return how far predictions are off, and were; None if one of them is not known."""
+    row = telling(d.prediction_error)
+    if row is None or not (getattr(row, now) and getattr(row, before)):
+        return None
+    return next(errors_line(d, now, before), None)
+
+
+def _open(d: Diagnosis) -> Finding | None:
+    return next(open_line(d), None)
 
 
 def measured_now(workspace: Folder) -> str:
@@ -113,70 +97,39 @@ def measured_now(workspace: Folder) -> str:
 
     If what that claims was adopted since, it is compared with the error just before.
     """
-    found, since = _last(workspace)
-    settled = settled_in(workspace, found, since)
-    if found is not None and settled is not None and settled.closed:
-        return gained(found, workspace.origin, before="crude", who=NOW)
-    if settled is not None or found is None or since.changed:
-        return settled.gained if settled is not None else ""
-    return gained(found, workspace.origin, now="crude", before="crude", who=NOW)
-
-
-def _last(workspace: Folder) -> tuple[Diagnosis | None, Since]:
     try:
-        found = read_diagnosis(workspace.reports)
+        diagnosis = read_diagnosis(workspace.reports)
     except GroundedError:
-        found = None
-    return found, since_diagnosis(workspace, found, usable_ids(workspace)) if found else Since()
-
-
-def told(
-    diagnosis: Diagnosis,
-    task: Task,
-    since: Since,
-    settled: Settled | None,
-    *,
-    causes_below: bool = False,
-) -> list[str]:
-    """Return a diagnosis as lines of text, after the lines on what has been adopted since.
-
-    Args:
-        diagnosis: the last diagnosis.
-        task: the task, whose weighed states are reported.
-        since: changes since the diagnosis.
-        settled: what was adopted.
-        causes_below: whether lists of what was adopted and of all causes follow.
-    """
-    lines = so_far(diagnosis, since, settled, causes_below=causes_below)
+        return ""
+    if diagnosis is None:
+        return ""
+    since = since_diagnosis(workspace, diagnosis, usable_ids(workspace))
+    settled = settled_in(workspace, diagnosis, since)
     if settled is not None and settled.closed:
-        return lines[:-1]
-    part = not since.newer and 0 < since.used < since.usable
-    some = [f"Diagnosed with {since.used} of {since.usable} trials."] * part
-    return [*lines, *three_lines(diagnosis, task, causes_below=causes_below), *some]
+        one = _error(diagnosis)
+    elif settled is not None:
+        one = settled.gained
+    else:
+        one = None if since.changed else _error(diagnosis, "crude", "crude")
+    return sentence(one) if one else ""
 
 
-def so_far(
-    diagnosis: Diagnosis, since: Since, settled: Settled | None, *, causes_below: bool = False
-) -> list[str]:
-    """Return the lines before a diagnosis: what was adopted, and why it may be outdated."""
-    lines = [] if settled is None else settled.lines
-    if settled is not None and causes_below and len(settled.adopted) > 1:
-        lines = settled.told(f"{len(settled.adopted)} changes, listed below")
-    if settled is not None and settled.left and not since.changed:
-        lines = lines[:-1]  # the diagnosis itself follows
+def told_since(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> Told:
+    """Return what is told of a diagnosis now: what was adopted since is not missing any more."""
+    said = told(diagnosis)
+    if settled is not None and settled.closed:
+        return replace(said, lines=(), rows=(), findings=(), next="")
+    return replace(said, next="") if since.sentence else said
+
+
+def lines_since(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> list[str]:
+    """Return the same as sentences: what was adopted, why the rest is outdated, and the rest."""
+    first = [] if settled is None else settled.lines
+    if settled is not None and not settled.closed:
+        first = first[:1]  # the diagnosis itself says what is open
     if text := since.sentence:
-        lines.append(f"{begun(text)}.")
-    return [*lines, f"The diagnosis, {made_from(diagnosis)}, said:"] if lines else []
-
-
-def _still(diagnosis: Diagnosis, causes: Sequence[str], since: Since) -> str:
-    """Return the first sentence of a diagnosis of the current planning model; its `causes`.
-
-    If a run was repeated since, which tells the noise that it asks for, that is told instead.
-    """
-    if diagnosis.effects:
-        return f"Found, not adopted: {'; '.join(causes)}."
-    return still_open(diagnosis, repeated=True) if since.repeats else diagnosis.verdict.lines[0]
+        first.append(f"{begun(text)}.")
+    return [*first, *told_since(diagnosis, since, settled).texts()]
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
@@ -226,99 +179,32 @@ class _Known:
         return Estimate(value, unit=unit)
 
 
-def _given(name: str, rests: Mapping[str, Sequence[str]]) -> str:
-    """Return a clause on the parameters that a value rests on; "" for none."""
-    return GIVEN.format(listed(rests[name])) if rests.get(name) else ""
-
-
-def _clause(
-    entry: Mapping[str, Any], model: Model, known: _Known, rests: Mapping[str, Sequence[str]]
-) -> str:
-    """Return an adopted effect in words, with its values; those that may be zero are left out."""
-    from grounded.effects import param_name
-    from grounded_trials.workspace.adopted import installed_effects
-
-    name, given = str(entry["name"]), {k: v for k, v in entry.items() if k != "name"}
-    try:
-        effect = installed_effects().effect(name, model)
-        units = {q.name: q.unit for q in effect.quantities}
-        values = {
-            q: known.estimate(param_name(name, q), float(v), units[q])
-            for q, v in given.items()
-            if q in units
-        }
-        return f"{meaning(effect, values)}{_given(name, rests)}"
-    except (GroundedError, TypeError, ValueError):
-        return f"{name} ({', '.join(f'{k} = {v}' for k, v in given.items())})"
-
-
-def _or_else(others: Sequence[str], same: bool) -> str:
-    """Return a clause on the effects that an adopted one may stand for; "" for none.
-
-    `same`: whether they are equivalent in the model.
-    """
-    if not others:
-        return ""
-    why = "the trials could not tell them apart"
-    if same:
-        why = "no trial can tell them apart in this model"
-    return f" or, as {why}, {' or '.join(others)} instead"
-
-
-def _rows(
-    model: Model,
-    table: ModelTable,
-    known: _Known,
-    ties: Mapping[str, Sequence[str]],
-    rests: Mapping[str, Sequence[str]],
-) -> Iterator[tuple[str, str]]:
+def _rows(workspace: Folder, known: _Known) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter."""
     from grounded.effects import param_name
     from grounded_trials.workspace.adopted import installed_effects
 
-    library = installed_effects()
+    table, model, library = workspace.config.model, workspace.origin.model, installed_effects()
+    ties, rests = tied_when_adopted(workspace), conditions_when_adopted(workspace)
 
-    def told(name: str, value: float, unit: str) -> str:
-        return give_or_take(known.estimate(name, value, unit))
+    def given(name: str) -> str:
+        text = "".join(f", or {other}" for other in ties.get(name, ()))
+        fitted = name in table.params and not known.adopted(name, table.params[name])
+        on = () if fitted else rests.get(name, ())
+        return text + f", given {listed(on)}" * bool(on)
 
     for entry in table.effects:
         name = str(entry["name"])
         try:
-            quantities = library.effect(name, model).free
-        except GroundedError:
-            quantities = ()
-        units = {q.name: q.unit for q in quantities if q.name in entry}
-        units = units or {key: "" for key in entry if key != "name"}
-        each = (f"{q} = {told(param_name(name, q), entry[q], unit)}" for q, unit in units.items())
-        alike = "".join(f", or {one}" for one in ties.get(name, ()))
-        yield name, f"{', '.join(each)}{_given(name, rests)}{alike}"
-    for name, param in model.params.items():  # in the order of `_moved`
+            units = {q.name: q.unit for q in library.effect(name, model).free if q.name in entry}
+        except GroundedError:  # it is of another package
+            units = {key: "" for key in entry if key != "name"}
+        each = (
+            f"{q} = {known.estimate(param_name(name, q), entry[q], unit).text}"
+            for q, unit in units.items()
+        )
+        yield name, f"{', '.join(each)}{given(name)}"
+    for name, param in model.params.items():
         if (value := table.params.get(name, param.value)) != param.value:
-            text = f"{told(name, value, param.unit)}{_at_end(param, value)}{_given(name, rests)}"
-            yield name, f"{text}, was {number(param.value)}"
-
-
-def _at_end(param: Param, value: float) -> str:
-    """Return `, at its bound, the data ask for less` of such a value; "" for another."""
-    at = Estimate(value, stopped=param.stopped(value))
-    return "".join(f", {clause}" for clause in ended(at, param.value))
-
-
-def _moved(
-    model: Model,
-    params: Mapping[str, float],
-    jointly: set[str],
-    rests: Mapping[str, Sequence[str]],
-) -> list[str]:
-    """Return `m 1.00 -> 1.30 kg` for every parameter that grounded.toml changes.
-
-    Those that the trials identify only `jointly` are marked.
-    """
-    known = {n: p for n, p in model.params.items() if n in params and params[n] != p.value}
-    return [
-        changed(name, p.value, params[name], p.unit)
-        + _at_end(p, params[name])
-        + ALONE * (name in jointly)
-        + _given(name, rests)
-        for name, p in known.items()
-    ]
+            text = known.estimate(name, value, param.unit).text
+            yield name, f"{text}{given(name)}, was {number(param.value)}"

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.diagnosis.errors_told import states_told, telling
 from grounded.diagnosis.pictures import credit_figure, worth_figure
 from grounded.diagnosis.tables import instrument_lines
+from grounded.diagnosis.telling import FINDINGS, sentence
 from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
@@ -27,7 +29,6 @@ from grounded.figures.interactive import label_lines, packed, palette, plotted
 from grounded.result import begun
 from grounded.search.certainty import by_starts, chance, explained, last_improvement, share_of_cost
 from grounded.search.pictures import search_figure
-from grounded_trials.report.diagnosis_notes import note_lines
 from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
@@ -36,7 +37,6 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, compared, improvements_in, utility_terms
-from grounded_trials.report.page.causes import adopted, causes
 from grounded_trials.report.page.diagnosed import NO_TRIAL, gap_section
 from grounded_trials.report.page.tables import (
     Block,
@@ -47,8 +47,6 @@ from grounded_trials.report.page.tables import (
     parameter_table,
     table,
 )
-from grounded_trials.report.settled import told
-from grounded_trials.report.three_lines import gained_most
 from grounded_trials.wording import count, figure, glued, placed, rendered
 from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
@@ -284,24 +282,23 @@ def _tiles(findings: Findings) -> list[str]:
 
 
 def _why(findings: Findings) -> dict[str, Any]:
-    """Return the verdict, its causes and notes, and the credit figure; {} if undiagnosed."""
-    diagnosis = findings.diagnosis
-    if diagnosis is None:
+    """Return what is told of the diagnosis, and the credit figure; {} if undiagnosed."""
+    diagnosis, said = findings.diagnosis, findings.told
+    if diagnosis is None or said is None:
         return {}
-    before = {} if findings.since.changed else findings.values
-    closed = findings.settled is not None and findings.settled.closed
-    groups = gained_most(diagnosis, findings.task)
-    credit = worth_figure(diagnosis, groups) or credit_figure(diagnosis)
+    row = telling(diagnosis.prediction_error)
+    names = states_told(row, diagnosis.tracked) if row else []
+    credit = worth_figure(diagnosis, [([name], name) for name in names])
+    adopted = [] if findings.settled is None else findings.settled.rows
     return {
         "kind": diagnosis.kind,
-        "verdict": told(
-            diagnosis, findings.task, findings.since, findings.settled, causes_below=True
-        ),
-        "adopted": adopted(findings.settled),
-        "causes": [] if closed else causes(diagnosis),
+        "verdict": findings.lines,
+        "adopted": adopted if len(adopted) > 1 else [],
+        "causes": said.rows,
+        "header": said.header,
         "preflight": instrument_lines(diagnosis.preflight),
-        "notes": note_lines(diagnosis, before),
-        "credit": credit,
+        "notes": [sentence(one) for one in said.findings[FINDINGS:]],
+        "credit": credit or credit_figure(diagnosis),
     }
 
 

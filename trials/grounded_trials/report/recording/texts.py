@@ -4,39 +4,28 @@ from __future__ import annotations
 
 import re
 
-from grounded.diagnosis.tables import larger
 from grounded.figures.figure import typeset
 from grounded_trials.report.figures.paths import crash
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.settled import told
-from grounded_trials.wording import count, figure, percent
-
-BAR = 20  # characters of a bar of 100 % credit
+from grounded_trials.wording import count, figure
 
 
 def verdict(findings: Findings) -> str:
     """Return the next command, and the diagnosis in a few lines (Markdown)."""
-    diagnosis, lines = findings.diagnosis, [f"next: `{findings.next_command}`\n"]
-    if diagnosis is None:
+    lines = [f"next: `{findings.next_command}`\n"]
+    if findings.diagnosis is None:
         lines.append("not diagnosed yet\n")
-    else:
-        lines += [
-            f"{_marked(line)}\n"
-            for line in told(diagnosis, findings.task, findings.since, findings.settled)
-        ]
+    lines += [f"{_marked(line)}\n" for line in findings.lines]
     return "\n".join(lines)
 
 
 def credit(findings: Findings) -> str:
-    """Return what each cause is worth as a table with bars (Markdown); "" if there is none."""
-    diagnosis = findings.diagnosis
-    if diagnosis is None or not diagnosis.credit:
+    """Return the causes as a table (Markdown); "" if there is none."""
+    said = findings.told
+    if said is None or not said.rows:
         return ""
-    lines = ["| cause | errors without it | |", "|---|---|---|"]
-    for one in diagnosis.credit:
-        bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
-        lines.append(f"| {one.of} | {larger(one.times) or percent(one.share)} | {bar} |")
-    return "\n".join(lines)
+    rows = (said.header, ("---",) * len(said.header), *said.rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def _marked(text: str) -> str:
