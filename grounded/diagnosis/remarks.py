@@ -112,7 +112,12 @@ def _of_errors(d: Diagnosed) -> Iterator[Finding]:
         ends: dict[str, Any] = errors(row, name, now="with_effects", before="crude")
         yield found("gap.worse", name, state=name, ahead=ahead, whole=row.whole_trial, **ends)
     if (above := excess(rows)) and not d.leftover:
-        yield found("gap.small", above[1], state=above[1], times=above[0])
+        times, name, row = above
+        ends = errors(row, name, error="with_effects")
+        share = row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300)
+        ahead = 0.0 if row.whole_trial else row.horizon_s
+        yield found("gap.small", name, state=name, times=times, share=share, ahead=ahead,
+                    whole=row.whole_trial, **ends)  # fmt: skip
 
 
 def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:

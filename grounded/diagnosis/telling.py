@@ -16,7 +16,8 @@ from grounded.diagnosis.errors_told import errors, excess, noise_unknown, states
 from grounded.diagnosis.parts import NEXT, Diagnosed
 from grounded.diagnosis.tables import Cells, values_of
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.result import begun, measured, number, percent
+from grounded.findings.catalogue import entry_of
+from grounded.result import measured, number, percent
 
 CAUSES = 3  # told in words; the table has all
 FINDINGS = 3  # told beside the lines; the others with --details
@@ -39,8 +40,9 @@ class Told:
 
 
 def sentence(one: Finding) -> str:
-    """Return a finding as a sentence of its own."""
-    return f"{begun(one.sentence)}."
+    """Return a finding as a sentence of its own; names keep their small letter."""
+    text, own = one.sentence, entry_of(one.code).short[:1].isalpha()
+    return f"{text[:1].upper() if own else text[:1]}{text[1:]}."
 
 
 def told(diagnosis: Diagnosed, now: str = "with_effects", before: str = "crude") -> Told:
@@ -86,7 +88,8 @@ def _was(d: Diagnosed, name: str) -> str:
 
 def _what(d: Diagnosed) -> Finding:
     """The causes, or that there is none."""
-    causes, left = d.verdict.causes, any(one.above for one in d.leftover)
+    causes = d.verdict.causes or d.effects  # the latter: a document of an older version
+    left = any(one.above for one in d.leftover)
     if d.no_cause:
         return found("gap.too_few")
     if causes:

@@ -128,7 +128,7 @@ def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(
     assert diagnosis.effects == ("coulomb_friction:w",)
     (friction,) = diagnosis.ranking[0].params.values()
     assert abs(friction.value - 0.5) < 0.01
-    assert np.isnan(diagnosis.prediction_error[0].crude["w"]) and not diagnosis.unknowable
+    assert np.isnan(diagnosis.prediction_error[0].crude["w"]) and not diagnosis.no_cause
 
 
 @pytest.mark.parametrize("first", [0, 1])

@@ -69,5 +69,5 @@ def test_the_verdict_tells_it():
     model = motor(95.0)
     options = DiagnosisOptions(library=Library((Library().family("input_gain"),)))
     found = diagnose(model, [run(model, k) for k in range(3)], options)
-    assert "w is missed by" in found.verdict.sentence and "substeps=2" in found.verdict.sentence
+    assert "substeps=2" in found.preflight[0].advice
     assert [one.kind for one in found.preflight] == ["time step"]

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.diagnosis.verdict import MOST_EFFECTS, verdict
 
 from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -17,6 +16,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.parts import Ranked
 from grounded.diagnosis.validation.blame import fewest, loss, still
+from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from small_tasks import DT, plain_task, pushed_cart
@@ -162,7 +162,7 @@ def test_a_constant_input_is_not_blamed():
     ]
     found = diagnose(model, flat)
     assert found.kind == "unknown"
-    assert any("never changed" in s for s in found.unknowable)
+    assert "model.still" in {one.code for one in found.findings}
     assert not any(r.effect.endswith(":u") for r in found.ranking)
 
 
@@ -254,12 +254,12 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
         moved=(),
         names=claimed,
         data=SimpleNamespace(model=pendulum),
-        with_rivals=dict,
-        one_clock=(),
         best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
         parameters=dict,
     )
     credit = (Credit("calibration", 1.0),)
     left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
-    found = verdict(claims, rows, (), left, (), credit, most=most)
+    writer = SimpleNamespace(claims=claims, adopted=(), most=most, causes=lambda *args: ())
+    writer.data = claims.data
+    found = Writer.verdict(writer, rows, left, (), credit)
     assert found.look_for == more and found.again is (most == MOST_EFFECTS)

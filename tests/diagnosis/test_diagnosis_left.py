@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.diagnosis.cause_words import give_or_take
 
 from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.parts import Estimate
@@ -26,7 +25,7 @@ from grounded.diagnosis.validation.measured import Measured
     ],
 )
 def test_a_value_is_as_precise_as_its_standard_deviation(value, std, unit, text):
-    assert give_or_take(Estimate(value, std, None, unit)) == text
+    assert Estimate(value, std, None, unit).text == text
 
 
 def test_what_is_farthest_above_its_noise_is_left_over_first():

@@ -1,18 +1,17 @@
-"""What a diagnosis says in its sentence, its tables and its JSON is the same."""
+"""What is told of a diagnosis: three lines, a table of causes, findings by code."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from grounded.diagnosis.cause_words import meaning
-from grounded.diagnosis.verdict import verdict
-from grounded_trials.report.diagnosis_words import calibrated_sentence
 
-from grounded.diagnosis.error_report import Credit
-from grounded.diagnosis.parts import Estimate, Identifiable, Ranked, Verdict
+from grounded.diagnosis.causes import meaning
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
+from grounded.diagnosis.parts import Agreement, Changed, Estimate, Ranked, TrialValue, Verdict
+from grounded.diagnosis.remarks import remarks
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.tables import EFFECTS, effect_table
-from grounded.diagnosis.validation.blame import Blame
+from grounded.diagnosis.tables import effect_table
+from grounded.diagnosis.telling import told
 from grounded.effects import Library
 from grounded.model import Model, Param
 
@@ -22,36 +21,6 @@ MODEL = Model(
     params={name: Param(2.0, "kg", std=1.0) for name in "abcdefg"},
     derivative=lambda s, a, p: {"x": s.v, "v": a.u / p.a + p.b + p.c + p.d + p.e + p.f + p.g},
 )
-
-
-def _claims(*effects, moved=(), parameters=None):
-    return SimpleNamespace(
-        known=SimpleNamespace(no_cause=False, sentences=()),
-        blamed=(),
-        names=tuple(e.name for e in effects),
-        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=effects)),
-        moved=[Blame(MODEL.param_names.index(name), 9.0) for name in moved],
-        parameters=lambda: parameters or {},
-        data=SimpleNamespace(model=MODEL),
-        one_clock=(),
-        off_with_rivals=dict,
-        with_rivals=dict,
-    )
-
-
-@pytest.mark.parametrize("claimed", [3, EFFECTS + 1])
-def test_a_claimed_or_tied_effect_always_has_a_row_in_the_table(claimed):
-    names = [f"viscous_friction:v{k}" for k in range(EFFECTS + 4)]
-    ranking = tuple(
-        Ranked(name, {}, {}, 100.0 - k, claimed=k < claimed) for k, name in enumerate(names)
-    )
-    tie = (names[0], names[-1])
-    found = Diagnosis(Verdict("several"), ranking=ranking, indistinguishable=(tie,))
-    for rivals in (False, True):
-        shown = [cells[0].strip("* ") for cells in effect_table(found, rivals=rivals)[0]]
-        assert {*names[:claimed], names[-1]} <= {*shown}
-    rivals = [name for name in shown if name not in (*names[:claimed], names[-1])]
-    assert len(rivals) == max(EFFECTS - claimed - 1, 0)
 
 
 def test_a_value_that_anything_fits_has_no_digits():
@@ -64,8 +33,8 @@ def test_a_value_that_anything_fits_has_no_digits():
     )
     values = [row[-1] for row in effect_table(Diagnosis(Verdict("effect"), ranking=ranking))[0]]
     assert values == [
-        "its values are not determined",
-        "c is not determined, k = 0.400 +- 0.10",
+        "c = unknown",
+        "c = unknown, k = 0.400 +- 0.10",
         "c = 0 +- 0.010",
     ]
 
@@ -76,30 +45,94 @@ def test_every_effect_has_a_meaning_in_words_for_any_value():
         assert "{" not in meaning(effect, known)
 
 
-def test_why_no_cause_is_named_is_a_field_that_survives_json():
-    claims = _claims()
-    claims.known = SimpleNamespace(no_cause=True, sentences=("one trial", "input u never changed"))
-    said = verdict(claims, (), (), (), (), ())
-    assert said.limit == "one trial" and said.limit in said.sentence
-    found = Diagnosis(said, unknowable=claims.known.sentences)
-    assert found.no_cause and Diagnosis.from_json(found.to_json()).no_cause
-    other = Diagnosis(replace(said, limit=""), unknowable=claims.known.sentences)
-    assert not other.no_cause and "limit" not in other.to_json()["verdict"]
+FRICTION, DRAG = "viscous_friction:v", "quadratic_drag:v"
+ERRORS = RulerRow(
+    1.0,
+    unit_by_channel={"x": "m", "v": "m/s"},
+    crude={"x": 0.2, "v": 0.5},
+    with_effects={"x": 0.02, "v": 0.1},
+    noise_floor={"x": 0.01, "v": 0.1},
+)
 
 
-def test_the_verdict_counts_the_parameters_that_adopt_writes():
-    """It named six as off where `adopt` wrote eight."""
-    effect = Library().effect("viscous_friction:v", MODEL)
-    known = {name: Estimate(2.2, 0.01, None, "kg") for name in "abcd"}
-    known |= {name: Estimate(2.02, 0.5, None, "kg") for name in "efg"}
-    lost = Identifiable("g", "not identifiable")
-    claims = _claims(effect, moved="abcd", parameters=known)
-    row = Ranked(effect.name, {"k": Estimate(1.0, 0.1)}, {}, 50.0, claimed=True)
-    credit = (Credit("calibration", 0.9), Credit(effect.name, 0.1))
-    said = verdict(claims, (row,), (), (), (), credit, identified=(lost,))
-    found = Diagnosis(said, parameters=known, identifiable=(lost,), ranking=(row,))
-    written = found.known_parameters
-    assert len(written) == 4 + 2
-    told = calibrated_sentence(found, dict.fromkeys(known, 2.0))
-    assert all(f"{name} 2.00 -> " in told for name in known)
-    assert told.count("not adopted") == len(known) - len(written)
+def diagnosed(**more) -> Diagnosis:
+    row = Ranked(FRICTION, {"k": Estimate(0.4, 0.02, None, "1/s")}, {}, 90.0, claimed=True)
+    parts = {
+        "verdict": Verdict("effect", (FRICTION,), ("v is damped by 0.4 1/s",)),
+        "ranking": (row,),
+        "credit": (Credit(FRICTION, 0.9),),
+        "prediction_error": (ERRORS,),
+        "trials": 3,
+        "motions": 2,
+    }
+    return Diagnosis(**parts | more)
+
+
+def codes(found, adopted=()):
+    return [one.code.removeprefix("gap.") for one in remarks(found, MODEL, adopted)]
+
+
+def test_three_lines_say_what_how_good_and_what_is_open():
+    left = Remainder("v", error=0.3, floor=0.1, horizon_s=1.0, error_unit="m/s")
+    said = told(diagnosed(leftover=(left,)))
+    assert [one.code for one in said.lines] == ["gap.causes", "gap.errors", "gap.left"]
+    errors = said.lines[1].facts
+    assert (errors["state"], errors["now"].value, errors["before"].value) == ("x", 0.02, 0.2)
+    assert said.rows == ((FRICTION, "k = 0.400 +- 0.020 1/s", "90 %"),)
+
+
+def test_what_is_tied_stands_below_its_cause():
+    tie = (FRICTION, DRAG)
+    found = diagnosed(indistinguishable=(tie,))
+    assert [row[0] for row in told(found).rows] == [FRICTION, f"or {DRAG}"]
+    assert "tie" in codes(found)
+    assert "equivalent" in codes(replace(found, equivalent=(tie,)))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "rows", "code"),
+    [
+        (Verdict("none"), (ERRORS,), "gap.none"),
+        (Verdict("unknown"), (ERRORS,), "gap.unknown"),
+        (Verdict("unknown", limit="model.one_trial"), (ERRORS,), "gap.too_few"),
+    ],
+)
+def test_without_a_cause_the_first_line_says_so(verdict, rows, code):
+    found = Diagnosis(verdict, prediction_error=rows)
+    said = told(found)
+    assert said.lines[0].code == code and found.no_cause is bool(verdict.limit)
+    assert not found.no_cause or not said.rows
+    assert Diagnosis.from_json(found.to_json()) == found
+
+
+def test_trials_that_disagree_are_told_with_the_two_that_differ_most():
+    each = [(0.3, 0.01), (0.6, 0.01), (9.0, 50.0)]
+    values = tuple(TrialValue(f"t{i}", FRICTION, "k", *one) for i, one in enumerate(each))
+    test = Agreement(FRICTION, "k", agrees=False, estimate=Estimate(0.4, 0.1, None, "1/s"))
+    found = diagnosed(per_trial=values, agreement=(test,))
+    (one,) = [f for f in remarks(found, MODEL) if f.code == "gap.disagree"]
+    assert (one.facts["trial"], one.facts["trial2"]) == ("t0", "t1")
+
+
+def test_what_changed_between_two_groups_is_told_by_value():
+    values = Estimate(0.0496, 0.0002, unit="m"), Estimate(0.0459, 0.0002, unit="m")
+    name = "first_order_lag_u_tau"
+    one = Changed(f"parameter:{name}", name, *values, 190.0)
+    found = diagnosed(changed=(one,))
+    (said,) = [f for f in remarks(found, MODEL, ["first_order_lag:u"]) if f.code == "gap.changed"]
+    assert said.facts["value"] == "tau of first_order_lag:u" and said.nats == 190.0
+    assert "unchanged" in codes(replace(found, changed=()))
+
+
+def test_errors_that_grow_and_values_at_bounds_are_told():
+    worse = replace(ERRORS, with_effects={"x": 0.4, "v": 0.1})
+    stopped = {"a": Estimate(3.0, 0.1, None, "kg", "bound")}
+    found = diagnosed(prediction_error=(worse,), parameters=stopped)
+    said = {one.code: one for one in remarks(found, MODEL)}
+    assert said["gap.worse"].facts["state"] == "x" and said["model.at_bound"].about == ("a",)
+    gain = Ranked("input_gain:u", {"g": Estimate(9.0, 0.1)}, {}, 9.0, claimed=True)
+    assert "unit" in codes(diagnosed(ranking=(gain,)))
+    turned = replace(gain, params={"g": Estimate(-2.0, 0.1)})
+    assert "sign" in codes(diagnosed(ranking=(turned,)))
+    assert "one_motion" in codes(diagnosed(motions=1, leftover=(Remainder("v", 0.1),)))
+    assert np.isnan(said["gap.worse"].nats)

@@ -64,7 +64,8 @@ def test_of_a_combination_the_surest_parameter_stays():
     assert not found.params["mass"].identified and found.params["mass"].value == 2.0
     assert found.params["gain"].identified and found.params["gain"].value == pytest.approx(3, 0.03)
     assert found.params["gain"].only_with == found.params["drag"].only_with == ("mass",)
-    assert "mass is held as before" in found.sentence
+    (one,) = [one for one in found.findings if one.code == "model.given"]
+    assert one.facts["rests"] == ("mass",)
     diagnosis = diagnose(model, trials())
     verdicts = {one.parameter: one.verdict for one in diagnosis.identifiable}
     assert verdicts["mass"] == "not identifiable"

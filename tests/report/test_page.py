@@ -86,8 +86,6 @@ def test_the_page_shows_what_was_found(cart):
         "viscous_friction:v",
         "coulomb_friction:v",
         "0.290 to 0.330",  # the 95 % interval, which is not symmetric
-        "90\xa0%",
-        "a fast run and a slow one",
         " adopt viscous_friction:v",
         "N s/m",
         "1.400 (1.36 to 1.44)",

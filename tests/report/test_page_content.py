@@ -6,17 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded_trials.report.page.causes import adopted, causes
 
-from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.calmed import WINDOWS
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import bias_figure, error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED, Log
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
-from grounded_trials.report.settled import Settled
-from reported import DIAGNOSIS, car, cart, gathered, many_flights
+from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -83,30 +80,3 @@ def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):
     for figure in (states, forecast_figures(findings)[0]):
         notes = {p.title: p.note for p in figure.panels}
         assert ESTIMATED in notes["v [m/s]"] and ESTIMATED not in notes["x [m]"]
-
-
-def test_each_cause_is_an_item_with_its_worth_values_and_ties():
-    tied = {"k": {"value": 0.25, "std": 0.02, "unit": "1/m"}}
-    ranking = [one | {"claimed": k == 0} for k, one in enumerate(DIAGNOSIS["ranking"])]
-    ranking.append({"effect": "quadratic_drag:v", "params": tied, "evidence": 39.0})
-    said = {"kind": "several", "effects": ["viscous_friction:v"], "parameters": ["mass"]}
-    said["causes"] = ["mass is off", "friction slows v"]
-    credit = [
-        {"of": "calibration", "share": 0.7, "times": 8.0},
-        {"of": "viscous_friction:v", "share": 0.3, "times": 1.46},
-    ]
-    more = {"verdict": said, "credit": credit, "ranking": ranking}
-    own, friction = causes(Diagnosis.from_json(DIAGNOSIS | more))
-    assert "8.0 times" in own.text and "mass = 1.400 +- 0.020 kg" in own.values
-    assert "46 %" in friction.text
-    assert (friction.name, friction.values) == ("viscous_friction:v", "k = 0.300 +- 0.010 1/s")
-    assert friction.ties == (("quadratic_drag:v", "k = 0.250 +- 0.020 1/m"),)
-
-
-def test_what_was_adopted_is_a_list_if_it_is_more_than_one():
-    rows = (("viscous_friction:v", "k = 0.30 +- 0.01 1/s"), ("mass", "1.40 +- 0.02 kg, was 1"))
-    both = Settled(("friction slows v", "mass 1.00 -> 1.40 kg"), rows=rows)
-    friction, mass = adopted(both)
-    assert friction.text and friction.values == rows[0][1]
-    assert (mass.text, mass.name, mass.values) == ("", *rows[1])
-    assert adopted(Settled(("friction slows v",), rows=rows[:1])) == adopted(None) == []

@@ -35,7 +35,7 @@ def test_json_holds_what_the_contract_says(cart):
     status = grounded("-C", cart, "status", "--json").json
     assert document["utilities"] == status["utilities"]
     assert document["paths"] == {}
-    assert document["verdict"] == DIAGNOSIS["verdict"]
+    assert document["verdict"]["effects"] == DIAGNOSIS["verdict"]["effects"]
     assert document["best"]["candidate"] == status["best"]["candidate"]
     assert set(document["best"]["tracking_error"]) == {"x", "v"}
     assert document["best"]["tracking_error"]["v"] is None  # no target: not a number

@@ -29,14 +29,12 @@ class OneClock:
         like: name of the equivalent effect.
         inputs: the inputs of the delayed part of the model.
         states: its states that have a sensor.
-        whole: whether these are all sensors and all inputs.
     """
 
     effect: str
     like: str
     inputs: tuple[str, ...]
     states: tuple[str, ...]
-    whole: bool
 
 
 def one_clock(
@@ -62,8 +60,7 @@ def one_clock(
         side, other = (inputs, states) if effect.family.name == "delay" else (states, inputs)
         if targets == set(side) and other:
             like = f"{FAMILIES[effect.family.name]}:{'+'.join(other)}"
-            whole = len(inputs) == len(moving) and len(states) == len(shown)
-            found.append(OneClock(effect.name, like, inputs, states, whole))
+            found.append(OneClock(effect.name, like, inputs, states))
     return tuple(found)
 
 

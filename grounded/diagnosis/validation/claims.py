@@ -330,35 +330,6 @@ class Claims:
         more = max(scores, default=-np.inf) - self.search.score(self.best)
         return more > max(LARGE_GAIN, 0.5 * nats)
 
-    def off_with_rivals(self) -> dict[str, str]:
-        """Return the parameters that are off only with a rival: {parameter: the rival}."""
-        found, own = dict[str, str](), {one.index for one in self.moved}
-        for name in self.names if self.best.hypothesis.spread > 0 else ():
-            for other, fit in self.rivals(name):
-                for one in moved_parameters(self.search, fit, self.ruler):
-                    if one.index not in own:
-                        found.setdefault(self.data.model.param_names[one.index], other)
-        return found
-
-    def with_rivals(self) -> dict[str, tuple[str, str, float]]:
-        """Return what parameters are beside a rival, if that is another value than is claimed.
-
-        Returns:
-            {parameter: (claimed effect, the rival in its place, the value then)}.
-        """
-        model, known = self.data.model, self.parameters()
-        found = dict[str, tuple[str, str, float]]()
-        for name in self.names if self.best.hypothesis.spread > 0 else ():
-            for other, fit in self.rivals(name):
-                shift = fit.hypothesis.shift
-                for one in self.moved:
-                    param = model.param_names[one.index]
-                    own = 0.0 if shift is None else float(shift[one.index])
-                    value = float(model.values[one.index]) + own
-                    if abs(value - known[param].value) > NORMAL * 2 * known[param].std:
-                        found.setdefault(param, (name, other, value))
-        return found
-
     def _ties(self, name: str, other: str, fit: Fitted) -> bool:
         """Check whether a fit with another effect in place of one is as likely, or equivalent.
 

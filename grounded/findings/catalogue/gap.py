@@ -79,7 +79,9 @@ ENTRIES: dict[str, Entry] = {
         "[[repeats?, all of one motion]][[, mostly {trial}]][[ where {place}]]",
     ),
     "small": Entry(
-        "note", "{state} is off by {times:.2g} times the noise: too little to find a cause for"
+        "note",
+        "{state} is off by {error:size} [[{ahead:.3g} s ahead]][[whole?over whole trials]], {times:.2g} "
+        "{times:.2g} times the noise but {share:%} of the error before: too little to find a cause for",
     ),
     "noise": Entry(
         "note",

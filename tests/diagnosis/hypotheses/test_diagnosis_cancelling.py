@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from grounded.diagnosis.cause_words import meaning
 
 from grounded import Model, Param, Trial
+from grounded.diagnosis.causes import meaning
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis

@@ -6,15 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grounded.diagnosis.next_trial import CHANGED
-from grounded.diagnosis.verdict import BOTH, UNEXPLAINED, verdict
-from grounded_trials.report.diagnosis_words import agreement_lines, verdict_lines
 
 from cli import grounded
-from facts import holds
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import Credit, Remainder
-from grounded.diagnosis.parts import Changed, Estimate, Made
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.ruler import repeated
 from grounded.effects import Library
@@ -24,6 +18,12 @@ FEW = (
     *("coulomb_friction", "viscous_friction", "dead_zone"),
     *("input_gain", "delay", "offset", "trend"),
 )
+
+
+def codes(found):
+    return {one.code for one in found.findings}
+
+
 OPTIONS = DiagnosisOptions(library=Library(tuple(map(Library().family, FEW))))
 
 
@@ -35,7 +35,7 @@ def test_trials_of_one_system_agree():
     assert found.agreement[0].agrees and found.agreement[0].chance > 1e-3
     assert [v.agrees for v in found.per_trial] == [True] * 5
     off = [(v.value - 0.3) / v.std for v in found.per_trial]
-    assert np.abs(off).max() < 5 and not agreement_lines(found)
+    assert np.abs(off).max() < 5 and "gap.disagree" not in codes(found)
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
     assert not one.agrees and one.goes_with == "rises with the order of the trials"
     values = [v.value for v in found.per_trial if v.effect == one.effect]
     assert np.polyfit(np.arange(6), values, 1)[0] == pytest.approx(0.05, rel=0.25)
-    assert [title for title, _ in agreement_lines(found)] == ["agreement"]
+    assert "gap.disagree" in codes(found)
 
 
 @pytest.mark.slow
@@ -66,8 +66,8 @@ def test_what_changed_between_two_groups(first, second, effect, values):
     found = diagnose(model, before, OPTIONS, compare=after)
     assert found.trials == 6 and found.changed is not None
     assert [one.effect for one in found.changed] == ([effect] if effect else [])
-    assert found.verdict.lines[0] == found.verdict.comparison != ""
-    assert (found.next_trial == CHANGED) == bool(effect)
+    assert ("gap.next.changed" in codes(found)) == bool(effect)
+    assert ("gap.changed" if effect else "gap.unchanged") in codes(found)
     for one in found.changed:
         assert (one.first.value, one.second.value) == pytest.approx(values, abs=0.06)
         assert one.evidence > 20 and one.chance < 1e-6
@@ -84,50 +84,6 @@ def test_groups_that_overlap_are_refused(workspace_of):
     folder = workspace_of().folder
     done = grounded("-C", folder, "diagnose", "--compare", "t0001,t0002", "t0002")
     assert done.code == 1 and "two groups of different trials" in done.err
-
-
-def compared(changed, unchanged=(), adopted=(), no_cause=False):
-    claims = SimpleNamespace(known=SimpleNamespace(no_cause=no_cause, sentences=("few",)))
-    left = (Remainder("v", 0.1, "m/s", 9.0, None),)
-    names = [effect["name"] for effect in adopted]
-    said = verdict(claims, (), (), left, (), (), changed=changed, adopted=names)
-    said = replace(said, causes=("one", "two"), clauses=("one", "two"))
-    one = Credit("viscous_friction:v", 0.5)
-    made = Made(("t0001", "t0002"), adopted, named=("t0001",), compared=("t0002",))
-    return Diagnosis(said, changed=changed, unchanged=unchanged, credit=(one, one), made=made)
-
-
-def test_the_verdict_of_a_comparison_begins_with_what_changed():
-    values = Estimate(0.0496, 0.0002, unit="m"), Estimate(0.0459, 0.0002, unit="m")
-    found = compared((Changed("parameter:r", "r", *values, 190.0),))
-    first = found.verdict.lines[0]
-    assert first == found.verdict.comparison and found.sentence.startswith(first)
-    assert holds(first, "r changed", "0.04960 +- 0.00020 m", "0.04590 +- 0.00020 m")
-    causes, others = verdict_lines(found)
-    assert causes == [first, "One", "Two"]
-    assert others == [] and found.verdict.lines[1].startswith(BOTH)
-    assert "v is off" in found.verdict.lines[1]
-    again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
-    assert again == found and again.verdict.comparison == first
-
-
-def test_the_verdict_of_a_comparison_says_that_nothing_changed():
-    found = compared(())
-    assert found.verdict.lines[0].startswith("Nothing") and UNEXPLAINED in found.sentence
-    alone = compared(None)
-    assert alone.verdict.comparison == "" and alone.verdict.lines[0].startswith(UNEXPLAINED)
-    assert compared((), no_cause=True).verdict.comparison == ""
-
-
-def test_a_compared_value_of_an_adopted_effect_has_its_name_and_unit():
-    lag = {"name": "first_order_lag:left+right", "tau": 0.1}
-    name = "first_order_lag_left_right_tau"
-    values = Estimate(0.1, 0.001, unit="s"), Estimate(0.0996, 0.001, unit="s")
-    one = Changed(f"parameter:{name}", name, *values, 0.1)
-    ((_, _), (title, text)) = agreement_lines(compared((), (one,), adopted=(lag,)))
-    assert title == "unchanged" and name not in text
-    assert holds(text, "tau of first_order_lag:left+right", "0.0014 s")
-    assert name not in compared((one,), adopted=(lag,)).sentence
 
 
 def test_trials_of_two_groups_are_no_repeats():

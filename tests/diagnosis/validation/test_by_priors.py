@@ -53,8 +53,8 @@ def test_a_gain_beside_an_uncertain_mass_is_as_uncertain_as_the_mass():
     assert g.interval[1] - g.interval[0] > 3.8 * g.std
     (one,) = found.combinations
     assert one.values == ("input_gain:u",) and one.rests_on == {"m": 0.05}
-    assert "given m as in the model" in found.sentence
-    assert "only in combination" in found.sentence and "m = 2 +- 0.05 kg" in found.sentence
+    (told,) = [one for one in found.findings if one.code == "model.given"]
+    assert told.about == ("input_gain:u",) and told.facts["rests"] == ("m",)
     assert found.to_json()["combinations"] == [
         {"values": ["input_gain:u"], "rests_on": {"m": 0.05}}
     ]
@@ -65,7 +65,7 @@ def test_a_gain_beside_a_known_drag_is_known_alone():
     assert found.effects == ("input_gain:u",) and not found.combinations
     g = found.ranking[0].params["g"]
     assert g.std < 0.005 and g.value == pytest.approx(-0.3, abs=4 * g.std)
-    assert "combination" not in found.sentence and "given" not in found.sentence
+    assert "model.given" not in {one.code for one in found.findings}
 
 
 def planar(gravity=0.0):

@@ -161,7 +161,7 @@ def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
     (i,) = data.hidden
     assert data.seen.shape[1] == 4  # two runs of each trial
     assert data.seen[0, :, i].sum() == 2 and data.seen[1:, :, i].sum() == 0
-    assert not [s for s in limits(data).sentences if memory[0] in s]
+    assert not [one for one in limits(data).findings if memory[0] in one.about]
     noise = HypothesisSearch(data, ()).nulls().noise
     assert np.exp(noise.log_q[i]) < 1e-20
 
@@ -209,7 +209,9 @@ def test_true_values_behind_a_late_log_begin_where_the_log_is(trials):
     assert sorted(data.behind) == sorted(data.hidden) and set(data.behind.values()) == {place}
     np.testing.assert_array_equal(data.y[..., now], data.y[..., place])
     assert not data.seen[..., now].any() and data.told[now] and not data.told[speed]
-    assert limits(data).sentences == ("state v was never measured",)
+    assert [(one.code, one.about) for one in limits(data).findings] == [
+        ("model.unmeasured", ("v",))
+    ]
     offered = Library().candidates(better, data.scales)
     names = [effect.name for effect in knowable(data, offered)]
     assert "coulomb_friction:v" in names and "sensor_delay:x" in names
@@ -436,5 +438,5 @@ def test_a_mean_that_was_left_out_is_left_out_once_its_delay_is_adopted():
     again = preflight(better, lifted, hidden)
     assert [(f.signal, f.kind) for f in again.findings] == [("v", "smoothed")]
     data = prepare(better, list(again.trials), None, None, hidden)
-    assert not limits(data, again.left_out).sentences
+    assert not limits(data, again.left_out).findings
     assert not limits(data, again.left_out).no_cause

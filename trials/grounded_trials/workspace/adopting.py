@@ -200,7 +200,7 @@ def _told(
         if family == "sensor_bias":
             b = effect["b"]
             bias, way = Quantity(abs(b), units[state]), "low" if b < 0 else "high"
-            yield found_("model.biased", state, state=state, bias=bias, way=way)
+            yield found_("model.biased", state, state=state, bias=bias, way=way, offset=-b)
         elif family == "sensor_scale":
             k = effect["k"]
             way = "low" if k < 0 else "high"
