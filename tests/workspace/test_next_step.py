@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 import pytest
-from grounded.diagnosis.verdict import MOST_EFFECTS
 
 from cli import grounded, plain, process
 from facts import holds
@@ -25,7 +24,7 @@ from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis
-from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis, to_look_deeper
+from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
 from grounded_trials.workspace.user_files.config import set_in_model
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied, diagnosed
@@ -38,9 +37,8 @@ NONE = {"kind": "none", "effects": [], "sentence": "None."}
 LATE = SECOND | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
 BOTH = {"kind": "several", "effects": ["viscous_friction:v", "delay:force"], "sentence": "Two."}
 TWO = {"verdict": BOTH, "ranking": [FIRST, LATE]}
-WHY = "one trial alone confirms nothing; run a second one"
-UNKNOWN = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {WHY}."}
-UNKNOWABLE = {"verdict": UNKNOWN, "unknowable": [WHY]}
+UNKNOWN = {"kind": "unknown", "effects": [], "limit": "model.one_trial"}
+UNKNOWABLE = {"verdict": UNKNOWN}
 LAGGING = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
 DELAYED = LAGGING | {"kind": "delay", "log": "delay_s = 0.05"}  # on top of 0.02 s in [log]
 ROW = {"horizon_s": 1.0, "unit_by_channel": {"v": "m/s"}, "crude": {"v": 0.3}}
@@ -376,23 +374,6 @@ def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(w, mon
     assert following(w.folder) == ("diagnose" if left else "export best --runner")
 
 
-def test_what_was_claimed_can_be_adopted_before_a_deeper_diagnosis(w):
-    verdict = BOTH | {"look_for": 5}
-    diagnosed(w.folder, **TWO | {"verdict": verdict})
-    assert following(w.folder) == "adopt viscous_friction:v delay:force"
-    made = {"trials": ["t0001", "t0002"], "params": {}, "without": ["delay"]}
-    for words, one in {
-        " --trials t0001,t0002": {"named": ["t0001", "t0002"]},
-        " --compare t0001 t0002": {"named": ["t0001"], "compared": ["t0002"]},
-    }.items():
-        found = Diagnosis.from_json({**DIAGNOSIS, "verdict": verdict, "diagnosed": made | one})
-        typed = f"grounded diagnose{words} --without delay --max-effects 5"
-        assert rendered(to_look_deeper(found)) == typed
-    assert to_look_deeper(Diagnosis.from_json(DIAGNOSIS)) is None
-    most, over = (grounded("diagnose", "--max-effects", str(MOST_EFFECTS + k)) for k in (0, 1))
-    assert "max-effects" in over.err and "max-effects" not in most.err
-
-
 def test_a_result_says_what_follows_it_without_the_command_line(w):
     run = w.run("best").trial_file
     assert w.ingest(run).then == w.status().then  # the search has ended: not `propose`
@@ -495,7 +476,7 @@ def test_an_effect_that_was_fitted_in_place_of_what_is_adopted_now_is_named(w):
     [
         ({}, ["viscous_friction:v", "delay:forse"], ["'delay:force'"]),
         ({}, ["viscous_friction:v", "delay:force"], ["delay:force", "(viscous_friction:v)"]),
-        (UNKNOWABLE, ["viscous_friction:v"], [WHY]),
+        (UNKNOWABLE, ["viscous_friction:v"], []),
     ],
 )
 def test_what_can_not_be_adopted_changes_nothing(w, changes, names, facts):

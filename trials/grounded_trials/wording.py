@@ -28,7 +28,9 @@ PIECES = 4  # largest number of ranges that a list of trials names
 NARROW, WIDE = 60, 80  # columns: smallest and largest line width
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # colour marks in a text, of zero width
 # commands that use no workspace: they are printed without -C
-ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
+ELSEWHERE = frozenset(
+    {"init", "recover", "demo", "experiment", "challenge", "completion", "explain"}
+)
 _NAMED = re.compile(r"`(?:grounded ([a-z][^`]*)|((?:discard|restore) [^`]*))`")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # a word of a command; quotes stay together
 _GLUE = re.compile(

@@ -80,8 +80,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "small": Entry(
         "note",
-        "{state} is off by {error:size} [[{ahead:.3g} s ahead]][[whole?over whole trials]], {times:.2g} "
-        "{times:.2g} times the noise but {share:%} of the error before: too little to find a cause for",
+        "{state} is off by {error:size} [[{ahead:.3g} s ahead]][[whole?over whole trials]], "
+        "{times:.2g} times the noise but {share:%} of the error before: too little to find a cause",
     ),
     "noise": Entry(
         "note",

@@ -117,7 +117,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "the robot is steered by its sensor of {state}, which reads {bias} too {way}",
         "add that to {state} where [task] start and the target are true values, not its readings; "
-        "or correct the readings (offset {offset:+.3g} in [log.state.{state}]) and remove the effect",
+        "or correct the log (offset {offset:+.3g} in [log.state.{state}]) and remove the effect",
     ),
     "scaled": Entry(
         "note",
