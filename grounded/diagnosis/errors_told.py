@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from grounded.diagnosis.error_report import AT_MOST, Remainder, RulerRow, doubt_of, furthest
 from grounded.findings import Finding, Quantity, found
@@ -137,7 +137,7 @@ def most_off(row: RulerRow) -> str:
     return max(off, key=lambda n: off[n], default="")
 
 
-def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Quantity]:
+def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:
     """Return the errors of a state as facts, by slot: columns of the row, such as now="crude"."""
     unit = row.unit_by_channel.get(name, "")
     values = {slot: getattr(row, column).get(name, math.nan) for slot, column in columns.items()}

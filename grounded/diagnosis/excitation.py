@@ -229,7 +229,7 @@ def _teaching(
     if motion:
         step = found("gap.next.probe", name, probe=words, motion=True)
     elif not little:
-        ends: dict[str, Any] = {"then": Quantity(then, of), "now": Quantity(now, of)}
+        ends: dict[str, Any] = {"after": Quantity(then, of), "now": Quantity(now, of)}
         twice_run = 2 if again else None
         step = found("gap.next.probe", name, probe=words, value=called, runs=twice_run, **ends)
     return Probe(chosen, gain, (name,), step, little, then, 1 + again)

@@ -8,6 +8,7 @@ from typing import Any
 
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.causes import effect_of, furthest_apart, sign_only, value_called
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise, worse_states
 from grounded.diagnosis.parts import Diagnosed, Estimate
 from grounded.findings import Finding, Quantity, found
@@ -34,10 +35,10 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
         return
     yield from _of_groups(d, adopted)
     for group in d.indistinguishable:
-        same = group in d.equivalent
         first, *others = group
-        yield found(f"gap.{'equivalent' if same else 'tie'}", *group, effect=first,
-                    others=tuple(others))  # fmt: skip
+        code = "gap.equivalent" if group in d.equivalent else "gap.tie"
+        own = not first.startswith("parameter:")  # a fit writes these
+        yield found(code, *group, effect=first, others=tuple(others), own=own)
     for one in d.lookalikes:
         if one.share >= 1.0:
             yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
@@ -56,8 +57,6 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
             trial=None if seen.repeats else seen.trial,
             place=seen.region.told if seen.region else None,
         )
-    for row in (row for row in d.ranking if row.no_better):
-        yield found("gap.no_better", row.effect, nats=row.evidence, effect=row.effect)
     if d.effects or d.verdict.parameters:
         yield from _of_errors(d)
         yield from _of_values(d, adopted)
@@ -69,6 +68,8 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
     if (curve := d.correction) is not None and curve.adoptable:
         state, gain = curve.channel, curve.held_out_gain
         yield found("gap.correction", state, over=curve.over, gain=gain, state=state)
+    if likely := [row.effect for row in d.ranking if row.no_better]:
+        yield found("gap.no_better", *likely)
     if odd := in_the_log(d.preflight):
         yield found("gap.corrected", *(one.signal for one in odd))
 
@@ -108,16 +109,18 @@ def _of_errors(d: Diagnosed) -> Iterator[Finding]:
     rows = d.prediction_error
     _, row, name = lost_most(rows)
     if row is not None and worse_states(rows):
-        ahead = 0.0 if row.whole_trial else row.horizon_s
-        ends: dict[str, Any] = errors(row, name, now="with_effects", before="crude")
-        yield found("gap.worse", name, state=name, ahead=ahead, whole=row.whole_trial, **ends)
+        ends = errors(row, name, now="with_effects", before="crude")
+        yield found("gap.worse", name, state=name, **_when(row), **ends)
     if (above := excess(rows)) and not d.leftover:
         times, name, row = above
-        ends = errors(row, name, error="with_effects")
+        off = errors(row, name, error="with_effects")
         share = row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300)
-        ahead = 0.0 if row.whole_trial else row.horizon_s
-        yield found("gap.small", name, state=name, times=times, share=share, ahead=ahead,
-                    whole=row.whole_trial, **ends)  # fmt: skip
+        yield found("gap.small", name, state=name, times=times, share=share, **_when(row), **off)
+
+
+def _when(row: RulerRow) -> dict[str, Any]:
+    """Return how far ahead the errors of a row are, as facts."""
+    return {"whole": True} if row.whole_trial else {"ahead": row.horizon_s}
 
 
 def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
@@ -129,6 +132,8 @@ def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
         rests.setdefault(on, []).append(value_called(name, adopted))
     for on, names in rests.items():
         yield found("model.given", *names, rests=on)
+    if d.jointly:
+        yield found("model.jointly", *(value_called(name, adopted) for name in sorted(d.jointly)))
     if stopped := [name for name, e in d.parameters.items() if e.stopped]:
         yield found("model.at_bound", *stopped)
     if lost := [name for name in d.parameters if name not in d.known_parameters]:

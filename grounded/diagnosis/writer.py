@@ -44,12 +44,12 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import acting_order, wrapping_order
 from grounded.findings import Finding, found
 from grounded.places import position
-from grounded.result import listed, number
+from grounded.result import number
 from grounded.task import Task
 from grounded.trial import Trial
 
 MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
-NAMED = 3  # parameters in the words of a cause
+NAMED, VALUED = 3, 2  # parameters in the words of a cause: at most, and with their values
 
 
 class Writer:
@@ -235,19 +235,16 @@ class Writer:
         params, known = self.data.model.params, self.claims.parameters()
         values = {row.effect: row.params for row in ranking}
         effects = {effect.name: effect for effect in self.best.hypothesis.effects}
-        parts = [
-            found(
-                "model.parameter",
-                name=value_called(name, self.adopted),
-                value=known[name].text,
-                old=number(params[name].value),
-            ).sentence
-            for name in off[:NAMED]
-        ]
-        parts += [f"{len(off) - NAMED} more"] * (len(off) > NAMED)
+        called = [value_called(name, self.adopted) for name in off]
+        each = (
+            f"{c} = {known[n].text}, was {number(params[n].value)}"
+            for c, n in zip(called, off, strict=True)
+        )
+        more = [f"{len(off) - NAMED} more"] * (len(off) > NAMED)
+        shown = tuple(each) if len(off) <= VALUED else None
+        own = found("model.off", values=shown, names=(*called[:NAMED], *more)).sentence
         return tuple(
-            meaning(effects[one.of], values[one.of]) if one.of in effects else listed(parts)
-            for one in credit
+            meaning(effects[one.of], values[one.of]) if one.of in effects else own for one in credit
         )
 
     def score(self) -> Score:

@@ -105,7 +105,8 @@ def test_parameters_that_are_known_only_together_are_written_together():
     assert total == pytest.approx(1.2, abs=0.01)
     written = diagnosis.to_json()["identifiable"]
     assert all(one["jointly"] for one in written)
-    assert "known only with the others" in diagnosis.sentence
+    (one,) = [one for one in diagnosis.findings if one.code == "model.jointly"]
+    assert one.about == ("a", "b")
 
 
 def test_a_direction_that_only_the_prior_sets_is_not_known():

@@ -54,7 +54,7 @@ ENTRIES: dict[str, Entry] = {
     "tie": Entry(
         "warn",
         "these trials can't tell {effect} from {others}: each explains them",
-        "adopting writes {effect}",
+        "[[own?adopting writes {effect}]]",
     ),
     "equivalent": Entry(
         "note", "no log can tell {effect} from {others} in this model; plans are the same for all"
@@ -89,7 +89,9 @@ ENTRIES: dict[str, Entry] = {
         "repeat one run to know it",
     ),
     "no_better": Entry(
-        "note", "{effect} alone is likely, but predictions do not clearly improve with it"
+        "note",
+        "{about} alone {about:is/are} likely, but predictions do not clearly improve with "
+        "{about:it/them}",
     ),
     "correction": Entry(
         "note",
@@ -207,7 +209,7 @@ ENTRIES: dict[str, Entry] = {
     "next.probe": Entry(
         "note",
         "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {nats:.3g} "
-        "nats]][[would tell {value} to +- {then:size}]][[ instead of {now:size}]]"
+        "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
         "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
     ),
     "next.unsafe": Entry(

@@ -31,12 +31,13 @@ ENTRIES: dict[str, Entry] = {
     ),
     "copy": Entry("warn", "{about} equals {first}: a copy, or no noise at all; it counts once"),
     # its parameters
-    "parameter": Entry("note", "{name} = {value}, was {old}"),
+    "off": Entry("note", "[[{values}]][[!values?{names} {names:is/are} off]]"),
     "given": Entry(
         "note",
         "{about} {about:is/are} known only if {rests} {rests:is/are} right as declared",
         "measure one of them to know each",
     ),
+    "jointly": Entry("note", "{about} {about:is/are} known only together with the others"),
     "not_told": Entry(
         "note", "the trials do not tell {about}, which {about:stays/stay} as {about:it/they} was"
     ),

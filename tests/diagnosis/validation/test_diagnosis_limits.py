@@ -206,7 +206,7 @@ def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(cl
     for model in (CART_POLE, filtered):  # as after its adoption: nothing was said
         found = joints_without_input(model, claimed)
         assert bool(found) == said
-        assert all(name in one for one in found for name in claimed if "input" not in name)
+        assert all(name in one.about for one in found for name in claimed if "input" not in name)
 
 
 def test_a_filter_that_sensors_show_alone_is_held():
