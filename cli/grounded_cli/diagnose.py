@@ -104,7 +104,8 @@ def command(
             engine=engine,
             progress=tell,
         )
-    for note in [*([] if trials or first else left_out(workspace)), *unwritten_in(workspace)]:
+    left = () if trials or first else left_out(workspace)
+    for note in [*(one.sentence for one in left), *unwritten_in(workspace)]:
         remark("note", note)
     if json_:
         show_json(found.to_json())
@@ -113,8 +114,9 @@ def command(
         show("\n" + field("next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent
+            from grounded_trials.workspace.candidates.trust import extent_of
 
-            show_extent(workspace.candidate(found.probe)[0], workspace.task)
+            show_extent(extent_of(workspace.candidate(found.probe)[0], workspace.task))
         assert found.then is not None
         show(f"\n{next_line(found.then)}")
 

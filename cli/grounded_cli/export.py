@@ -9,7 +9,7 @@ import click
 from grounded.errors import NextCommand
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import anyway, as_json
-from grounded_cli.console.terminal import remark, sentence, show, show_json
+from grounded_cli.console.terminal import sentence, show, show_json, tell
 from grounded_cli.console.workspace_option import (
     in_workspace,
     next_line,
@@ -70,10 +70,7 @@ def command(
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} has the extension {named}, but --format is {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
-    for reason in done.overridden:
-        remark("warning", f"{done.candidate} is exported anyway: {reason}")
-    for note in done.notes:
-        remark("note", note)
+    tell(done.findings, all_=True)
     if json_:
         show_json(done.to_json())
     else:

@@ -119,7 +119,7 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
     show("")
     for path in done.removed:
         remark("note", f"{path} is deleted: {path.stem} was not run and is void")
-    tell_proposed(workspace, done.proposed, last=done.exported is None)
+    tell_proposed(done.proposed, last=done.exported is None)
     if done.exported is not None:
         show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
         then = next_line(NextCommand("next", ("LOG",)))

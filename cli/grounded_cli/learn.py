@@ -16,6 +16,7 @@ from grounded_cli.console.terminal import (
     show,
     show_json,
     stages,
+    tell,
     tinted,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
@@ -48,8 +49,7 @@ def run(candidate: str | None, anyway: bool, json_: bool) -> None:
 
     with progress(f"running {candidate or 'the candidate'}"):
         ran = workspace.run(candidate, anyway=anyway, warn=warn)
-    for note in ran.notes:
-        remark("note", note)
+    tell(ran.findings, all_=True)
     if json_:
         show_json(ran.to_json())
     else:
@@ -74,10 +74,10 @@ def command(trials: int | None, json_: bool) -> None:
 def narrated(workspace: Workspace, trials: int | None = None) -> Status:
     """Run the learning loop and print a line for each trial."""
     told = dict[str, str]()
-    with stages() as tell:
+    with stages() as stage:
 
         def each(candidate: Candidate, found: Ingested) -> None:
-            tell("")
+            stage("")
             for warning in found.warnings:
                 remark("warning", f"{found.trial}: {warning}")
             say(
@@ -87,10 +87,9 @@ def narrated(workspace: Workspace, trials: int | None = None) -> Status:
             )
             told[candidate.id] = found.verdict
 
-        status = workspace.learn(trials, progress=tell, each=each)
+        status = workspace.learn(trials, progress=stage, each=each)
     now = {t.candidate.id: t.verdict() for t in status.standing.history}
     if sure := [n for n, then in told.items() if (then, now.get(n)) == ("maybe better", "better")]:
         remark("note", f"{ranges(sure)}: maybe better when run, better by what repeats told since")
-    for note in status.notes:
-        remark("note", note)
+    tell(status.findings, all_=True)
     return status

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, details
 from grounded_cli.console.terminal import (
     field,
     number,
@@ -17,22 +17,22 @@ from grounded_cli.console.terminal import (
     show_json,
     sparkline,
     table,
+    tell,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_cli.propose import noise_share
-from grounded_trials.wording import count, legend, rendered, wrapped
+from grounded_trials.wording import count, legend, wrapped
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Standing
     from grounded_trials.workspace.candidates.proposing import Status
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
 
 @click.command("status")
+@details
 @in_workspace
 @as_json
-def command(json_: bool) -> None:
+def command(json_: bool, details: bool) -> None:
     """Show where the search stands, from the stored trials; nothing is written."""
     workspace = open_workspace()
     with progress("reading trials"):
@@ -47,16 +47,13 @@ def command(json_: bool) -> None:
         from grounded_trials.workspace.last_diagnosis import Since
 
         settled = settled_in(workspace, status.diagnosis, status.since or Since())
-    for note in status.notes:
-        remark("note", note)
+    tell(status.findings, all_=details)
     for name, why in status.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
     if settled:
         show(f"\n{table(settled.rows, ('adopted', 'value'))}")
         for one in filter(None, (settled.gained, settled.open)):
             show("\n".join(wrapped(one.sentence, "  ", "  ")))
-    if status.outdated:
-        show("\n" * bool(settled) + field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")
 
 
@@ -80,8 +77,7 @@ def verify(json_: bool) -> None:
 
 def summary(status: Status) -> str:
     """Return the history as a table, the utilities as bars, and the certainty of the last gain."""
-    from grounded.search.certainty import beyond_one_trial, last_improvement
-    from grounded_trials.workspace.next_step import outlook
+    from grounded_trials.workspace.candidates.trust import much_noise
 
     standing, lines = status.standing, []
     if standing.history:
@@ -90,41 +86,19 @@ def summary(status: Status) -> str:
         lines += wrapped(words, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
         lines.append("\n" + field("utility", bars) if bars else "")
-    if standing.incumbent is not None:
-        best = standing.incumbent
-        text = f"{best.candidate.id}, utility {number(best.utility)}{noise_share(best)}"
-        lines.append(field("best", text + _gained(standing)))
-        if less := standing.less_in_log:
-            lines.append(field("predicted", less))
+    if (best := standing.incumbent) is not None:
+        text = f"{best.candidate.id}, utility {number(best.utility)}"
+        if noise := much_noise(best.noise_cost, best.utility):
+            text += f", {number(noise)} of it by sensor noise"
+        lead = standing.lead
+        if lead is not None and lead.before.utility and best.candidate.base:
+            failed = not math.isfinite(lead.before.utility)
+            text += "; the model's own policy failed" if failed else f"; {lead.lead.sentence}"
+        lines.append(field("best", text))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
-    exported = "then " * (status.again.verb == "next")
-    again = f" ({exported}`{rendered(status.again)}`)"
-    if certainty := last_improvement(standing.history, again):
-        ran = {t.candidate.id for t in standing.history if t.trials}
-        waiting = standing.outstanding
-        if waiting and waiting.id not in ran and standing.incumbent is not None:
-            small = beyond_one_trial(waiting, standing.incumbent, standing.missing)
-            certainty = "; ".join(filter(None, (certainty, small)))
-        lines.append(field("certainty", certainty))
-    lines.append(field("phase", f"{standing.outcome}: {outlook(standing, status.then)}"))
+    if status.certainty:
+        certain = "; ".join(one.sentence for one in status.certainty)
+        lines.append(field("certainty", certain))
+    lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))
     return "\n".join(lines)
-
-
-def _gained(standing: Standing) -> str:
-    """Return by how much the best candidate beats the model's own policy, as a sentence's end."""
-    from grounded.search.certainty import by_starts, share_of_cost
-
-    best, own = standing.incumbent, standing.history[0]
-    if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
-        return ""
-    if not math.isfinite(own.utility):
-        return "; the model's own policy failed"
-    if best.candidate.base == "" or not own.utility:
-        return ""
-    if why := standing.lead_doubt:
-        return f"; {why}"
-    share = share_of_cost(own, best, standing.history)
-    gain = f", {share} better than the model's own policy"
-    start = by_starts(own, best, standing.history)
-    return f"{gain}; {start}" if start else gain

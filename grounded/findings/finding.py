@@ -67,6 +67,11 @@ class Finding:
         texts = (filled(text, facts).strip() for text in (entry.short, entry.remedy))
         return "; ".join(text for text in texts if text)
 
+    def knowing(self, facts: Mapping[str, Fact | None]) -> Finding:
+        """Return it with more facts; those that are None are left out."""
+        known = {name: value for name, value in facts.items() if value is not None}
+        return replace(self, facts={**self.facts, **known})
+
     def weighing(self, weight: Weight) -> Finding:
         """Return it with another weight."""
         return replace(self, weight=weight)
@@ -117,7 +122,6 @@ def found(
     weight: Weight | None = None,
     **facts: Fact | None,
 ) -> Finding:
-    """Return a finding with the weight of its entry; facts that are None are left out."""
+    """Return a finding with the weight of its entry and the facts that are not None."""
     weighs = weight or Weight(entry_of(code).weight)
-    known = {name: value for name, value in facts.items() if value is not None}
-    return Finding(code, about, known, weighs, nats, then)
+    return Finding(code, about, {}, weighs, nats, then).knowing(facts)

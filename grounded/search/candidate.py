@@ -10,9 +10,10 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from grounded.figures.figure import Curve, Figure, Panel, legend
+from grounded.findings import Finding, found
 from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
-from grounded.result import Result, document, figure, percent, shown
+from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
 
 Way = Literal[
@@ -138,8 +139,8 @@ class Candidate(Result):
             return self.predicted_gain
         return self.predicted_utility - best.utility
 
-    def less_in_log(self, best: Tried, missed: float) -> str:
-        """Return why it may be run though its log is expected to show less than the best; or "".
+    def less_in_log(self, best: Tried, missed: float) -> Finding | None:
+        """Return that its log is expected to show less than the best one's, although it gains.
 
         The gain is one within the model, which replays the best one's run with the noise in it.
 
@@ -149,36 +150,32 @@ class Candidate(Result):
         """
         gain, in_log = self.promised_over(best), self.predicted_utility - missed
         if not (gain > 0 and in_log < best.utility and self.base == best.candidate.id):
-            return ""
+            return None
         if self.unlike(best.utility) or not self.grounded:  # told by what the model gives the best
-            return ""
-        return (
-            f"in the model, which replays {self.base} with the noise in its log, {self.id} is "
-            f"{figure(gain)} better; about {figure(in_log)} is expected of its log, which will "
-            f"have {figure(missed)} of noise that the prediction lacks: only the run tells whether "
-            "more than noise is gained"
+            return None
+        return found(
+            "plan.less_in_log", self.id, candidate=self.id, best=self.base, gain=gain, log=in_log
         )
 
-    def doubt(self, best: Tried | None) -> str:
-        """Return a sentence that says why a `doubtful` candidate may lose."""
+    def doubt(self, best: Tried | None) -> Finding | None:
+        """Return why it may lose although it promises a gain; None if it is not `doubtful`."""
+        if not self.doubtful:
+            return None
         gain = self.predicted_gain if best is None else self.promised_over(best)
-        over = self.base if best is None else best.candidate.id
-        if best is not None and self._gain_over(best) != self.predicted_utility - best.utility:
-            over = f"the {self.expected_of_base:.4g} that the model predicts for {over} itself"
-        cost = self.predicted_gain - self.predicted_utility  # of its base
-        off = f"{self.likely_off:.3g}"  # beyond the base's whole cost the size means nothing
-        off = f"more than the whole cost of {self.base}" if self.likely_off > cost > 0 else off
-        stop = ""
-        if best and not best.is_unsteady and self.predicted_gain < LITTLE * abs(best.utility):
-            stop = f". {run_or_stop(gain, best)}"
-        may = "may well lose"
-        if best and best.candidate.doubtful:  # it has won, so that such a likely error says less
-            luck = ", perhaps by luck" * (best.probability < SURE or best.unsure)
-            may = f"may lose, as was said of {best.candidate.id}, which won{luck}"
-        return (
-            f"{self.id} {may}: it promises {gain:.3g} over {over}, but judging by earlier "
-            f"trials the model's likely error there is {off}{stop}"
+        return found(
+            "plan.doubtful",
+            self.id,
+            candidate=self.id,
+            gain=gain,
+            best=self.base if best is None else best.candidate.id,
+            error=self.likely_off,
+            share=None if best is None else self.stake(best),
         )
+
+    def stake(self, best: Tried) -> float | None:
+        """Return its promised share of the best cost if that is too little for a doubtful run."""
+        share = self.promised_over(best) / abs(best.utility)
+        return share if 0 < share < LITTLE and not best.is_unsteady else None
 
     @property
     def of_original(self) -> bool:
@@ -219,21 +216,6 @@ class Candidate(Result):
             panels.append(Panel(title, "time [s]", unit, (curve,), kind="time"))
         title = f"{self.id}: predicted utility {figure(self.predicted_utility)}"
         return (Figure("candidate", title, "", tuple(panels), legend(panels[:1])),)
-
-
-def run_or_stop(gain: float, best: Tried) -> str:
-    """Return what a doubtful candidate gains if it keeps its promise, and how to stop instead.
-
-    Args:
-        gain: the promised gain over the best so far.
-        best: the best so far.
-    """
-    own = best.candidate.id
-    return (
-        f"If it keeps its promise, it gains {percent(gain / abs(best.utility))} of what {own} "
-        f"costs: run it if that is worth a run, else stop with {own}, the best so far "
-        "(`export best`)"
-    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

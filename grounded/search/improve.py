@@ -28,20 +28,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, list_of, type_of
+from grounded.errors import GroundedError, list_of, type_of
+from grounded.findings import Finding, found
 from grounded.model import Model
-from grounded.result import figure, percent
 from grounded.search.candidate import BY_STEP, Candidate, Tried
-from grounded.search.certainty import few, one_trial_error, runs_needed
+from grounded.search.difference import few, one_trial_error
 from grounded.search.making import About, Maker
 from grounded.search.original import keeping_promises
 from grounded.search.planner import Planner
 from grounded.search.standing import (
-    AGAIN,
+    DIAGNOSE,
     Ending,
     Phase,
     Proposal,
     Standing,
+    ended,
     let_down,
     standing,
 )
@@ -99,18 +100,15 @@ def propose(
         )
     reward = task.reward
     if not any(w.any() for w in (reward.state, reward.terminal, reward.input, reward.input_change)):
-        raise GroundedError(
-            "no weight of the reward is above 0, so there is nothing to improve: set a weight "
-            f"for a state that the target gives, such as {task.model.state_names[0]}"
-        )
+        raise GroundedError(found("plan.no_weight", state=task.model.state_names[0]))
     candidates = list_of(candidates, Candidate, "candidates")
     trials = list_of(trials, Trial, "trials")
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
     now = standing(task, candidates, trials, options, fingerprint, planner)
-    if now.phase == "await-trial":
+    if now.phase is Phase.AWAIT:
         return Proposal(now, now.outstanding, is_new=False)
-    if now.phase != "propose":
+    if now.phase is not Phase.PROPOSE:
         return Proposal(now, None, is_new=False)
     if options.refit and now.incumbent is not None:
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
@@ -119,39 +117,31 @@ def propose(
     if now.incumbent is None:
         policy, plan = planner.first_policy(now.caution, tick)
         if not plan.ok:
-            raise GroundedError(
-                f"there is no plan to run: {plan.sentence}; correct the model there, or choose a "
-                "start and a target at which it is valid"
-            )
+            raise GroundedError(found("plan.none", why=plan.sentence))
         model = planner.plan.problem(exact=True)
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":
             return made
-        note = (
-            f"the plan is not optimal in the model: {plan.sentence}{_slowly(plan)}. It can be run "
-        )
-        note += "all the same: the steps from its run go on improving it"
-        return replace(made, notes=(*made.notes, note))
-    found = _improvement(make, now.incumbent, options)
-    if found.candidate is None:
-        return found
+        slow = found("plan.not_optimal", why=plan.sentence, share=_slowly(plan), last=LATEST)
+        return replace(made, findings=(*made.findings, slow))
+    made = _improvement(make, now.incumbent, options)
+    if made.candidate is None:
+        return made
     before = standing(task, candidates, trials[:-1], options, fingerprint, planner)
-    note = _run_again(before, now, trials[-1], found.candidate)
-    return replace(found, notes=(*found.notes, note)) if note else found
+    again = _run_again(before, now, trials[-1], made.candidate)
+    return replace(made, findings=(*made.findings, again)) if again else made
 
 
-def _slowly(plan: Solution) -> str:
-    """Return by how much the last iterations of a plan lowered its cost; "" if there were few."""
+def _slowly(plan: Solution) -> float | None:
+    """Return the share by which the last iterations of a plan lowered its cost; None for few."""
     costs = [line.cost for line in plan.trace[-LATEST:]]
-    if len(costs) < LATEST or not costs[0] > 0:
-        return ""
-    return f" (the last {LATEST} by {percent(1 - costs[-1] / costs[0])})"
+    return 1 - costs[-1] / costs[0] if len(costs) == LATEST and costs[0] > 0 else None
 
 
-def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> str:
-    """Return why a search goes on after a run of its best candidate that it did not ask for.
+def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> Finding | None:
+    """Return that a search goes on after a run of its best candidate that it did not ask for.
 
-    It may have ended before that run; "" for other runs, and if the model was changed since.
+    It may have ended before that run; None for other runs, and if the model was changed since.
 
     Args:
         before: the standing of the search without the last trial.
@@ -160,23 +150,16 @@ def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) ->
         made: the next candidate.
     """
     was, best = before.incumbent, now.incumbent
-    if was is None or best is None or before.phase == "await-trial":
-        return ""
+    if was is None or best is None or before.phase is Phase.AWAIT:
+        return None
     if now.history[-1].candidate.model != made.model:
-        return ""
+        return None
     own = was.candidate.id
     ran = next((tried for tried in now.history if tried.candidate.id == own), None)
     if last.candidate != own or ran is None:
-        return ""
-    mean = (
-        f"{own} was run again, and the mean of its runs is now {figure(ran.utility)} instead of "
-        f"{figure(was.utility)}"
-    )
-    if best.candidate.id != own:
-        return f"{mean}: {best.candidate.id} is the best now, and the search goes on from there"
-    gain = made.promised_over(best)
-    promise = f", and promises {figure(gain)} from there" * (gain > 0)
-    return f"{mean}: the model replays their mean{promise}, so the search goes on"
+        return None
+    other, mean = best.candidate.id if best.candidate.id != own else None, ran.utility
+    return found("plan.run_again", own, best=own, mean=mean, was=was.utility, other=other)
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
@@ -251,13 +234,9 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     )
 
 
-def _steps_lost(make: Maker, own: str) -> str:
+def _steps_lost(make: Maker, own: str) -> int:
     """Return how many steps from a candidate lost, with the model as it is now."""
-    history = make.now.history
-    lost = len(losers_of(history, own, make.fingerprint))
-    each = sum(t.accepted is False and t.candidate.base == own for t in history)
-    now = " with the model as it is now" * (each > lost)
-    return f"{lost} step{'s' * (lost > 1)} from {own}{now}"
+    return len(losers_of(make.now.history, own, make.fingerprint))
 
 
 def _below_noise(
@@ -279,18 +258,16 @@ def _below_noise(
     if gain > 0 and best.is_unsteady:
         return None
     own = best.candidate.id
-    sentence = f"{_steps_lost(make, own)} did not improve, and the next "
-    if gain > 0:
-        sentence += (
-            f"promises {figure(gain)}, less than the standard error of a trial's gain, "
-            f"{error:.2g}{few(best.repeats)} (it takes {runs_needed(gain, best)} of each candidate "
-            "to show such a gain)"
-        )
-    else:
-        sentence += "promises no gain over its runs"
-    sentence += f": {own} is the result"
-    ended = replace(make.now, phase="converged", step=None, ending="below the noise", doubt="")
-    return let_down(replace(ended, sentence=sentence, then=None, missed=""), make.fingerprint)
+    less = found(
+        "search.below_noise",
+        own,
+        best=own,
+        lost=_steps_lost(make, own),
+        gain=gain if gain > 0 else None,
+        error=error,
+        few=few(best.repeats) if gain > 0 else None,
+    )
+    return let_down(ended(make.now, Ending.BELOW_NOISE, less), make.fingerprint)
 
 
 def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
@@ -344,52 +321,33 @@ def _ended(
 ) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
     own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
-    phase: Phase = "stopped"
-    ending: Ending
-    then: NextCommand | None = NextCommand("diagnose")
-    asked = ""  # the end of the sentence, if that asks for a diagnosis
-    lost = len(losers_of(make.now.history, own, make.fingerprint))
-    if doubted is not None:
-        phase, then, ending = "converged", None, "no step improved"
-        sentence = (
-            f"{_steps_lost(make, own)} did not improve, and the next promises "
-            f"{doubted.predicted_gain:.3g} with a likely error of {doubted.likely_off:.3g}: {own} "
-            "is the result"
-        )
-    elif ruinous is not None:
-        ending, asked = "too doubtful", "; diagnose the model"
+    lost, most = _steps_lost(make, own), max(finite, default=0.0)
+    ask = found("search.diagnose", then=DIAGNOSE)
+    if doubted is None and ruinous is not None:
         off = ruinous.likely_off
-        told = f" of {figure(off)}" * (off < -ABSURD * incumbent.utility)
-        if len(incumbent.trials) < AGAIN:
-            asked = f"; run {own} again or diagnose the model"
-        sentence = (
-            f"the model promises a gain of {figure(ruinous.predicted_gain)} from a step, but with "
-            f"a likely error{told}, more than the whole cost of {own}: no trial is spent on it"
+        why = found(
+            "search.too_doubtful",
+            own,
+            best=own,
+            gain=ruinous.predicted_gain,
+            error=off if off < -ABSURD * incumbent.utility else None,
         )
-    elif promised and not finite:
-        ending, asked = "model diverges", "; a diagnosis may show what it lacks"
-        sentence = (
-            f"the model grounded on {own} diverges for every step: it is too inaccurate there to "
-            "improve with"
+        return ended(make.now, Ending.DOUBTFUL, why, ask)
+    if doubted is None and promised and not finite:
+        return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
+    if doubted is None and most < -least and not lost:
+        why = found("search.every_step_loses", own, best=own, least=-most)
+        return ended(make.now, Ending.EVERY_STEP_LOSES, why, ask)
+    ending = Ending.NO_STEP if lost or doubted else Ending.NOTHING_PROMISED
+    why = found("search.nothing_promised", own, best=own, least=tolerance)
+    if lost or doubted:
+        why = found(
+            "search.no_step",
+            own,
+            best=own,
+            lost=lost,
+            gain=doubted.predicted_gain if doubted else None,
+            error=doubted.likely_off if doubted else None,
+            least=None if doubted else tolerance,
         )
-    elif finite and max(finite) < -least and not lost:
-        ending, asked = "every step loses", "; a diagnosis may show what it lacks"
-        sentence = (
-            f"every step from {own} loses in the grounded model, by at least {-max(finite):.4g}: "
-            "its derivatives are wrong along this trial"
-        )
-    elif lost:
-        phase, then, ending = "converged", None, "no step improved"
-        sentence = (
-            f"{_steps_lost(make, own)} did not improve, and the model promises "
-            f"less than {100 * tolerance:g} % from smaller steps: {own} is the result"
-        )
-    else:
-        phase, then, ending = "converged", None, "nothing promised"
-        sentence = (
-            f"the model promises less than {100 * tolerance:g} % more from any step "
-            f"([search] tolerance): {own} is the result"
-        )
-    ended = replace(make.now, phase=phase, step=None, missed=asked)
-    now = replace(ended, sentence=sentence + asked, ending=ending, then=then)
-    return let_down(now, make.fingerprint) if phase == "converged" else now
+    return let_down(ended(make.now, ending, why), make.fingerprint)

@@ -18,9 +18,9 @@ from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
 from grounded.search.feedback.sample_age import planned_age, run_ages
 from grounded.search.planner import Planner, predicted
-from grounded.search.safety import objections, spread, too_strong
+from grounded.search.safety import objections, spread
 from grounded.search.scatter import beyond_noise
-from grounded.search.standing import LOST, Ending, Proposal, Standing, wild
+from grounded.search.standing import LOST, Ending, Proposal, Standing, ended, wild
 from grounded.search.step.directions import base_columns, direction
 from grounded.search.step.step_size import KEPT, SearchOptions, Step, losers_of
 from grounded.solve import ddp
@@ -542,11 +542,11 @@ class Maker:
     def checked(self, made: Candidate) -> Proposal:
         """Return a proposal of the candidate, or a refusal if it violates limits or [safety]."""
         task, history = self.planner.task, self.now.history
-        if not (found := objections(task, made, spread(task, history, self.fingerprint))):
+        if not (against := objections(task, made, spread(task, history, self.fingerprint))):
             return Proposal(self.now, made, is_new=True)
-        ending: Ending = "gains too large" if found[0] == too_strong(task, made) else "not allowed"
-        stopped = replace(self.now, phase="stopped", sentence=found[0], ending=ending)
-        return Proposal(stopped, None, is_new=False, notes=tuple(found), refused=made)
+        ending = Ending.GAINS if against[0].code == "plan.gain" else Ending.NOT_ALLOWED
+        stopped = ended(self.now, ending, against[0])
+        return Proposal(stopped, None, is_new=False, findings=against, refused=made)
 
 
 def _gain(policy: Policy) -> float:

@@ -24,7 +24,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.search.candidate import LITTLE, Tried
-from grounded.search.certainty import LUCK, error_between
+from grounded.search.difference import LUCK, Difference
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
 from grounded.search.step.step_size import BROKEN
@@ -152,8 +152,8 @@ def promises(
         if made.base not in judged or made.id not in judged or not promised > 0:
             continue
         base = judged[made.base]
-        error, known = error_between(base, tried, history)
-        gained = promised, tried.gain_over(base), error if known else 0.0
+        between = Difference(base, tried, history)
+        gained = promised, tried.gain_over(base), between.error if between.known else 0.0
         if _by_adopted(tried, model):
             adopted = adopted.and_of(*gained)
         else:

@@ -14,7 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
+from grounded.model import Model
+from grounded.result import with_unit
 from grounded.rollout import augmented
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
@@ -32,23 +35,10 @@ class Strays:
     Args:
         size: deviation in units of the states, (H + 1, n).
         trial: id of the trial that causes most of it, (H + 1, n); "" if none does.
-        foretold: whether it is a deviation from the trial's prediction, (H + 1, n); else from
-            repeated runs.
     """
 
     size: Array
     trial: Array
-    foretold: Array
-
-    def clause(self, t: int, i: int) -> str:
-        """Return which run causes the spread of state i at step t and what to do; "" if none."""
-        if not (one := self.trial[t, i]):
-            return ""
-        what = "its prediction" if self.foretold[t, i] else "the other runs of its candidate"
-        return (
-            f"; +- is the distance of trial {one} from {what}: if that run was disturbed, remove "
-            f"it with `discard {one}`"
-        )
 
 
 def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
@@ -58,11 +48,11 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
     error of the latest prediction of a step by this model, grounded on a trial. Errors of other
     models, or of the model without a bias, do not count: they don't apply to the next step.
     """
-    found = np.zeros((task.horizon + 1, task.model.n))
-    whose, foretold = np.full(found.shape, "", dtype=object), np.zeros(found.shape, dtype=bool)
+    size = np.zeros((task.horizon + 1, task.model.n))
+    whose = np.full(size.shape, "", dtype=object)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
-        return Strays(found, whose, foretold)  # no [safety] to check
+        return Strays(size, whose)  # no [safety] to check
     for tried in history:
         whole = [t for t in tried.trials if t.finite_steps == task.horizon]
         if len(whole) > 1:
@@ -71,8 +61,8 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
             scatter = 2 * np.sqrt(off.sum(axis=0) / (len(whole) - 1))
             ids = np.array([t.id for t in whole], dtype=object)[off.argmax(axis=0)]
             ids[off.max(axis=0) <= MOST * off.sum(axis=0)] = ""
-            whose = np.where(scatter > found, ids, whose)
-            found = np.maximum(found, scatter)
+            whose = np.where(scatter > size, ids, whose)
+            size = np.maximum(size, scatter)
     grounded = [
         (tried.candidate.predicted_states, trial)
         for tried in history
@@ -83,12 +73,13 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
     if grounded:
         predicted, last = grounded[-1]
         missed = np.abs(task.model.difference(last.states, predicted))
-        foretold = missed > found
-        whose, found = np.where(foretold, last.id, whose), np.maximum(found, missed)
-    return Strays(found, whose, foretold)
+        whose, size = np.where(missed > size, last.id, whose), np.maximum(size, missed)
+    return Strays(size, whose)
 
 
-def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -> list[str]:
+def objections(
+    task: Task, candidate: Candidate, strays: Strays | None = None
+) -> tuple[Finding, ...]:
     """Return the reasons why a candidate must not be run; empty if there are none.
 
     Args:
@@ -96,67 +87,69 @@ def objections(task: Task, candidate: Candidate, strays: Strays | None = None) -
         candidate: the candidate with its predicted run.
         strays: deviations of real runs so far, see `spread`; None for zero.
     """
-    policy = candidate.policy
+    policy, name = candidate.policy, candidate.id
     parts = {"feed-forward": policy.feedforward, "predicted state": candidate.predicted_states}
     if policy.gain is not None and policy.reference is not None:
         parts |= {"gain": policy.gain, "reference": policy.reference}
-    for name, values in parts.items():
+    for what, values in parts.items():
         bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         if bad.any():
-            t = int(np.argmax(bad))
-            return [
-                f"the {name} of {candidate.id} is not a finite number at t = {t * task.dt:g} s "
-                f"(step {t}): the model diverges there; check it with a shorter horizon"
-            ]
-    found = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
-    return [sentence for sentence in (*found, too_strong(task, candidate)) if sentence]
+            at = Quantity(int(np.argmax(bad)) * task.dt, "s")
+            return (found("plan.not_finite", name, candidate=name, what=what, at=at),)
+    against = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
+    return tuple(one for one in (*against, too_strong(task, candidate)) if one)
 
 
-def too_strong(task: Task, candidate: Candidate) -> str:
-    """Return which gain of a candidate is beyond reason, and what would make it smaller; or ""."""
+def too_strong(task: Task, candidate: Candidate) -> Finding | None:
+    """Return which gain of a candidate is beyond reason, and what would make it smaller."""
     policy, model = candidate.policy, task.model
     if policy.gain is None or not np.abs(policy.gain).max() > MAX_GAIN:
-        return ""
+        return None
     t, j, i = np.unravel_index(int(np.argmax(np.abs(policy.gain))), policy.gain.shape)
     sent, fed = policy.input_names[j], policy.z_names[i]
     units = {**model.inputs, **model.states}
     of = units.get(fed, units[sent])  # else an input of an earlier step
-    size = f"{abs(policy.gain[t, j, i]):.3g} {units[sent]} per {of}"
-    lower, moves = f"raise [reward] input_change of {sent}", ""
-    if fed in model.states:
-        k = model.state_names.index(fed)
-        weight = float(max(task.reward.state[k], task.reward.terminal[k]))
-        moved = float(np.ptp(candidate.predicted_states[:, k]))
-        moves = f". The plan moves {fed} by {moved:.3g} {of} in all"
-        lower = (
-            f"weigh {fed} less in [reward] (now {weight:g}), or {lower}"
-            if weight
-            else f"{fed} has no weight in [reward], so check its unit and what it drives in the "
-            f"model, or {lower}"
-        )
-    return (
-        f"the gain of {sent} on {fed} reaches {size} in {candidate.id}, at t = {t * task.dt:g} s, "
-        f"more than {MAX_GAIN:g}{moves}: {lower} (now {task.reward.input_change[j]:g})"
+    known = fed in model.states
+    k = model.state_names.index(fed) if known else 0
+    return found(
+        "plan.gain",
+        candidate.id,
+        candidate=candidate.id,
+        input=sent,
+        state=fed,
+        gain=Quantity(abs(policy.gain[t, j, i]), f"{units[sent]} per {of}"),
+        at=Quantity(t * task.dt, "s"),
+        most=MAX_GAIN,
+        moved=Quantity(float(np.ptp(candidate.predicted_states[:, k])), of) if known else None,
+        state_weight=float(max(task.reward.state[k], task.reward.terminal[k])) if known else None,
+        change=float(task.reward.input_change[j]),
     )
 
 
-def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> str:
-    """Return the sentence for state i leaving [safety] in the predicted run, or ""."""
+def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> Finding | None:
+    """Return that state i leaves [safety] in the predicted run; None if it does not."""
     assert task.safety_low is not None and task.safety_high is not None
+    low, high = float(task.safety_low[i]), float(task.safety_high[i])
     value = candidate.predicted_states[:, i]
     stray = np.zeros(len(value)) if strays is None else strays.size[:, i]
-    beyond = np.maximum(task.safety_low[i] - value, value - task.safety_high[i])
+    beyond = np.maximum(low - value, value - high)
     excess = beyond + stray
     t = int(np.argmax(excess))
     if excess[t] <= 0:
-        return ""
+        return None
     name = task.model.state_names[i]
-    around = f" +- {stray[t]:.3f}" * bool(stray[t])
-    why = strays.clause(t, i) if strays is not None and beyond.max() <= 0 else ""
-    return (
-        f"{candidate.id} (alpha = {candidate.alpha:g}) is predicted to take {name} to "
-        f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside "
-        f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]{why}"
+    blamed = strays is not None and beyond.max() <= 0
+    return found(
+        "plan.outside_safety",
+        candidate.id,
+        candidate=candidate.id,
+        alpha=candidate.alpha,
+        state=name,
+        value=Quantity(value[t], task.model.states[name], stray[t]),
+        at=Quantity(t * task.dt, "s"),
+        low=f"{low:g}",
+        high=f"{high:g}",
+        trial=str(strays.trial[t, i]) if strays is not None and blamed else None,
     )
 
 
@@ -186,8 +179,8 @@ def coasting(task: Task, run: Trial, held: Array) -> Array:
     return np.array(states)
 
 
-def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
-    """Return a warning if the model predicts that the robot leaves [safety] after a run, or "".
+def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> Finding | None:
+    """Return that the model predicts that the robot leaves [safety] after a run, or None.
 
     Args:
         task: has the limits of [safety].
@@ -197,22 +190,27 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> str:
     """
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
-        return ""
+        return None
     states = coasting(plan, run, held)[:, : task.model.n]
     excess = np.maximum(task.safety_low - states, states - task.safety_high)
     if not (excess > 0).any():
-        return ""
+        return None
     t = int(np.argmax((excess > 0).any(axis=1)))
     i = int(np.argmax(excess[t]))
     most = int(np.argmax(excess[:, i]))
-    (name, unit), inputs = list(task.model.states.items())[i], task.model.inputs.items()
-    sent = ", ".join(
-        f"{one} = {value:.3g} {of}".removesuffix(" 1")
-        for (one, of), value in zip(inputs, held, strict=True)
+    name, unit = list(task.model.states.items())[i]
+    return found(
+        "plan.coasts_out",
+        held=as_sent(task.model, held),
+        state=name,
+        low=f"{task.safety_low[i]:g}",
+        high=f"{task.safety_high[i]:g}",
+        at=Quantity(t * task.dt, "s"),
+        most=Quantity(states[most, i], unit),
     )
-    return (
-        f"its runner holds {sent}, and the model predicts that the robot leaves [safety] {name} = "
-        f"[{task.safety_low[i]:g}, {task.safety_high[i]:g}] {t * task.dt:.2g} s later and reaches "
-        f"{states[most, i]:.3g} {unit}, {most * task.dt:.2g} s later: be ready to stop it, switch "
-        "to a holding controller once the runner is done, or let the target come to rest inside"
-    )
+
+
+def as_sent(model: Model, inputs: Array, digits: int = 3) -> tuple[str, ...]:
+    """Return inputs (m,) as `force = 0 N`, each."""
+    pairs = zip(model.inputs.items(), inputs + 0.0, strict=True)
+    return tuple(with_unit(f"{name} = {x:.{digits}g}", unit) for (name, unit), x in pairs)

@@ -21,22 +21,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
-from grounded.result import Result, document, figure, html_table, percent, spread
+from grounded.findings import Finding, found
+from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
-from grounded.search.certainty import (
+from grounded.search.certainty import judged
+from grounded.search.difference import (
     LUCK,
     MANY,
-    error_between,
-    explained,
-    few,
-    judged,
-    last_improvement,
+    Difference,
+    last_gain,
     missed_by_start,
-    runs_needed,
     runs_to_show,
 )
 from grounded.search.pictures import search_figure
@@ -49,21 +48,43 @@ from grounded.trial import Trial
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
 
-Phase = Literal["propose", "await-trial", "converged", "stopped"]
-Ending = Literal[
-    "",  # the search goes on
-    "nothing promised",  # the grounded model predicts no further gain
-    "no step improved",  # step 7: real trials lost down to the smallest step
-    "every step loses",  # already in the grounded model
-    "too doubtful",  # other models that explain the trials predict a large loss
-    "model diverges",  # when grounded on the best trial
-    "crashed",  # every first policy crashed
-    "not allowed",  # the next candidate violates [limits] or [safety]
-    "gains too large",  # of the next candidate: a state that hardly moves, or weights
-    "too little gained",  # by the last candidates
-    "below the noise",  # steps lost, and the next promises less than a trial can show
-    "trials used up",
-]
+
+class Phase(StrEnum):
+    """What the search waits for."""
+
+    PROPOSE = "propose"  # the next candidate is to be made
+    AWAIT = "await-trial"  # the outstanding candidate is to be run
+    CONVERGED = "converged"  # it has ended with a result
+    STOPPED = "stopped"  # it has ended without one
+
+
+class Ending(StrEnum):
+    """Why a search has ended."""
+
+    NONE = ""  # it goes on
+    NOTHING_PROMISED = "nothing promised"  # the grounded model predicts no further gain
+    NO_STEP = "no step improved"  # step 7: real trials lost down to the smallest step
+    EVERY_STEP_LOSES = "every step loses"  # already in the grounded model
+    DOUBTFUL = "too doubtful"  # other models that explain the trials predict a large loss
+    DIVERGES = "model diverges"  # when grounded on the best trial
+    CRASHED = "crashed"  # every first policy crashed
+    NOT_ALLOWED = "not allowed"  # the next candidate violates [limits] or [safety]
+    GAINS = "gains too large"  # of the next candidate: a state that hardly moves, or weights
+    LITTLE = "too little gained"  # by the last candidates
+    BELOW_NOISE = "below the noise"  # steps lost, and the next promises less than a trial can show
+    USED_UP = "trials used up"
+
+
+WORDS = {Phase.PROPOSE: "going on", Phase.AWAIT: "waiting"}  # the other phases are their own words
+DIAGNOSE = NextCommand("diagnose")
+ASKS = ("search.diagnose", "search.lost_in_row", "search.far_off")  # answered by a diagnosis
+DOUBTS = ("search.crashes", *ASKS)
+RESULTS = (
+    Ending.NOTHING_PROMISED,
+    Ending.NO_STEP,
+    Ending.LITTLE,
+    Ending.BELOW_NOISE,
+)  # endings with a result: the search has converged
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
 AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
@@ -73,7 +94,7 @@ MAX_CAUTION = 3  # times the first policy is made again, each time more gently, 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Standing(Result):
-    """The state of a search, with a sentence that describes it."""
+    """The state of a search, and why it is that."""
 
     phase: Phase
     iteration: int  # accepted improvements so far
@@ -85,24 +106,43 @@ class Standing(Result):
     caution: int
     history: tuple[Tried, ...]
     trials: int
-    sentence: str
-    ending: Ending = ""
-    then: NextCommand | None = None  # a command that helps now
-    doubt: str = ""  # why a diagnosis helps more than the next trial
-    missed: str = ""  # the end of `sentence`, if that asks for a diagnosis
+    findings: tuple[Finding, ...]  # why it stands so, then what helps
+    ending: Ending = Ending.NONE
+
+    @property
+    def sentence(self) -> str:
+        """The findings in words."""
+        return "; ".join(one.sentence for one in self.findings)
+
+    @property
+    def then(self) -> NextCommand | None:
+        """A command that helps now."""
+        return next((one.then for one in self.findings if one.then), None)
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks for a diagnosis of the trials so far."""
+        return any(one.code in ASKS for one in self.findings)
+
+    @property
+    def doubt(self) -> Finding | None:
+        """Why a diagnosis helps more than the next trial, while the search goes on."""
+        doubts = (one for one in self.findings if one.code in DOUBTS)
+        return next(doubts, None) if self.phase is Phase.PROPOSE else None
 
     def answered(self) -> Standing:
         """Return the standing after the diagnosis that it asked for."""
-        if not self.missed:
-            return self
-        sentence = self.sentence.removesuffix(self.missed)
-        return replace(self, sentence=sentence, then=None, doubt="", missed="")
+        return replace(self, findings=tuple(one for one in self.findings if one.code not in ASKS))
+
+    def with_finding(self, one: Finding | None) -> Standing:
+        """Return the standing with one more finding."""
+        return replace(self, findings=(*self.findings, one)) if one else self
 
     @property
     def asks_again(self) -> bool:
         """Whether another run of the best candidate may settle the doubt that ended the search."""
-        few = self.incumbent is not None and len(self.incumbent.trials) < AGAIN
-        return self.ending == "too doubtful" and few
+        once = self.incumbent is not None and len(self.incumbent.trials) < AGAIN
+        return self.ending is Ending.DOUBTFUL and once
 
     @property
     def utilities(self) -> list[float]:
@@ -112,29 +152,33 @@ class Standing(Result):
     @property
     def outcome(self) -> str:
         """The phase in words; "converged" only if the model predicts no further gain."""
-        if self.ending in ("", "nothing promised"):
-            return {"propose": "going on", "await-trial": "waiting"}.get(self.phase, self.phase)
-        return self.ending
+        if self.ending in (Ending.NONE, Ending.NOTHING_PROMISED):
+            return WORDS.get(self.phase, self.phase.value)
+        return self.ending.value
 
     @property
-    def less_in_log(self) -> str:
-        """Why the candidate that waits for its first run may show less than the best; or ""."""
+    def less_in_log(self) -> Finding | None:
+        """That the candidate that waits for its first run may show less than the best."""
         made = self.outstanding
         waiting = (t for t in self.history if t.candidate is made and not t.trials)
         tried = next(waiting, None)
         if made is None or tried is None or self.incumbent is None:
-            return ""
+            return None
         return made.less_in_log(self.incumbent, tried.noise_missed)
 
     @property
-    def lead_doubt(self) -> str:
-        """A clause on what may explain the best one's lead on the model's own policy; or ""."""
+    def lead(self) -> Difference | None:
+        """How the best one compares with the model's own policy; None if that is the best."""
         best, own = self.incumbent, self.history[0] if self.history else None
         if best is None or own is None or own.candidate.base or not own.utilities:
-            return ""
-        if best.candidate is own.candidate or not (why := explained(own, best, self.history)):
-            return ""
-        return f"{why} its lead on the model's own policy"
+            return None
+        return Difference(own, best, self.history) if best.candidate is not own.candidate else None
+
+    @property
+    def lead_doubt(self) -> Finding | None:
+        """What may explain the best one's lead on the model's own policy."""
+        lead = self.lead
+        return lead.lead if lead is not None and lead.doubt else None
 
     def verdict(self, tried: Tried) -> str:
         """Return the verdict on a candidate, see `Tried.verdict`."""
@@ -148,7 +192,7 @@ class Standing(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded status --json`, with the whole history."""
-        best = self.incumbent
+        best, gain = self.incumbent, last_gain(self.history)
         return document(
             phase=self.phase,
             iteration=self.iteration,
@@ -156,7 +200,7 @@ class Standing(Result):
             and {
                 "candidate": best.candidate.id,
                 "utility": best.utility,
-                "lead_doubt": self.lead_doubt or None,
+                "lead_doubt": doubt.sentence if (doubt := self.lead_doubt) else None,
             },
             utilities=self.utilities,
             trials=self.trials,
@@ -164,7 +208,8 @@ class Standing(Result):
             missing=self.missing,
             sentence=self.sentence,
             ending=self.ending or None,
-            certainty=last_improvement(self.history),
+            certainty=gain.to_finding().sentence if gain else "",
+            findings=[one.to_json() for one in self.findings],
             history=[t.to_json() | {"verdict": self.verdict(t)} for t in self.history],
         )
 
@@ -208,8 +253,13 @@ class Proposal(Result):
     standing: Standing
     candidate: Candidate | None
     is_new: bool  # whether the candidate was made by this call
-    notes: tuple[str, ...] = ()
-    refused: Candidate | None = None  # a candidate that was refused for the reasons in `notes`
+    findings: tuple[Finding, ...] = ()  # on the candidate, or why it was refused
+    refused: Candidate | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
 
     def summary(self) -> str:
         """Return the summary of the candidate, or of the standing if there is none."""
@@ -229,6 +279,7 @@ class Proposal(Result):
             sentence=now.sentence,
             ending=None if made else now.ending or None,
             notes=self.notes,
+            findings=[one.to_json() for one in (*now.findings, *self.findings)],
         )
         best = document(best_utility=now.incumbent and now.incumbent.utility, new=self.is_new)
         return known | best if made else known
@@ -256,7 +307,7 @@ def standing(
     history, incumbent, iteration = judged(task, candidates, trials, options, model, starts)
     total = sum(len(t.trials) for t in history)
     now = Standing(
-        phase="propose",
+        phase=Phase.PROPOSE,
         iteration=iteration,
         incumbent=incumbent,
         outstanding=None,
@@ -266,61 +317,57 @@ def standing(
         caution=0,
         history=history,
         trials=total,
-        sentence="the first candidate is the model's own policy",
+        findings=(found("search.first"),),
     )
     if (awaited := _awaited(now, options, model)) is not None:
         return awaited
     if total + options.repeats > options.max_trials:
-        used = "all" if total >= options.max_trials else f"{total} of"
-        needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
-        sentence = f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)"
-        return replace(now, phase="stopped", sentence=sentence, ending="trials used up")
+        needs = options.repeats if total < options.max_trials else None
+        used = found("search.used_up", used=total, most=options.max_trials, needs=needs)
+        return ended(now, Ending.USED_UP, used)
     if incumbent is None:
-        failed = sum(t.accepted is False for t in history)
-        if failed > MAX_CAUTION:
-            sentence = (
-                f"the first policy crashed {failed} times, although each was gentler: the model is "
-                "too inaccurate to start from; correct it (fit, diagnose) and propose again"
-            )
-            return replace(
-                now,
-                phase="stopped",
-                sentence=sentence,
-                ending="crashed",
-                then=NextCommand("diagnose"),
-            )
-        now = replace(now, step=options.first_step(), caution=failed)
-        if failed:
-            gone = history[-1].candidate.id
-            now = replace(now, sentence=f"{gone} crashed: the next first policy is gentler")
-        if failed < LOST or history[-1].candidate.model != model:
-            return now
-        why = f"{failed} policies crashed in a row: a diagnosis may show what the model lacks"
-        return replace(now, sentence=why, then=NextCommand("diagnose"), doubt=why)
+        return _none_stood(now, options, model)
     own = incumbent.candidate.id
     step, way = _next_step(history, incumbent, options, model)
     if step is None:
-        sentence = (
-            f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
-            f"{own} is the result"
-        )
-        return replace(now, phase="converged", sentence=sentence, ending="no step improved")
+        alpha = 2.0**-options.max_halvings
+        return ended(now, Ending.NO_STEP, found("search.no_step", own, best=own, alpha=alpha))
     if options.damps and (hardly := _hardly(history, options.tolerance, model)):
-        ending, why = hardly
-        why = f"{why}: {own} is the result"
-        return let_down(replace(now, phase="converged", sentence=why, ending=ending), model)
-    restarted = _restarted(history, model)
+        return let_down(ended(now, *hardly), model)
     last = history[-1]
-    lost = f", since {last.candidate.id} crashed" * (last.accepted is False and bool(last.failed))
-    sentence = f"improve on {own} with {step}{lost}{restarted}"
-    if why := _suspicion(history, incumbent, model):
-        asked = f"; {why}"
-        now = replace(now, then=NextCommand("diagnose"), doubt=why, missed=asked)
-        return replace(now, step=step, way=way, sentence=sentence + asked)
-    return replace(now, step=step, way=way, sentence=sentence)
+    crashed = last.candidate.id if last.accepted is False and last.failed else None
+    lost, more = _restarted(history, model)
+    improve = found(
+        "search.step", own, best=own, step=str(step), crashed=crashed, lost=lost, more=more
+    )
+    now = replace(now, step=step, way=way, findings=(improve,))
+    return now.with_finding(_suspicion(history, incumbent, model))
 
 
-def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[Ending, str] | None:
+def ended(now: Standing, ending: Ending, *findings: Finding) -> Standing:
+    """Return the standing of a search that has ended."""
+    phase = Phase.CONVERGED if ending in RESULTS else Phase.STOPPED
+    return replace(now, phase=phase, step=None, ending=ending, findings=findings)
+
+
+def _none_stood(now: Standing, options: SearchOptions, model: str) -> Standing:
+    """Return the standing before a first policy was run to its end."""
+    crashes = sum(t.accepted is False for t in now.history)
+    if crashes > MAX_CAUTION:
+        return ended(now, Ending.CRASHED, found("search.crashed", then=DIAGNOSE, crashes=crashes))
+    now = replace(now, step=options.first_step(), caution=crashes)
+    if not crashes:
+        return now
+    last = now.history[-1].candidate
+    why = found("search.gentler", last.id, crashed=last.id)
+    if crashes >= LOST and last.model == model:
+        why = found("search.crashes", then=DIAGNOSE, crashes=crashes)
+    return replace(now, findings=(why,))
+
+
+def _hardly(
+    history: tuple[Tried, ...], tolerance: float, model: str
+) -> tuple[Ending, Finding] | None:
     """Return the ending and its reason if the last candidates gained too little, else None.
 
     Too little is less than the tolerance each on average, or in total less than the standard error
@@ -336,36 +383,37 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     if not before or any(t.candidate.model != model for t in last[-LOST:]):
         return None
     old, best = before[-1], [t for t in history if t.accepted][-1]
-    gained = best.gain_over(old)
+    gained, own = best.gain_over(old), best.candidate.id
     if gained == 0.0:
-        return "no step improved", f"the last {PATIENCE} candidates did not improve"
+        return Ending.NO_STEP, found("search.no_step", own, best=own, last=PATIENCE)
     if any(t.candidate.way == BY_STEP for t in last) and before[-1].candidate.way != BY_STEP:
         return None  # the others say nothing about steps with these derivatives
-    told = f"the last {PATIENCE} candidates gained {gained:.3g} in total, less than"
-    if gained < PATIENCE * tolerance * abs(best.utility):
-        return (
-            "too little gained",
-            f"{told} {100 * tolerance:g} % each on average ([search] tolerance)",
-        )
-    error, known = error_between(old, best, history)
-    if known and gained < error:
-        repeats = few(Repeats(history).near(best.utility).repeats) or " from repeats"
-        return "too little gained", f"{told} its standard error of {error:.2g}{repeats}"
-    return None
+    between = Difference(old, best, history)
+    little = gained < PATIENCE * tolerance * abs(best.utility)
+    if not little and not (between.known and gained < between.error):
+        return None
+    return Ending.LITTLE, found(
+        "search.little",
+        own,
+        best=own,
+        last=PATIENCE,
+        gain=gained,
+        least=tolerance if little else None,
+        error=None if little else between.error,
+        few=None if little else between.few,
+    )
 
 
-def _restarted(history: tuple[Tried, ...], model: str) -> str:
-    """Return that a search goes on after losses because the model was changed since; "" if not."""
+def _restarted(history: tuple[Tried, ...], model: str) -> tuple[int | None, int | None]:
+    """Return after how many losses a search goes on because the model was changed, or None.
+
+    The second number is how many losses of its own then end the search.
+    """
     row = list[Tried]()
     for tried in history:
         row = [] if tried.accepted else row + [tried] * tried.lost
     own = sum(tried.candidate.model == model for tried in row)
-    if len(row) < PATIENCE or own >= LOST:
-        return ""
-    return (
-        f"; the last {len(row)} candidates did not improve, but the model was changed "
-        f"after {row[-1 - own].candidate.id}: {LOST} losses of its own end the search"
-    )
+    return (None, None) if len(row) < PATIENCE or own >= LOST else (len(row), LOST)
 
 
 def _due(tried: Tried, best: Tried) -> float:
@@ -376,65 +424,58 @@ def _due(tried: Tried, best: Tried) -> float:
     return max(-owed, 0.0) if math.isfinite(owed) else 0.0
 
 
-def let_down(ended: Standing, model: str) -> Standing:
+def let_down(now: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if a step that promised much has lost.
 
     Much is more than LITTLE of the best cost, more than the step's own likely error, and not to be
     explained by noise.
     """
-    best = ended.incumbent
+    best = now.incumbent
     assert best is not None
-    own, missed = best.candidate.id, list[Tried]()
-    lost = losers_of(ended.history, own, model)
-    for tried in ended.history:
+    lost, missed = losers_of(now.history, best.candidate.id, model), list[Tried]()
+    for tried in now.history:
         made = tried.candidate
         if made not in lost or made.doubtful:
             continue
-        error, known = error_between(best, tried, ended.history)
+        between = Difference(best, tried, now.history)
         loss = best.utility - tried.utility - _due(tried, best)
-        noise = max(LUCK * error if known else 0.0, tried.noise_cost)  # a plan may replay a log's
+        # a plan may replay a log's noise
+        noise = max(LUCK * between.error if between.known else 0.0, tried.noise_cost)
         short = loss + made.predicted_gain
         luck = short <= noise or max(loss, made.predicted_gain) <= noise
         if not luck:
             missed.append(tried)
     most = max(missed, key=lambda one: one.candidate.predicted_gain, default=None)
     if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
-        return ended
-    gave = f"gave {figure(most.utility)}" if math.isfinite(most.utility) else "failed"
-    cost = missed_by_start(most)
-    said = figure(most.promised - cost) + " from where its runs began" * bool(cost)
-    why = (
-        f". But {most.candidate.id}, for which {said} was predicted, {gave}: the model is wrong "
-        f"near {own}, and a diagnosis may show what it lacks"
+        return now
+    return now.with_finding(_far_off(most, most.promised - missed_by_start(most)))
+
+
+def _far_off(tried: Tried, promised: float) -> Finding:
+    """Return that a candidate gave far less than was predicted, so that a diagnosis is due."""
+    name, real = tried.candidate.id, tried.utility if math.isfinite(tried.utility) else None
+    return found(
+        "search.far_off", name, then=DIAGNOSE, candidate=name, real=real, promised=promised
     )
-    then = NextCommand("diagnose")
-    return replace(ended, sentence=ended.sentence + why, then=then, missed=why)
 
 
-def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
-    """Return why a diagnosis would help more than the next trial; "" if there is no reason."""
+def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> Finding | None:
+    """Return why a diagnosis would help more than the next trial; None if there is no reason."""
     if history[-1].candidate.model != model:
-        return ""  # the model has changed since: the next trial shows the effect
+        return None  # the model has changed since: the next trial shows the effect
     lost = 0
     for tried in history:
         if tried is incumbent or tried.accepted is not False:
             lost = 0
         lost += tried.lost
     if lost >= LOST:
-        return f"{lost} steps in a row did not improve: a diagnosis may show what the model lacks"
+        return found("search.lost_in_row", then=DIAGNOSE, lost=lost)
     if wild(incumbent):
-        made = incumbent.candidate
-        return (
-            f"its trial gave {incumbent.utility:.4g}, but the model promised "
-            f"{made.predicted_utility:.4g}: a diagnosis may show what the model lacks"
-        )
+        return _far_off(incumbent, incumbent.candidate.predicted_utility)
     last = history[-1]
     if last.lost and _far_below(last, min(last.promised, incumbent.utility)):
-        return (
-            f"{last.candidate.id} gave {last.utility:.4g}, but {last.promised:.4g} was predicted: "
-            "a diagnosis may show what the model lacks"
-        )
-    return ""
+        return _far_off(last, last.promised)
+    return None
 
 
 def wild(tried: Tried) -> bool:
@@ -454,48 +495,41 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     if doubt is not None and now.incumbent is not None:
         best, missing = now.incumbent.candidate, 1
         made = doubt.candidate if doubt.to_settle == doubt.candidate.id else best
-        lost, from_start = f"{doubt.candidate.id} lost to {best.id}", ""
-        if excused := doubt.excused(now.incumbent):
-            from_start = ", from [task] start"
-            if made is best and len(doubt.trials) > 1:  # the start may have cost the other more
-                from_start += f" ({doubt.candidate.id} ran {len(doubt.trials)} times)"
-            gain = doubt.gain_over(now.incumbent)
-            lost += (
-                f" by {figure(now.incumbent.utility - doubt.utility)}, but by the model it lost "
-                f"{figure(excused)} by where the runs began, and is itself "
-                f"{figure(abs(gain))} {'better' if gain > 0 else 'worse'}"
-            )
-        elif Repeats(now.history).near(now.incumbent.utility).known:
-            lost += " by no more than noise may explain"
-        else:
-            lost += ", but none as good ran twice, so how much such runs differ is not known"
-        sentence = f"{lost}: {made.id} is waiting for another trial{from_start}"
-        gap, whole = abs(doubt.gain_over(now.incumbent)), now.incumbent
-        if excused and whole.deviation > 0 and gap > 0 and runs_to_show(gap, whole) > MANY:
-            sentence += (
-                f". To show that difference takes {runs_needed(gap, whole)} of each of the two: if "
-                f"that is too many, stop with {best.id}"
-            )
-        else:
-            sentence += _or_stop(doubt.candidate, whole)
+        why = _in_doubt(now, doubt, now.incumbent, made)
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
-        sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"
+        why = found("search.waiting", made.id, candidate=made.id, missing=missing)
     else:
         return None
-    return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
+    return replace(now, phase=Phase.AWAIT, outstanding=made, missing=missing, findings=(why,))
 
 
-def _or_stop(doubted: Candidate, best: Tried) -> str:
-    """Return what is at stake in another run for a loss in doubt, and how to stop; "" for much."""
-    share = max(doubted.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
-    if share >= LITTLE or best.is_unsteady:
-        return ""
-    own = best.candidate.id
-    promise = f"{percent(share)} of what {own} costs" if share > 0 else f"nothing over {own}"
-    return (
-        f". {doubted.id} promises {promise}: if that is not worth another run, stop with {own}, "
-        "the best so far (`export best`)"
+def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Finding:
+    """Return why a loss is in doubt, what is at stake in another run, and how to stop.
+
+    Args:
+        now: the standing.
+        doubt: the candidate that lost.
+        best: the best one.
+        made: the one of the two that is run again.
+    """
+    excused, gap = doubt.excused(best), abs(doubt.gain_over(best))
+    # many runs that would show the difference that is left without the starts
+    runs = runs_to_show(gap, best) if excused and best.deviation > 0 and gap > 0 else None
+    runs = runs if runs and runs > MANY else None
+    share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
+    known = not excused and Repeats(now.history).near(best.utility).known
+    return found(
+        "search.in_doubt",
+        made.id,
+        candidate=made.id,
+        loser=doubt.candidate.id,
+        best=best.candidate.id,
+        loss=best.utility - doubt.utility if excused else None,
+        start=excused or None,
+        known=int(known),
+        runs=runs,
+        share=None if runs or share >= LITTLE or best.is_unsteady else max(share, 1e-9),
     )
 
 

@@ -20,6 +20,11 @@ def as_json(function: F) -> F:
     return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
 
 
+def details(function: F) -> F:
+    """Add the option --details: tell every finding."""
+    return click.option("--details", is_flag=True, help="Tell all notes.")(function)
+
+
 def anyway(function: F) -> F:
     """Add the option --anyway, for commands that hand a candidate over."""
     text = "Hand the candidate over even if [limits], [safety], task or model changed since."

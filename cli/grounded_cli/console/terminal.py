@@ -147,14 +147,18 @@ def remark(kind: str, text: str) -> None:
     say("\n".join([first.replace(kind, tinted(kind), 1), *rest]))
 
 
-def tell(findings: Sequence[Finding], about: str = "", most: int = 3) -> None:
+def tell(
+    findings: Sequence[Finding], about: str = "", most: int = 3, *, all_: bool = False
+) -> None:
     """Write findings to stderr as remarks, the heaviest first; beyond `most`, how many are left.
 
     Args:
         findings: as `settle` orders them.
         about: what all are about, such as the name of a log.
         most: how many are told; the others are in the JSON document and with --details.
+        all_: tell them all, as --details does.
     """
+    most = len(findings) if all_ else most
     for one in findings[:most]:
         kind = "note" if one.weight is Weight.NOTE else "warning"
         remark(kind, f"{about}: {one.sentence}" if about else one.sentence)

@@ -4,4 +4,316 @@ from __future__ import annotations
 
 from grounded.findings.catalogue import Entry
 
-ENTRIES: dict[str, Entry] = {}
+STOP = "be ready to stop the robot"
+
+ENTRIES: dict[str, Entry] = {
+    # there is no candidate
+    "no_weight": Entry(
+        "refuse",
+        "no weight of the reward is above 0, so there is nothing to improve",
+        "set a weight for a state that the target gives, such as {state}",
+    ),
+    "none": Entry(
+        "refuse",
+        "there is no plan to run: {why}",
+        "correct the model there, or choose a start and a target at which it is valid",
+    ),
+    "not_finite": Entry(
+        "refuse",
+        "the {what} of {candidate} is not a finite number at t = {at}: the model diverges there",
+        "check it with a shorter horizon",
+    ),
+    "outside_safety": Entry(
+        "refuse",
+        "{candidate} (alpha = {alpha:g}) is predicted to take {state} to {value} at t = {at}, "
+        "outside [safety] {state} = [{low}, {high}]",
+        "[[+- is the distance of trial {trial} from what it should repeat: if that run was "
+        "disturbed, remove it with `discard {trial}`]]",
+    ),
+    "gain": Entry(
+        "refuse",
+        "the gain of {input} on {state} reaches {gain} in {candidate}, at t = {at}, more than "
+        "{most:g}[[; the plan moves {state} by {moved}]]",
+        "[[weigh {state} less in [reward] (now {state_weight:g}), or ]][[!state_weight? check the unit of "
+        "{state} and what it drives in the model, or ]]raise [reward] input_change of {input} (now "
+        "{change:g})",
+    ),
+    # what it is, what it promises, how far to trust it
+    "made": Entry(
+        "note",
+        "[[!base? the model's own policy]][[, made gentler after {crashes} crashes]][[own? the "
+        "changed model's own plan, instead of a step from {base}]][[{base} with its gains reduced "
+        "to {share:%}: its feedback made the inputs swing]][[iteration {iteration}: {step} from "
+        "{base}]][[corrected? , with derivatives corrected by the trials]][[gentle? , its gains as "
+        "low as ran without oscillating]][[original? , by the model without the adopted effects, "
+        "whose steps kept too little of what they promised]], {seconds}",
+    ),
+    "predicted": Entry(
+        "note",
+        "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]][[; "
+        "{usual} from where the last {runs} runs began]]",
+    ),
+    "so_far": Entry(
+        "note",
+        "{utility} by {best}[[, {noise} of it by sensor noise]][[; for {best} itself the model "
+        "predicts {model}, of which {candidate} is to gain {gain}]][[; about {log} is expected of "
+        "the log of {candidate}, with noise that the prediction lacks]]",
+    ),
+    "tested": Entry(
+        "note",
+        "[[promised? the last prediction was {promised}]][[real? , the run gave {real}]]"
+        "[[!promised? the last predictions missed the utility by {missed}]][[; {failed:run} "
+        "failed]][[; this one promises a gain of {gain}]][[less? , less than such an error]]"
+        "[[noise? , which may only be the noise of the run that it replays]]",
+        "[[it gains at most {share:%} of what {best} costs: run it if that is worth a run, else "
+        "stop with {best} (`export best`)]]",
+    ),
+    "untested": Entry(
+        "note",
+        "unknown: no run has tested the model[[changed?  since it was changed]][[; by the last "
+        "diagnosis it misses {what} by {miss:size} in {ahead}]][[; it can be checked against "
+        "{logs:log} of data (`grounded diagnose`)]]",
+        "[[exact? the prediction starts exactly at [task] start: what placing the robot less "
+        "exactly costs shows after a few runs]]",
+    ),
+    "samples": Entry(
+        "note",
+        "{candidate} is planned for samples {age} [[newer? newer than in its log]][[!newer? old]]"
+        "[[; in the runs so far: {least} to {most}]]",
+    ),
+    "model": Entry("note", "the model is {what}"),
+    "lacks": Entry(
+        "note",
+        "the last diagnosis found that {cause}[[, and {more:cause} more]]",
+        "`{command}` first",
+    ),
+    "no_target": Entry(
+        "refuse",
+        "there is no manoeuvre to learn: [task] names no target",
+        "draw one with `grounded target`; `fit` and `diagnose` need none",
+    ),
+    "draw_again": Entry(
+        "note",
+        "`next:` draws the same line so that the plan comes to rest",
+        "to run {candidate} as it is: `{command}`",
+    ),
+    "waits_void": Entry(
+        "refuse",
+        "{standing}, but {why}",
+        "undo what was changed, or run {candidate} regardless with --anyway",
+    ),
+    "not_optimal": Entry(
+        "note",
+        "the plan is not optimal in the model: {why}[[ (the last {last} by {share:%})]]; it can be "
+        "run all the same: the steps from its run go on improving it",
+    ),
+    "run_again": Entry(
+        "note",
+        "{best} was run again, and the mean of its runs is now {mean} instead of {was}[[: {other} "
+        "is the best now]]; the search goes on from there",
+    ),
+    "doubtful": Entry(
+        "note",
+        "{candidate} may well lose: it promises {gain:.3g} over {best}, but judging by earlier "
+        "trials the model's likely error there is {error:.3g}",
+        "[[if it keeps its promise, it gains {share:%} of what {best} costs: run it if that is "
+        "worth a run, else stop with {best} (`export best`)]]",
+    ),
+    "small": Entry(
+        "note",
+        "{candidate} promises {gain:.2g} over {best}, less than its trial can show: a gain below "
+        "{least:.2g} may be luck[[, from {few:repeat} only]][[. To show it takes {runs} runs of "
+        "each of the two]]",
+        "[[stop? if that is too many, stop with {best} (`export best`)]]",
+    ),
+    "less_in_log": Entry(
+        "note",
+        "in the model, which replays {best} with the noise in its log, {candidate} is {gain} "
+        "better; about {log} is expected of its log, with the noise that the prediction lacks: "
+        "only the run tells whether more than noise is gained",
+    ),
+    # the first plan of a task
+    "no_motion": Entry(
+        "note", "the target stays where the run starts, in every state", "draw another (`target`)"
+    ),
+    "no_limits": Entry("note", "[limits] has none for {about}: plans may send values of any size"),
+    "without_effect": Entry(
+        "note",
+        "{about} {about:changes/change} no state in the model",
+        "complete the equations and values in {file}",
+    ),
+    "limits_of_log": Entry(
+        "note",
+        "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]"
+        "[[; those of {beyond} reach more than {times:g} times as far as was ever sent: check their "
+        "unit]]",
+        "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
+        "(`target`): target.csv is the run in that log]]",
+    ),
+    "costly_inputs": Entry(
+        "note",
+        "{share:%} of the plan's cost is [reward] input and input_change",
+        "weigh them less (a tenth, say), and errors count for more",
+    ),
+    "another_unit": Entry(
+        "note",
+        "{what} of {state} is {given}, far beyond what it reaches in any log ({seen})",
+        "if it is in {unit}, multiply it by {factor:.8g}",
+    ),
+    "of_other_limits": Entry(
+        "note",
+        "[reward] input_change of {about} was made for a different range from that in [limits]",
+        "write input_change = { {new} }, or draw the target again",
+    ),
+    "at_limits": Entry(
+        "note",
+        "{about} {about:is/are} at a limit for {share:%} of the plan, and still {what} misses its "
+        "target by {off:size}: it asks for more than [limits] allow",
+        "draw a larger or slower target, or widen [limits] if the robot can take more",
+    ),
+    "falls_short": Entry(
+        "note",
+        "the plan ends with {what} {off:size} from the end of the target: either [reward] makes "
+        "getting closer too costly, or the model can't get there in time",
+        "weigh inputs and their changes less, draw a slower target, or check model.py",
+    ),
+    "outweighed": Entry(
+        "note",
+        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:g} times the "
+        "weight on it",
+        "[[helps? weigh it so in [reward] state ({weights}) if that matters more than the other "
+        "states]][[!helps? check its weight in [reward] state, and whether the model and [limits] "
+        "allow the target]]",
+    ),
+    "rough": Entry(
+        "note",
+        "[[{input} jumps over half its [limits] from one step to the next, {times} times]][[sensor "
+        "noise moves {input} by {shaken:size} rms through the gains, mostly that of {state}]]",
+        "for a smoother {input} increase [reward] input_change of {input}",
+    ),
+    "unguarded": Entry(
+        "note",
+        "{about} {about:leaves/leave} [safety], and [[unweighed? [reward] has no weight for "
+        "{about:its/their} target]][[!unweighed? nothing in [reward] keeps {about:it/them} inside]]",
+        "[[unweighed? add one in [reward] state]][[!unweighed? draw the target with a column for "
+        "{about:it/each of them}]][[ (`{command}`)]]",
+    ),
+    "leaves": Entry(
+        "note",
+        "nothing was run yet",
+        "draw a target whose run stays inside [safety] (`target`); widen [safety] only if the "
+        "robot may go there",
+    ),
+    "unused_rows": Entry(
+        "note",
+        "{file} has {rows} rows, but [task] horizon = {horizon} ends the plan after {end}",
+    ),
+    "not_at_rest": Entry(
+        "warn",
+        "the plan assumes {held} before the start and after the end, under which {state} changes "
+        "at once, by {rate}",
+        "if nothing but its inputs holds the robot there, put what does into [task] of "
+        "grounded.toml: start = { {start} }; else just propose again",
+    ),
+    # it is not handed over, or not without a warning
+    "refused": Entry(
+        "refuse",
+        "{about} is not handed over: {why}",
+        "propose another, or use --anyway to hand it over regardless",
+    ),
+    "anyway": Entry("warn", "{about} is handed over anyway: {why}"),
+    "unmapped": Entry(
+        "refuse",
+        "[log] maps no {about}, though {file} has {about:that as an input/those as inputs}: which "
+        "command of the robot that is, and in which unit, was never compared with a log",
+        "map it in [log]; if another command drives the robot, put that into {file} under its own "
+        "name and unit",
+    ),
+    "delay_twice": Entry(
+        "refuse",
+        "{keys} {keys:removes/remove} from every log the delay that the adopted {effects} "
+        "{effects:has/have} in the model as well",
+        "remove delay_s there again, so that plans allow for the delay that the robot's program "
+        "sees, or undo the adoption with `adopt --undo`",
+    ),
+    "rewritten": Entry(
+        "refuse",
+        "{file} is not the policy that was handed out[[, and that {ran} ran]]: it was rewritten, "
+        "or comes from another workspace[[ ({why})]]",
+        "delete the file and propose again",
+    ),
+    "other_robot": Entry(
+        "refuse", "{about} is for a robot with {has}, but this workspace's model has {model}"
+    ),
+    "other_dt": Entry("refuse", "it runs every {own}, but [task] dt is {now}"),
+    "other_unit": Entry("refuse", "it has {signal} in {unit}, but the model has it in {now}"),
+    "outside_limits": Entry(
+        "refuse", "it may send {input} = {value}, outside [limits] {input} = [{low}, {high}]"
+    ),
+    "other_task": Entry(
+        "refuse", "it was made for another task ({what})[[never? , and was not run there]]"
+    ),
+    "of_other_task": Entry(
+        "note", "{candidate} was made for a different task from that in grounded.toml"
+    ),
+    "outdated": Entry(
+        "note", "the model was changed since {candidate} was made: its prediction is outdated"
+    ),
+    "void": Entry("note", "{candidate} was not run and is void: {why}[[; run {instead} instead]]"),
+    "disowned": Entry(
+        "note",
+        "{candidate} was not run and is void: {trials}, which it was made from, {trials:is/are} "
+        "{gone}",
+        "if the robot has run it meanwhile, ingest that log with --candidate {candidate}: it "
+        "counts",
+    ),
+    "lost": Entry(
+        "note",
+        "{candidate} [[lost with {real:.4g}]][[!real? crashed]]; the best so far is {best}, "
+        "{of:.4g}",
+    ),
+    "run_aside": Entry("note", "{trial}, a run of {candidate}, is set aside[[: {why}]]"),
+    # what the robot will do
+    "near_safety": Entry(
+        "note",
+        "no run has tested the prediction yet, and it comes within {left} of the {side} bound of "
+        "{state} in [safety], at {at}",
+        STOP,
+    ),
+    "not_logged": Entry(
+        "note",
+        "{candidate} feeds back {about}, of which the log has no column: your program has to "
+        "compute {about:it/them} while it runs",
+        "let it log {about:it/them}, map {about:it/them} in [log], and add {about:it/them} to "
+        "[estimate] measured, with the scatter at standstill",
+    ),
+    "time_step": Entry(
+        "warn",
+        "in each step of the predicted run {about} is off by {share:%} of its change: the "
+        "integrator's steps of {step} are too long for the model",
+        "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]] in "
+        "{file}, and propose again",
+    ),
+    "last_command": Entry(
+        "note",
+        "the plan ends with {about} at a limit, and by the model {what} is {off} from its target "
+        "{at} later",
+        "[[let_go? the runner sends {held} then, which lets it go: switch to a controller that "
+        "holds it as soon as `runner.done(t)` is true]][[!let_go? let the target rest for longer "
+        "(`grounded target --hold`), or lower [reward] terminal]]",
+    ),
+    "oscillates": Entry(
+        "warn",
+        "the feedback of {swung} made inputs oscillate[[, while that of {quiet}, {share:%} as "
+        "strong, did not]][[needed? , but much weaker feedback did far worse]][[; that of "
+        "{candidate} is {strength:%} as strong as that of {swung}]]",
+        STOP,
+    ),
+    "coasts_out": Entry(
+        "warn",
+        "after the run its runner holds {held}, and the model predicts that the robot "
+        "leaves [safety] {state} = [{low}, {high}] {at} later and reaches {most}",
+        STOP + ", switch to a holding controller once the runner is done, or let the target come "
+        "to rest inside",
+    ),
+}

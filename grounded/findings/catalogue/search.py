@@ -4,4 +4,155 @@ from __future__ import annotations
 
 from grounded.findings.catalogue import Entry
 
-ENTRIES: dict[str, Entry] = {}
+MODEL = "a diagnosis may show what the model lacks"
+
+ENTRIES: dict[str, Entry] = {
+    # it goes on
+    "first": Entry("note", "the first candidate is the model's own policy"),
+    "gentler": Entry("note", "{crashed} crashed: the next first policy is gentler"),
+    "crashes": Entry("note", "{crashes} policies crashed in a row", MODEL),
+    "step": Entry(
+        "note",
+        "improve on {best} with {step}[[, since {crashed} crashed]][[; the last {lost} candidates "
+        "did not improve, but the model was changed since: {more} losses of its own end the "
+        "search]]",
+    ),
+    # it waits
+    "waiting": Entry("note", "{candidate} is waiting for {missing:trial}"),
+    "in_doubt": Entry(
+        "note",
+        "{loser} lost to {best}[[ by {loss}]][[, but by the model {start} of that is due to where "
+        "the runs began]][[known? by no more than noise may explain]]: {candidate} is waiting for "
+        "another trial[[. To show that difference takes {runs} runs of each, or more: if that is "
+        "too many, stop with {best}]][[. {loser} promises {share:%} of what {best} costs: if that "
+        "is not worth a run, stop with {best} (`export best`)]]",
+    ),
+    "discard_first": Entry(
+        "note", "discard {trial}, a run of {candidate}, or go on with it: `propose`"
+    ),
+    # it has ended with a result
+    "no_step": Entry(
+        "note",
+        "no step improved on {best}[[ down to alpha = {alpha:g}]][[ in the last {last} "
+        "candidates]][[ ({lost} lost)]][[; the next promises {gain}, with a likely error of "
+        "{error}]][[; the model promises less than {least:%} from smaller steps]]: {best} is the "
+        "result",
+    ),
+    "little": Entry(
+        "note",
+        "the last {last} candidates gained {gain:.3g} in total, less than [[{least:%} each "
+        "([search] tolerance)]][[its standard error of {error:.2g}]][[, from {few:repeat} only]]: "
+        "{best} is the result",
+    ),
+    "below_noise": Entry(
+        "note",
+        "{lost:step} from {best} did not improve, and the next promises [[{gain}, less than the "
+        "standard error of a trial's gain, {error:.2g}]][[, from {few:repeat} only]][[!gain? no "
+        "gain over its runs]]: {best} is the result",
+    ),
+    "nothing_promised": Entry(
+        "note",
+        "the model promises less than {least:%} more from any step ([search] tolerance): {best} is "
+        "the result",
+    ),
+    # it has ended without one
+    "used_up": Entry(
+        "note",
+        "{used} of {most} trials are used up[[; a candidate needs {needs}]] ([search] max_trials)",
+    ),
+    "crashed": Entry(
+        "note",
+        "the first policy crashed {crashes} times, although each was gentler: the model is too "
+        "inaccurate to start from",
+        "correct it (fit, diagnose) and propose again",
+    ),
+    "too_doubtful": Entry(
+        "note",
+        "the model promises a gain of {gain} from a step, but with a likely error[[ of {error}]], "
+        "more than the whole cost of {best}: no trial is spent on it",
+    ),
+    "diverges": Entry(
+        "note",
+        "the model grounded on {best} diverges for every step: it is too inaccurate there to "
+        "improve with",
+    ),
+    "every_step_loses": Entry(
+        "note",
+        "every step from {best} loses in the grounded model, by at least {least:.4g}: its "
+        "derivatives are wrong along this trial",
+    ),
+    # what helps more than the next trial
+    "lost_in_row": Entry("note", "{lost} steps in a row did not improve", MODEL),
+    "far_off": Entry(
+        "note",
+        "{candidate} [[gave {real:.4g}]][[!real? failed]], but {promised:.4g} was predicted",
+        MODEL,
+    ),
+    "diagnose": Entry("note", MODEL),
+    "again": Entry("note", "run {best} again"),
+    "fit_first": Entry(
+        "note",
+        "the diagnosis blames the model's parameters only, so fit them: a better model may gain "
+        "more",
+    ),
+    "adopt_first": Entry("note", "a better model may gain more: adopt what this one lacks"),
+    # what status tells beside it
+    "asked": Entry("note", "{why}"),
+    "no_log": Entry(
+        "note",
+        "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
+        "model lacks; without, `propose` plans with the model as it is",
+    ),
+    "lost_by_starts": Entry(
+        "note",
+        "{candidate} lost to {best} by {loss}; by the model {start} of that is due to where their "
+        "runs began",
+    ),
+    "uncounted": Entry(
+        "note",
+        "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
+        "candidates of another task, or probes",
+    ),
+    "namesake": Entry(
+        "note",
+        "{about} ran another policy that is also called {candidate}: only data, for fit and "
+        "diagnose",
+    ),
+    "left_out": Entry(
+        "note",
+        "{about} {about:has/have} [[other states or inputs than {model}]][[a sampling interval of "
+        "{was}, and [task] dt is {now}]]: fit, diagnose and the search leave {about:it/them} out",
+    ),
+    "outdated": Entry(
+        "note",
+        "the last diagnosis is outdated[[; [log] reads {reread} in another way now]][[; it had "
+        "{used} of {usable} trials]][[; adopted since: {adopted}]][[, but not {missing}]]"
+        "[[changed? ; the model was changed]][[; {repeats} repeat one run: diagnose again to know "
+        "how much of what is left is noise]]",
+    ),
+    "stops": Entry(
+        "note",
+        "learn stops here, since the next plan would be based on this log",
+        "fix it first, or run `learn` again if the warning is wrong",
+    ),
+    # how sure a gain is
+    "gain": Entry(
+        "note",
+        "the last gain in utility, of {after} over {before}, is {gain}[[, an improvement with "
+        "probability {probability:.2f}]][[, from {few:repeat} only]][[exact? ; repeated trials "
+        "agree exactly]][[single? ; runs of similar utility were not repeated, so their noise is "
+        "unknown]][[; by the model {start:.3g} of it is due to where their runs began, and "
+        "{own:.3g} to the policy]][[open? : which of the two is better is open]][[apart? , but "
+        "their runs began apart, and what that is worth is not known]]",
+    ),
+    "better": Entry(
+        "note",
+        "{share:%} {better:1=better,0=worse} than {before}[[, +- {error:%}]][[, from {few:repeat} "
+        "only]][[; by the model, different start states alone changed the cost by {start:%}]]",
+    ),
+    "lead": Entry(
+        "note",
+        "{doubt:scatter=the scatter of repeats,starts=where the runs began,unknown=scatter that is "
+        "not known yet} may explain its lead on {before}",
+    ),
+}

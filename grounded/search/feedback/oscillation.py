@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.findings import Finding, found
 from grounded.frozen import Array, median
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
@@ -142,21 +143,21 @@ class Quiet:
         """Return whether a policy's feedback is no stronger than what ran quietly."""
         return self.strength(policy) <= STRONGER * self.most
 
-    def risk(self, made: Candidate) -> str:
-        """Return a sentence if a candidate's feedback is stronger than what ran quietly; or ""."""
+    def risk(self, made: Candidate) -> Finding | None:
+        """Return that a candidate's feedback is stronger than what ran quietly; None if not."""
         if self.allows(made.policy):
-            return ""
-        strength, swung, name = self.strength(made.policy), self.swung.id, made.id
-        weaker = f", while that of {self.by}, {100 * self.most / strength:.0f} % as strong, did not"
-        weaker = weaker * bool(self.by) + ", but much weaker feedback did far worse" * self.needed
-        if name == swung:
-            told = f"the feedback of {name} made inputs oscillate when it ran{weaker}"
-        else:
-            told = (
-                f"the feedback of {swung} made inputs oscillate{weaker}, and that of {name} is "
-                f"{100 * strength:.0f} % as strong as that of {swung}"
-            )
-        return f"{told}: be ready to stop the robot"
+            return None
+        strength, again = self.strength(made.policy), made.id == self.swung.id
+        return found(
+            "plan.oscillates",
+            made.id,
+            candidate=made.id,
+            swung=self.swung.id,
+            strength=None if again else strength,
+            quiet=self.by or None,
+            share=self.most / strength if self.by else None,
+            needed=int(self.needed),
+        )
 
 
 def quiet_gains(task: Task, history: Sequence[Tried], model: str | None = None) -> Quiet | None:

@@ -20,7 +20,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import measured_alike
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.certainty import LUCK
+from grounded.search.difference import LUCK
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -123,7 +123,7 @@ class Findings:
     @property
     def outlook(self) -> str:
         """The sentence on the search, and whether another model may go on with it."""
-        return outlook(self.standing, self.then)
+        return outlook(self.standing, self.then).sentence
 
     @property
     def told(self) -> Told | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from grounded.errors import NextCommand
-from grounded.search.certainty import by_starts, explained, share_of_cost
+from grounded.search.difference import Difference
 from grounded.search.pictures import few
 from grounded_trials.report.findings import (
     Findings,
@@ -69,7 +69,7 @@ def _head(findings: Findings) -> str:
     )
     if findings.logs:
         text += f", {count(len(findings.logs) + findings.left_logs, 'log')} of data"
-    text += "".join(f"; {words}" for words in not_counted(findings.uncounted))
+    text += "".join(f"; {one.sentence}" for one in not_counted(findings.uncounted))
     if findings.discarded:
         text += f", set aside: {', '.join(findings.discarded)}"
     if findings.effects:
@@ -102,15 +102,12 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         if math.isfinite(first.utility) and first.utility < 0 and not own:
             tried = {one.candidate.id: one for one in history}
             two = tried[first.candidate.id], tried[best.candidate.id]
-            why = explained(*two, history)
-            text += f"; {why} its lead" if why else f", {share_of_cost(*two, history)} better"
-            if start := by_starts(*two, history):
-                text += f"; {start}"
+            text += f"; {Difference(*two, history).lead.sentence}"
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text)
     if less := findings.standing.less_in_log:
-        lines += _wrapped(less)
+        lines += _wrapped(less.sentence)
     lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}")
     return "\n".join(lines)
 

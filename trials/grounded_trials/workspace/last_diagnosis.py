@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import listed
+from grounded.findings import Finding, Quantity, found
 from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
-from grounded_trials.wording import ranges
 from grounded_trials.workspace.read_before import changed_since
 from grounded_trials.workspace.unknown_id import named_trials
 
@@ -118,8 +117,8 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
     return replace(trial, states=states)
 
 
-def left_out(workspace: Folder) -> list[str]:
-    """Return notes on stored trials that nothing can use, since [task] dt or the model was changed.
+def left_out(workspace: Folder) -> list[Finding]:
+    """Return which trials nothing can use, since [task] dt or the model was changed.
 
     Raises:
         GroundedError: if a stored file is damaged.
@@ -131,20 +130,12 @@ def left_out(workspace: Folder) -> list[str]:
             names = (one.trial.state_names, one.trial.input_names)
             same = names == (model.state_names, model.input_names)
             (paced.setdefault(one.trial.dt, []) if same else others).append(one.stored.id)
-    notes = [
-        f"{ranges(ids)} {'was' if len(ids) == 1 else 'were'} sampled every {was:g} s, [task] dt is "
-        f"{dt:g} s now: fit, diagnose and the search leave {'it' if len(ids) == 1 else 'them'} "
-        f"out. To use {'it' if len(ids) == 1 else 'them'}, `discard` and ingest the log again, or "
-        "set dt back"
+    now = Quantity(dt, "s")
+    told = [
+        found("search.left_out", *ids, was=Quantity(was, "s"), now=now)
         for was, ids in paced.items()
     ]
-    if others:
-        has = "has" if len(others) == 1 else "have"
-        notes.append(
-            f"{ranges(others)} {has} other states or inputs than model.py has now: fit, diagnose "
-            f"and the search leave {'it' if len(others) == 1 else 'them'} out"
-        )
-    return notes
+    return told + ([found("search.left_out", *others, model="model.py")] if others else [])
 
 
 def made_from(diagnosis: Diagnosis) -> Made:
@@ -179,24 +170,27 @@ class Since:
         return not self.newer and (adopted or not self.changed)
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Why the diagnosis is outdated; () if it is not."""
+        only = self.changed and not self.adopted
+        if not (self.reread or self.newer or self.adopted or only or self.repeats):
+            return ()
+        one = found(
+            "search.outdated",
+            reread=self.reread,
+            used=self.used if self.newer else None,
+            usable=self.usable,
+            adopted=self.adopted,
+            missing=self.missing if self.adopted else (),
+            changed=int(only),
+            repeats=self.repeats,
+        )
+        return (one,)
+
+    @property
     def sentence(self) -> str:
-        """Why the diagnosis is outdated; "" if it is not."""
-        parts = []
-        if self.reread:
-            parts.append(f"[log] was changed since: it reads {listed(self.reread)} in another way")
-        if self.newer:
-            parts.append(f"diagnosed with {self.used} of {self.usable} trials")
-        if self.adopted:
-            but = f", but not {', '.join(self.missing)}" * bool(self.missing)
-            parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
-        elif self.changed:
-            parts.append("the model was changed since")
-        if self.repeats:
-            parts.append(
-                f"{listed(self.repeats)} repeat one run: diagnose again to know how much of what "
-                "is left is noise"
-            )
-        return "; ".join(parts)
+        """Why the diagnosis is outdated, in words; "" if it is not."""
+        return "; ".join(one.sentence for one in self.findings)
 
 
 def usable_ids(workspace: Folder) -> list[str]:

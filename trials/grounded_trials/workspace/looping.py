@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import found as said
 from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
+from grounded.search.standing import Phase
 from grounded_trials.workspace.candidates.exporting import Exported, export_candidate, void_exports
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -19,10 +21,6 @@ from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
 MOST_TRIALS = 100_000
-STOPS = (
-    "learn stops here, since the next plan would be based on this log: fix it first, or run "
-    "`learn` again if the warning is wrong"
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,7 +66,7 @@ def learn_in(
         proposed = propose_in(workspace)
         made = proposed.candidate
         if made is None:
-            return status_of(workspace, proposed.standing, proposed.proposal.notes)
+            return status_of(workspace, proposed.standing, proposed.findings)
         tell(f"running {made.id}")
         path = run_candidate(workspace, made.id).trial_file
         found = ingest_log(workspace, path, made.id)
@@ -77,10 +75,10 @@ def learn_in(
         if each is not None:
             each(made, found)
         if found.faults and not odd:  # the next plan would be based on it: the user decides
-            status = status_of(workspace, standing_in(workspace), (STOPS,))
+            status = status_of(workspace, standing_in(workspace), (said("search.stops"),))
             return replace(status, then=found.then)
     status = status_of(workspace, standing_in(workspace))
-    goes_on = status.standing.phase == "propose"
+    goes_on = status.standing.phase is Phase.PROPOSE
     return replace(status, then=NextCommand("learn")) if goes_on else status
 
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, found
 from grounded.model import all_at_bounds
-from grounded.search.standing import LOST, Standing
-from grounded_trials.wording import count, rendered
+from grounded.search.standing import LOST, Ending, Phase, Standing
+from grounded_trials.wording import rendered
 from grounded_trials.workspace.adoptable import declined, late_open
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -59,19 +60,12 @@ def next_command(
     return to_plan(workspace) if then == PROPOSE else then
 
 
-def outlook(now: Standing, then: NextCommand) -> str:
-    """Return the sentence on the search; of one that has ended, also that the model may change.
-
-    Else "c0007 is the result" stood above a command that adopts effects and goes on, and nothing
-    said why `fit` was next.
-    """
-    of = " of the model as it is" * now.sentence.endswith("is the result")
-    if then.verb == "fit":
-        why = "the diagnosis blames the model's parameters only, so fit them first"
-        return f"{now.sentence}{of}; {why}"
-    if then.verb != "adopt" or now.phase in ("propose", "await-trial"):
-        return now.sentence
-    return f"{now.sentence}{of}; adopt what it lacks to go on"
+def outlook(now: Standing, then: NextCommand) -> Standing:
+    """Return the standing; of a search that has ended, also that the model may change."""
+    goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT)
+    if then.verb == "fit" or (then.verb == "adopt" and not goes_on):
+        return now.with_finding(found(f"search.{then.verb}_first", then=then))
+    return now
 
 
 def to_plan(workspace: Folder) -> NextCommand:
@@ -104,18 +98,18 @@ def _follows(
     follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
     if follow and (not since.newer or _none_stood(now)):
         return follow  # at any point of the search: a better model plans better
-    if now.phase == "await-trial":
+    if now.phase is Phase.AWAIT:
         return another_trial(workspace, now)
-    if now.ending == "not allowed" and not now.trials:
+    if now.ending is Ending.NOT_ALLOWED and not now.trials:
         return TARGET  # the plan for this target leaves [safety]: proposing again would not help
     if diagnosis is None:
         if log := not_ingested(workspace):
             return NextCommand("ingest", ("--data", log))
         logs = usable and not now.history  # diagnose logs before the first candidate
-        teach = usable and (logs or now.phase != "propose")
+        teach = usable and (logs or now.phase is not Phase.PROPOSE)
         then = None if now.doubt and not doubted(now, None, usable) else now.then
         return then or (DIAGNOSE if teach else PROPOSE)
-    if now.phase == "propose":
+    if now.phase is Phase.PROPOSE:
         logs = follow is not None and not now.history
         due = logs or _of_another_model(workspace, diagnosis, since)
         return DIAGNOSE if due or doubted(now, since, usable) else PROPOSE
@@ -174,8 +168,8 @@ def doubted(now: Standing, since: Since | None, usable: Sequence[str]) -> bool:
 
 def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     """Return the command for one more trial: of the outstanding, the next or the best candidate."""
-    waiting = now.phase == "await-trial"
-    if not waiting and (now.phase == "propose" or now.incumbent is None):
+    waiting = now.phase is Phase.AWAIT
+    if not waiting and (now.phase is Phase.PROPOSE or now.incumbent is None):
         return PROPOSE
     if waiting and now.outstanding is not None:
         return to_run(workspace, now.outstanding.id)
@@ -205,7 +199,7 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         return DIAGNOSE
     if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
         return next_command(workspace, now, found, usable_ids(workspace))
-    goes_on = now.phase in ("propose", "await-trial") and not now.doubt
+    goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not now.doubt
     if goes_on:
         return PROPOSE
     usable = usable_ids(workspace)
@@ -312,19 +306,19 @@ def _to_read_again(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | Non
     return last_again(workspace, trials) if changed else None
 
 
-def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> str:
-    """Return what the last diagnosis found that the model lacks, with the command; "" if nothing.
+def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | None:
+    """Return what the last diagnosis found that the model lacks, with the command, if anything.
 
     Nothing is said of a diagnosis of another model, or if its effects were adopted and undone.
     """
     if diagnosis is None or since_diagnosis(workspace, diagnosis, usable_ids(workspace)).changed:
-        return ""
+        return None
     then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
     if then is None or then.verb not in ("adopt", "fit") or not clauses:
-        return ""
-    more = f", and {count(len(clauses) - 1, 'more cause')}" * (len(clauses) > 1)
-    done = "fitted" if then.verb == "fit" else "adopted"
-    return f"{clauses[0]}{more}; not {done}: `{rendered(then, workspace.address)}` first"
+        return None
+    command = rendered(then, workspace.address)
+    more = len(clauses) - 1
+    return found("plan.lacks", then=then, cause=clauses[0], more=more, command=command)
 
 
 def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
-from grounded.search.certainty import began_apart
+from grounded.search.difference import began_apart
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial

@@ -17,7 +17,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
-from grounded.search.certainty import student
+from grounded.search.difference import student
 from grounded.search.starts import worth_of_start
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded import findings as said
 from grounded.accounts.finding import AS_LATE, SENSOR_DELAY, Finding, late_effects
 from grounded.places import heading, position
 from grounded.result import listed
@@ -140,8 +141,8 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
     return found
 
 
-def twice_in_time(workspace: Folder) -> str:
-    """Return that [log] now removes delays that adopted effects have in the model as well; or "".
+def twice_in_time(workspace: Folder) -> said.Finding | None:
+    """Return that [log] now removes delays that adopted effects have in the model as well.
 
     A delay_s that trials were read with before the adoption is another part of the delay.
     """
@@ -149,7 +150,7 @@ def twice_in_time(workspace: Folder) -> str:
     late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
     mapping = workspace.log_mapping
     if mapping is None or not late:
-        return ""
+        return None
     metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta]
     before = {name: _keys(metas[-1], name) if metas else {} for name in late}
     twice = [
@@ -159,15 +160,10 @@ def twice_in_time(workspace: Folder) -> str:
         and mapping.states[name].delay_s - before[name].get("delay_s", 0.0) > d / 2 > 0
     ]
     if not twice:
-        return ""
-    keys = listed(f"[log.state.{name}] delay_s" for name in twice)
-    one = len(twice) == 1
-    return (
-        f"{keys} {'removes' if one else 'remove'} from every log the delay that the adopted "
-        f"{listed(SENSOR_DELAY + name for name in twice)} {'has' if one else 'have'} in the model "
-        "as well. Remove delay_s there again (plans then allow for the delay that the robot's "
-        "program sees), or undo the adoption with `adopt --undo`"
-    )
+        return None
+    keys = tuple(f"[log.state.{name}] delay_s" for name in twice)
+    effects = tuple(SENSOR_DELAY + name for name in twice)
+    return said.found("plan.delay_twice", *twice, keys=keys, effects=effects)
 
 
 def _at_limits(

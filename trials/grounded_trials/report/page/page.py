@@ -27,7 +27,7 @@ from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
 from grounded.result import begun
-from grounded.search.certainty import by_starts, chance, explained, last_improvement, share_of_cost
+from grounded.search.difference import Difference, last_gain
 from grounded.search.pictures import search_figure
 from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
@@ -221,9 +221,12 @@ def _heading(findings: Findings) -> str:
     worse = any(one.after > one.before and not one.is_same for one in rows)
     if worse:
         return "What the runs changed"
-    if (two := _first_and_best(findings)) is None or not explained(*two, findings.history):
+    two = _first_and_best(findings)
+    between = None if two is None else Difference(*two, findings.history)
+    if between is None or not between.doubt:
         return "What improved"
-    sure, (first, best) = chance(*two, findings.history), (one.candidate.id for one in two)
+    sure = between.probability
+    first, best = between.before.candidate.id, between.after.candidate.id
     better = f"{best} is better than {first} with probability {sure:.2f}"
     if sure < 0.5:
         return f"What the runs changed ({better})"
@@ -248,12 +251,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         gain = ""
         rated = -math.inf < first.utility < 0 and best.utility <= 0
         if rated and (two := _first_and_best(findings)):
-            did = "reduced" if best.utility > first.utility else "raised"
-            gain = f": cost {did} by {share_of_cost(*two, findings.history)}"
-            if best.utility > first.utility and (why := explained(*two, findings.history)):
-                gain = f": {why} the difference"
-            if start := by_starts(*two, findings.history):
-                gain += f"; {start}"
+            gain = f": {Difference(*two, findings.history).lead.sentence}"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
@@ -268,7 +266,7 @@ def _tiles(findings: Findings) -> list[str]:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
         found.append(f"{count(logs, 'log')} of data")
-    found += not_counted(findings.uncounted)
+    found += [one.sentence for one in not_counted(findings.uncounted)]
     if findings.optimum is not None:
         found.append(f"optimum of the real system {figure(findings.optimum)}")
     for left, shown, kind in (
@@ -306,7 +304,8 @@ def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
         logs = count(len(findings.logs) + findings.left_logs, "log")
         return [Block("text", f"No candidate has been proposed yet; {logs} of data.")]
-    sure = last_improvement(findings.history)
+    gain = last_gain(findings.history)
+    sure = gain.to_finding().sentence if gain else ""
     few = len(findings.history) <= OPEN
     rows, header = utility_terms(findings)
     return [

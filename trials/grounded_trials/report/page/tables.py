@@ -116,7 +116,8 @@ def candidate_table(findings: Findings) -> list[Block]:
         Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
     ]
     why = legend("", [t.candidate.iteration for t in kept])
-    told = [f"{begun(words)}." for words in (why, findings.standing.less_in_log) if words]
+    less = findings.standing.less_in_log
+    told = [f"{begun(words)}." for words in (why, less.sentence if less else "") if words]
     return [made, *(Block("soft", words) for words in told), *more * bool(left)]
 
 

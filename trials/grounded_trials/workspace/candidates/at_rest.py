@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
 from grounded.places import integrals, true_values
@@ -25,7 +26,6 @@ from grounded.trial import Trial
 from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.candidates.standstill import STEADY, held_there, standstill
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.user_files.config import FILE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,11 +42,11 @@ NEWTON, PROBE = 10, 1e-4  # iterations for a state at rest, difference for its s
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
-def held_before(workspace: Folder, again: bool = False) -> list[str]:
-    """Return a note if the robot is not at rest at its start, but would be under another input.
+def held_before(workspace: Folder, again: bool = False) -> Finding | None:
+    """Return that the robot is not at rest at its start, but would be under another input.
 
-    Values of states that the user did not give (a fan's speed, say) may be changed too. There is no
-    note if the user gave the inputs, or if they make no difference: without weights on changes and
+    Values of states that the user did not give (a fan's speed, say) may be changed too. Nothing is
+    told if the user gave the inputs, or if they make no difference: without weights on changes and
     without latency the first command does not depend on the input held before.
 
     Args:
@@ -71,7 +71,7 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
         stands = resting(task, free, loose)
     if stands is None:
-        return []
+        return None
     units = {**base.model.states, **task.model.inputs}
     given = np.concatenate([task.start[:n], task.past])
     stands = _as_given(task, stands, base.target)
@@ -82,7 +82,7 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
     stands[np.abs(stands) < NOTHING * span] = 0.0
     if not (np.abs(stands - given) > (MOVED if chosen else NOTHING) * span).any():
-        return []
+        return None
     moved = moved_at_start(task, task.past) / task.dt
     rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
     for memory_state, own in true_values(states, states[n:]).items():
@@ -90,21 +90,21 @@ def held_before(workspace: Folder, again: bool = False) -> list[str]:
     told = np.abs(stands - given) > STILL * (1 + np.abs(stands))
     told[n:] = True
     if held_there(workspace, given, np.where(told, stands, given), rate):
-        return []
+        return None
     k = int(np.argmax(np.abs(rate)))
     other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
     before = dict(zip(units, given, strict=True))
-    held = ", ".join(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
+    held = tuple(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
     whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
     whole |= {name: f"{to:.4g}" for name, to in other.items()}
-    start = ", ".join(f"{name} = {whole[name]}" for name in units if name in whole)
-    return [
-        f"the plan assumes {held} before the start, under which {states[k]} changes at once, by "
-        f"{with_unit(f'{rate[k]:.3g}', per_second(units[states[k]]))}; after its end the runner "
-        "holds that input again. If nothing but its inputs holds the robot before the run (no "
-        f"hand, no stop), put what does into [task] of {FILE} and propose again (if something else "
-        f"holds it, or it moves, just propose again): start = {{ {start} }}"
-    ]
+    return found(
+        "plan.not_at_rest",
+        states[k],
+        held=held,
+        state=states[k],
+        rate=Quantity(rate[k], per_second(units[states[k]])),
+        start=", ".join(f"{name} = {whole[name]}" for name in units if name in whole),
+    )
 
 
 def _as_given(task: Task, stands: Array, target: Array) -> Array:
@@ -186,7 +186,7 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
         x, u = still[0], np.clip(first, task.low, task.high)
         for one in (loose or task, replace(task, smoothing=0.0)):  # a kink at 0, once near the rest
             one = replace(one, target=still, input_target=None, past=u)
-            x, u = (found[0] for found in trim(one, np.stack([x, still[1]]), ~free))
+            x, u = (row[0] for row in trim(one, np.stack([x, still[1]]), ~free))
             moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
             if (moved <= STILL * away).all():
                 return np.append(x, u)

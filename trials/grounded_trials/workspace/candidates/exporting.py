@@ -10,8 +10,9 @@ from typing import Any
 
 from grounded import onboard
 from grounded.errors import GroundedError, nearest
+from grounded.findings import Finding, settle
 from grounded.result import Result
-from grounded.search.standing import Standing
+from grounded.search.standing import Ending, Phase, Standing
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.exported_files import (
     about_of,
@@ -42,8 +43,7 @@ class Exported(Result):
     file: Path
     format: str
     runner: Path | None = None  # the program that runs it, if requested
-    notes: tuple[str, ...] = ()  # remarks on the candidate
-    overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
+    findings: tuple[Finding, ...] = ()  # on the candidate, and what it would be refused for
     named: tuple[str, ...] = ()  # options of `ingest` for its log if another one is outstanding
     ended: bool = False  # whether it is the best candidate of a search that has ended
 
@@ -99,17 +99,17 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     ended = _has_ended(workspace, identity, handed.check.standing)
-    return Exported(identity, path, form, program, handed.notes, handed.overridden, how, ended)
+    return Exported(identity, path, form, program, settle(handed.findings), how, ended)
 
 
 def _has_ended(workspace: Folder, identity: str, now: Standing) -> bool:
     """Return whether the search is known to have ended with this candidate; nothing is planned."""
     if now.incumbent is None or now.incumbent.candidate.id != identity:
         return False
-    if now.phase == "propose":
+    if now.phase is Phase.PROPOSE:
         with suppress(GroundedError):  # another candidate's file is damaged
             now = known_end(workspace, workspace.read(), now) or now
-    return now.phase in ("converged", "stopped")
+    return now.ending is not Ending.NONE
 
 
 def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:

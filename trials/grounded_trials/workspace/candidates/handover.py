@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,26 +26,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded.policy import Policy
-from grounded.result import listed
 from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
-from grounded.search.certainty import beyond_one_trial
+from grounded.search.difference import beyond_one_trial
 from grounded.search.feedback.oscillation import quiet_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.store.store import Stored
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.wording import ranges, what_became, with_unit
+from grounded_trials.wording import what_became
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
 from grounded_trials.workspace.where_to_mend import twice_in_time
 
 if TYPE_CHECKING:
+    from grounded.search.candidate import Tried
     from grounded.search.standing import Standing
 
 INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
-NEAREST = 2  # number of [safety] bounds reported: the nearest, relative to the state's range
+PROPOSE = NextCommand("propose")
 NEAR = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
 NEARER = 0.01  # fraction of that range by which a run must approach a bound from its start
 AGREES = 1e-6  # tolerance, relative to an input's size, for a policy to repeat its prediction
@@ -59,24 +60,27 @@ class Handed:
     meta: dict[str, str]
     data: bytes
     check: Check
-    overridden: tuple[str, ...] = ()  # reasons to refuse it, overridden by `anyway`
+    overridden: tuple[Finding, ...] = ()  # reasons to refuse it, overridden by `anyway`
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Remarks on the candidate that do not prevent its use."""
-        return tuple(self.check.notes())
+    def findings(self) -> tuple[Finding, ...]:
+        """What is told of the candidate; what it is refused for first, if that is overridden."""
+        weighed = (one.weighing(Weight.WARN) for one in self.overridden)
+        return (*weighed, *self.check.notes())
 
 
 class Void(GroundedError):
-    """Raised for a candidate that must not be handed over; `reasons` has a sentence for each."""
+    """Raised for a candidate that must not be handed over; `reasons` has a finding for each."""
 
-    def __init__(self, identity: str, reasons: Sequence[str]) -> None:
-        super().__init__(
-            f"{identity} is not handed over: {'; '.join(reasons)}. Propose another, or use "
-            "--anyway to hand it over regardless",
-            NextCommand("propose"),
-        )
+    def __init__(self, identity: str, reasons: Sequence[Finding]) -> None:
         self.reasons = tuple(reasons)
+        then = NextCommand("propose")
+        super().__init__(found("plan.refused", identity, then=then, why=in_words(reasons)))
+
+
+def in_words(findings: Sequence[Finding]) -> str:
+    """Return findings as a fact of another one."""
+    return "; ".join(one.sentence for one in findings)
 
 
 def checked_candidate(
@@ -110,24 +114,26 @@ def checked_candidate(
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
-    reasons = (*([lost] if (lost := unmapped(workspace)) else []), *reasons)
+    if (lost := unmapped(workspace)) is not None:
+        reasons = (lost, *reasons)
     _note(workspace, identity, data)
     return Handed(candidate, meta, data, check, reasons)
 
 
-def unmapped(workspace: Folder) -> str:
-    """Return which inputs [log] lacks although it maps others; "" for none, or without [log].
+def unmapped(workspace: Folder) -> Finding | None:
+    """Return which inputs [log] lacks although it maps others; None for none, or without [log].
 
     What such an input is on the robot was never compared with a log: a speed in m/s may arrive as
     the duty of a motor. A system that `run` reaches gets the model's inputs, and needs no [log].
     """
     mapping = workspace.log_mapping
     if mapping is None or not (mapping.states or mapping.inputs):
-        return ""
+        return None
     if workspace.config.system.reachable:
-        return ""
+        return None
     lost = [name for name in workspace.base_model.input_names if name not in mapping.inputs]
-    return f"[log] maps no {listed([repr(name) for name in lost])}" if lost else ""
+    file = workspace.config.model.file or workspace.config.model.module
+    return found("plan.unmapped", *lost, then=INSPECT, file=file) if lost else None
 
 
 def check_log(workspace: Folder) -> None:
@@ -137,19 +143,9 @@ def check_log(workspace: Folder) -> None:
         GroundedError: if there is such an input, or if [log] removes a delay that an adopted effect
             has in the model as well.
     """
-    if twice := twice_in_time(workspace):
-        raise GroundedError(twice)
-    if not (lost := unmapped(workspace)):
-        return
-    file = workspace.config.model.file or workspace.config.model.module
-    raise GroundedError(
-        f"{lost}, though {file} has that as an input: which command of the robot that is, and in "
-        "which unit, was never compared with a log, so the robot may take it for something else. "
-        "Every input must be logged: map it in [log]. If the robot is driven by another command (a "
-        f"duty instead of a speed), put that one into {file} under its own name and unit, and map "
-        "it",
-        INSPECT,
-    )
+    for one in (twice_in_time(workspace), unmapped(workspace)):
+        if one is not None:
+            raise GroundedError(one)
 
 
 def _note(workspace: Folder, identity: str, data: bytes) -> None:
@@ -194,11 +190,14 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     if wrong.any():
         t, j = (int(i) for i in np.argwhere(wrong)[0])
         raise GroundedError(
-            f"candidates/{identity}.mcap is not the candidate that was proposed: at t = "
-            f"{t * policy.dt:g} s its policy sends {policy.input_names[j]} = {sent[0, t, j]:g}, "
-            f"but its own prediction has {predicted[t, j]:g}. It was rewritten: delete the file "
-            "and propose again",
-            NextCommand("propose"),
+            found(
+                "plan.rewritten",
+                identity,
+                then=NextCommand("propose"),
+                file=f"candidates/{identity}.mcap",
+                why=f"at t = {t * policy.dt:g} s it sends {policy.input_names[j]} = "
+                f"{sent[0, t, j]:g}, but its own prediction has {predicted[t, j]:g}",
+            )
         )
     return candidate, meta
 
@@ -239,115 +238,107 @@ class Check:
         """Whether the candidate was made for the current task."""
         return self.meta.get("task") == self.workspace.task.hash
 
-    def refuse_foreign(self, found: str) -> None:
+    def refuse_foreign(self, found_hash: str) -> None:
         """Refuse a candidate for another robot, or one not equal to what was handed out or run.
 
         Args:
-            found: SHA-256 of its file.
+            found_hash: SHA-256 of its file.
 
         Raises:
             GroundedError: if it is such a candidate.
         """
         made, model = self.candidate, self.workspace.base_model
-        for what, names, own in (
-            ("states", made.policy.state_names, model.state_names),
-            ("inputs", made.policy.input_names, model.input_names),
+        for names, own in (
+            (made.policy.state_names, model.state_names),
+            (made.policy.input_names, model.input_names),
         ):
             if names != own:
                 raise GroundedError(
-                    f"{made.id} is for the {what} {', '.join(names)}, but this workspace's model "
-                    f"has {', '.join(own)}: it is a candidate of another robot",
-                    NextCommand("propose"),
+                    found("plan.other_robot", made.id, then=PROPOSE, has=names, model=own)
                 )
-        if found not in self.workspace.noted.handed.get(made.id, {found}):
-            raise GroundedError(
-                f"candidates/{made.id}.mcap is not what was handed out under that name: it was "
-                "rewritten, or comes from another workspace; delete the file",
-                NextCommand("propose"),
-            )
+        file, then = f"candidates/{made.id}.mcap", PROPOSE
+        if found_hash not in self.workspace.noted.handed.get(made.id, {found_hash}):
+            raise GroundedError(found("plan.rewritten", made.id, then=then, file=file))
         for one in self.trials:
-            if one.trial.candidate == made.id and one.ran not in ("", found):
-                raise GroundedError(
-                    f"candidates/{made.id}.mcap is not the policy that {one.stored.id} ran: it was "
-                    "rewritten, or comes from another workspace; delete the file, the trial "
-                    "carries the one that was run"
-                )
+            if one.trial.candidate == made.id and one.ran not in ("", found_hash):
+                ran = one.stored.id
+                raise GroundedError(found("plan.rewritten", made.id, then=then, file=file, ran=ran))
 
-    def reasons(self) -> Iterator[str]:
-        """Yield the reasons why it must not be handed over, a sentence each."""
-        made, config = self.candidate, self.workspace.config
+    def reasons(self) -> Iterator[Finding]:
+        """Yield the reasons why it must not be handed over."""
+        made, config, name = self.candidate, self.workspace.config, self.candidate.id
         if abs(made.policy.dt - config.task.dt) > 1e-9:
-            yield f"it runs every {made.policy.dt:g} s, but [task] dt is {config.task.dt:g} s"
+            own, now = Quantity(made.policy.dt, "s"), Quantity(config.task.dt, "s")
+            yield found("plan.other_dt", name, own=own, now=now)
         model = self.workspace.base_model
-        for kind, own in (("states", model.states), ("inputs", model.inputs)):
-            for name, unit in json.loads(self.meta[kind]).items():
-                if unit != own[name]:
-                    yield f"it has {name} in {unit}, but the current model has it in {own[name]}"
+        for kind, own_units in (("states", model.states), ("inputs", model.inputs)):
+            for signal, unit in json.loads(self.meta[kind]).items():
+                if unit != own_units[signal]:
+                    now_unit = own_units[signal]
+                    yield found("plan.other_unit", name, signal=signal, unit=unit, now=now_unit)
         yield from outside_limits(self.workspace.task, made.policy)
         if not self.same_task and not (self.other_task and self._ever_ran):
-            yield (
-                f"it was made for another task ({other_task(self.workspace.task, made)})"
-                f"{', and was not run there' * self.other_task}"
+            yield found(
+                "plan.other_task",
+                name,
+                what=other_task(self.workspace.task, made),
+                never=int(self.other_task),
             )
         elif self.void:
-            yield "it was not run and is void: the model was changed since it was made"
+            yield found("plan.outdated", name, weight=Weight.REFUSE, candidate=name)
         yield from self._unsafe()
 
-    def notes(self) -> Iterator[str]:
-        """Yield remarks that the user should know although they do not prevent its use."""
+    def notes(self) -> Iterator[Finding]:
+        """Yield what the user should know although it does not prevent its use."""
         made, name = self.candidate, self.candidate.id
         best, untried = self.standing.incumbent, not self._trials(name)
-        if made.doubtful and untried:
-            yield made.doubt(best)
-        if best is not None and untried:
-            small = beyond_one_trial(made, best, self.workspace.config.search.repeats)
-            yield from [small] if small else []
-        if quiet := quiet_gains(self.workspace.task, self.standing.history):
-            yield from [risk] if (risk := quiet.risk(made)) else []
-        yield from self._became()
-        if "sha256" not in self.meta:
-            yield f"{name} was written by an older version: its file has no checksum of its own"
+        repeats = self.workspace.config.search.repeats
+        quiet = quiet_gains(self.workspace.task, self.standing.history)
+        told = [
+            made.doubt(best) if untried else None,
+            beyond_one_trial(made, best, repeats) if best is not None and untried else None,
+            quiet.risk(made) if quiet else None,
+            *self._became(),
+        ]
         if not self.same_task:
-            yield f"{name} was made for a different task from that in grounded.toml"
+            told.append(found("plan.of_other_task", name, candidate=name))
         elif self._changed:
-            again = "its prediction is outdated"
-            if self._predictable:
-                again += ", and its run was predicted again only to check it against the limits"
-            yield f"the model was changed since {name} was made; {again}"
+            told.append(found("plan.outdated", name, candidate=name))
         if self.same_task and not self.standing.trials:
-            yield from self._untried()
-            yield from self._not_logged()
-            yield from self._too_long()
-        if self.same_task and (coasts := self._coasting()):
-            yield coasts
+            told += [self._untried(), self._not_logged(), self._too_long()]
+        if self.same_task:
+            told.append(self._coasting())
+        yield from (one for one in told if one is not None)
 
-    def _became(self) -> Iterator[str]:
+    def _became(self) -> Iterator[Finding]:
         """Yield that it lost, that its trials were set aside, or those that it was made from."""
         name, best = self.candidate.id, self.standing.incumbent
         tried = next((t for t in self.standing.history if t.candidate.id == name), None)
-        if tried is not None and tried.void:
-            yield (
-                f"{name} was made from {ranges(tried.gone)}, which "
-                f"{'is' if len(tried.gone) == 1 else 'are'} "
-                f"{what_became(tried.gone, self.workspace.discarded())}: `propose` says what to "
-                "run instead"
-            )
-        if tried is not None and tried.accepted is False and best is not None:
-            lost = "crashed" if tried.utility == -np.inf else f"lost with {tried.utility:.4g}"
-            yield f"{name} {lost}; the best so far is {best.candidate.id}, {best.utility:.4g}"
         aside = self.workspace.discarded()
+        if tried is not None and tried.void:
+            yield disowned(tried, aside)
+        if tried is not None and tried.accepted is False and best is not None:
+            real = None if tried.crashed else tried.utility
+            yield found(
+                "plan.lost",
+                name,
+                candidate=name,
+                real=real,
+                best=best.candidate.id,
+                of=best.utility,
+            )
         for stored in self.workspace.store.list() if aside else ():
             if stored.id in aside and self._ran(stored) == name:
                 why = aside[stored.id]
-                yield f"{stored.id}, a run of {name}, is set aside{why and ': ' + why}"
+                yield found("plan.run_aside", stored.id, trial=stored.id, candidate=name, why=why)
 
     def _ran(self, stored: Stored) -> str:
         with suppress(GroundedError):
             return read_trial(self.workspace.store.read(stored))[0].candidate
         return ""
 
-    def _untried(self) -> Iterator[str]:
-        """Yield a warning if the first run is predicted to come near bounds of [safety].
+    def _untried(self) -> Finding | None:
+        """Return that the first run is predicted to come near bounds of [safety].
 
         Bounds that the run does not approach from where it starts are left out.
         """
@@ -364,63 +355,54 @@ class Check:
                     and room[0] - room[t] > NEARER * far
                     and room[t] < NEAR * far
                 ):
-                    left = with_unit(f"{room[t]:.3g}", unit)
-                    told = f"within {left} of the {side} bound of {name} (at {t * task.dt:.4g} s)"
-                    near.append((room[t] / far, told))
-        if near:
-            told = " and ".join(text for _, text in sorted(near)[:NEAREST])
-            yield (
-                f"[safety] was only checked on the prediction, which no run has tested: {made.id} "
-                f"is predicted to come {told}. The robot may go further: be ready to stop it"
-            )
+                    near.append((room[t] / far, name, side, Quantity(room[t], unit), t * task.dt))
+        if not near:
+            return None
+        _, name, side, left, at = min(near)
+        return found(
+            "plan.near_safety", name, left=left, side=side, state=name, at=Quantity(at, "s")
+        )
 
-    def _not_logged(self) -> Iterator[str]:
-        """Yield which states are fed back although [log] has no column of them, only estimates."""
+    def _not_logged(self) -> Finding | None:
+        """Return which states are fed back although [log] has no column of them, only estimates."""
         gain, config = self.candidate.policy.gain, self.workspace.config
         mapped = self.workspace.log_mapping if config.estimate.names() else None
         if gain is None or mapped is None:
-            return
+            return None
         names = self.workspace.base_model.state_names
         used = np.abs(gain[:, :, : len(names)]).max(axis=(0, 1)) > 0
         told = [n for n, u in zip(names, used, strict=True) if u and n not in mapped.states]
-        if told:
-            many = len(told) > 1
-            it = "them" if many else "it"
-            yield (
-                f"{self.candidate.id} feeds back {listed(told)}, of which the log has no column: "
-                f"your program has to compute {it} while it runs (differences, a filter). Let it "
-                f"log {it}, by hand too, map {it} in [log], and add {it} to [estimate] measured, "
-                "with the scatter at standstill: a run is recognised by the commands that follow "
-                f"from these values, and `diagnose` finds how late {'they are' * many or 'it is'}, "
-                "which plans then allow for"
-            )
+        name = self.candidate.id
+        return found("plan.not_logged", *told, candidate=name) if told else None
 
-    def _too_long(self) -> Iterator[str]:
-        """Yield that the integrator's steps are too long for the model, if they are."""
+    def _too_long(self) -> Finding | None:
+        """Return that the integrator's steps are too long for the model, if they are."""
         from grounded.accounts.time_step import too_long
 
         made, model = self.candidate, self.workspace.base_model
         states, inputs = made.predicted_states[:-1], made.predicted_inputs
-        if found := too_long(model, states, inputs, made.policy.dt):
-            file = self.workspace.config.model.file or self.workspace.config.model.module
-            yield (
-                f"in each step of the predicted run {found.state} {found.told}: {found.advice} in "
-                f"{file}, and propose again"
-            )
+        if (long := too_long(model, states, inputs, made.policy.dt)) is None:
+            return None
+        file = self.workspace.config.model.file or self.workspace.config.model.module
+        return found(
+            "plan.time_step",
+            long.state,
+            share=long.missed,
+            step=Quantity(long.dt, "s"),
+            substeps=long.substeps,
+            file=file,
+        )
 
-    def _coasting(self) -> str:
-        """Return where the robot goes after the run, with the input held then; or ""."""
+    def _coasting(self) -> Finding | None:
+        """Return where the robot goes after the run, with the input held then."""
         from grounded.search.safety import coasts_out
-        from grounded_trials.workspace.intake.remarks.after_run import kicked
+        from grounded_trials.workspace.candidates.last_command import kicked
 
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)
         held = np.clip(made.policy.past, made.policy.low, made.policy.high)
         out = coasts_out(self.workspace.task, planner.plan, run, held)
-        if out:
-            return f"after {made.id} ends {out}"
-        kick = kicked(planner, run, held)
-        return f"{made.id}: {kick}" * bool(kick)
+        return out or kicked(planner, run, held)
 
     @property
     def void(self) -> bool:
@@ -446,7 +428,7 @@ class Check:
         found = [t.trial for t in self.trials if t.trial.candidate == identity]
         return [t for t in found if self.workspace.fits(t)]
 
-    def _unsafe(self) -> list[str]:
+    def _unsafe(self) -> tuple[Finding, ...]:
         """Return objections of [safety]; a step not run yet gets a margin for how runs strayed."""
         from grounded.search.safety import objections, spread
 
@@ -480,23 +462,36 @@ class Check:
         return replace(made, predicted_states=states, predicted_inputs=run.inputs)
 
 
-def outside_limits(task: Task, policy: Policy) -> Iterator[str]:
-    """Yield a sentence for each input for which a policy may exceed the task's hard limits.
+def outside_limits(task: Task, policy: Policy) -> Iterator[Finding]:
+    """Yield the inputs for which a policy may exceed the task's hard limits.
 
     A feed-forward with feedback may lie outside the limits: its sum with the feedback is clipped to
     the policy's own limits, so only those need to be inside.
     """
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         low, high = task.low[j], task.high[j]
-        today = with_unit(f"[limits] {name} = [{low:g}, {high:g}]", unit)
-        if policy.low[j] < low or policy.high[j] > high:
-            own = f"[{policy.low[j]:g}, {policy.high[j]:g}]"
-            yield f"its own limits of {name} are {own}, wider than {today}"
         room = 1e-9 * max([1.0, *(abs(v) for v in (low, high) if np.isfinite(v))])
-        parts = {f"holds {name} at": policy.past[j : j + 1]}
+        sent = policy.past[j : j + 1]
         if policy.gain is None:
-            parts[f"sends {name} ="] = policy.feedforward[:, j]
-        for what, values in parts.items():
+            sent = np.append(sent, policy.feedforward[:, j])
+        ends = np.array([policy.low[j], policy.high[j]])
+        for values, least in ((ends, 0.0), (sent, room)):
             excess = np.maximum(low - values, values - high)
-            if excess.max() > room:
-                yield f"it {what} {values[np.argmax(excess)]:g}, outside {today}"
+            if excess.max() > least:
+                value = Quantity(float(values[np.argmax(excess)]), unit)
+                yield found(
+                    "plan.outside_limits",
+                    name,
+                    input=name,
+                    value=value,
+                    low=f"{low:g}",
+                    high=f"{high:g}",
+                )
+                break
+
+
+def disowned(tried: Tried, aside: Collection[str]) -> Finding:
+    """Return that a candidate, never run, is void since a trial that it was made from is gone."""
+    name = tried.candidate.id
+    gone = what_became(tried.gone, aside)
+    return found("plan.disowned", name, candidate=name, trials=tried.gone, gone=gone)

@@ -10,15 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result, figure
+from grounded.findings import Finding, Weight, found, settle
+from grounded.result import Result
+from grounded.search.difference import last_gain
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
-from grounded_trials.wording import ranges, rendered, what_became
+from grounded.search.standing import Ending, Phase
+from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
     check_log,
     checked_candidate,
+    disowned,
+    in_words,
     outside_limits,
     unmapped,
 )
@@ -31,7 +36,13 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import doubted, next_command, not_adopted, not_ingested
+from grounded_trials.workspace.next_step import (
+    doubted,
+    next_command,
+    not_adopted,
+    not_ingested,
+    outlook,
+)
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
@@ -42,6 +53,7 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
+    from grounded_trials.workspace.candidates.trust import Extent
     from grounded_trials.workspace.identity import StoredTrial
 
 PROPOSE = NextCommand("propose")
@@ -55,11 +67,16 @@ class Proposed(Result):
     proposal: Proposal
     file: Path | None  # the candidate's file; None if the search has ended
     then: NextCommand
+    findings: tuple[Finding, ...] = ()  # what to know before the run, the heaviest first
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
-    lacks: str = ""  # what the last diagnosis found and the model lacks
-    noise_in_log: float = 0.0  # expected cost of all of the sensor noise in its log
     from_starts: FromStarts | None = None  # from where runs began so far; None: too few are known
+    again: bool = False  # whether the candidate was run before
+    made: Finding | None = None  # how the candidate was made
+    predicted: Finding | None = None
+    so_far: Finding | None = None  # the best one's utility
+    trust: Finding | None = None
+    extent: tuple[Extent, ...] = ()  # where the predicted run goes
 
     @property
     def candidate(self) -> Candidate | None:
@@ -77,7 +94,7 @@ class Proposed(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `propose --json`; candidate is null if the search has ended."""
-        found = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
+        told = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
         age = self.candidate.sample_age if self.candidate else None
         begun = self.from_starts and {
@@ -85,8 +102,12 @@ class Proposed(Result):
             "std": self.from_starts.std,
             "runs": self.from_starts.runs,
         }
-        found |= {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
-        return found | {"from_usual_starts": begun}
+        every = [*self.standing.findings, *self.findings]
+        every += [one for one in (self.made, self.predicted, self.so_far, self.trust) if one]
+        told |= {"notes": [one.sentence for one in self.findings]}
+        told |= {"findings": [one.to_json() for one in every]}
+        told |= {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
+        return told | {"from_usual_starts": begun}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,8 +117,8 @@ class Status(Result):
     standing: Standing
     then: NextCommand
     again: NextCommand  # runs or exports the best candidate once more; `next` once it is exported
-    outdated: str = ""  # why the last diagnosis is outdated
-    notes: tuple[str, ...] = ()  # notes on the end of the search, and on trials that don't count
+    findings: tuple[Finding, ...] = ()  # on the end of the search, and on trials that don't count
+    certainty: tuple[Finding, ...] = ()  # of the last gain, and of what waits
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
     off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
     diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
@@ -120,10 +141,12 @@ class Status(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `status --json`, with the whole history."""
-        found = self.standing.to_json() | {"discarded": self.discarded}
-        if found["best"] is not None:
-            found["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
-        return found
+        told = self.standing.to_json() | {"discarded": self.discarded}
+        every = (*self.standing.findings, *self.certainty, *self.findings)
+        told |= {"findings": [one.to_json() for one in every]}
+        if told["best"] is not None:
+            told["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
+        return told
 
 
 def propose_in(workspace: Folder) -> Proposed:
@@ -137,79 +160,106 @@ def propose_in(workspace: Folder) -> Proposed:
             `check_log`).
     """
     if not workspace.config.task.target:
-        raise GroundedError(
-            "there is no manoeuvre to learn: [task] names no target. Draw one with `grounded "
-            "target`; `fit` and `diagnose` need none",
-            NextCommand("target", ("SHAPE",)),
-        )
+        raise GroundedError(found("plan.no_target", then=NextCommand("target", ("SHAPE",))))
     check_log(workspace)
     before, told = workspace.candidate_ids(), bool(workspace.noted.since)
     proposal, void = _handed_over(workspace)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
-    candidate = proposal.candidate
-    notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
-    left = _disowned(proposal.standing, workspace.discarded())
-    if candidate is not None and proposal.is_new:
-        notes = notes or left or _void(workspace, before)
-    elif candidate is not None:
-        notes += left
-    if told:  # when the candidate that replaced them was handed out
-        notes = [note for note in notes if note not in left]
-    instead = f"; run {candidate.id} instead" if candidate is not None else ""
-    notes = [f"{note}{instead}" for note in notes]
-    held: list[str] = []
-    if not proposal.standing.trials and (candidate is None or proposal.is_new):
+    candidate, now = proposal.candidate, proposal.standing
+    notes = [found("plan.void", name, candidate=name, why=why) for name, why in void.items()]
+    left = [] if told else _disowned(now, workspace.discarded())  # told when it was replaced
+    if candidate is not None:
+        notes = notes + left if not proposal.is_new else notes or left or _void(workspace, before)
+        notes = [one.knowing({"instead": candidate.id}) for one in notes]
+    held: Finding | None = None
+    if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.at_rest import held_before
         from grounded_trials.workspace.candidates.first_plan import left_open
 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
-    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
-
-    status = status_of(workspace, proposal.standing)
-    if lacks := not_adopted(workspace, status.diagnosis) if candidate else "":
-        notes.append(f"the last diagnosis found that {lacks}")
-    if doubt := proposal.standing.doubt:
-        since = status.since
-        if doubted(proposal.standing, since, usable_ids(workspace)):
-            notes.append(f"{doubt}: `{rendered(NextCommand('diagnose'), workspace.address)}`")
-    proposal = replace(proposal, notes=(*proposal.notes, *notes))
+    status = status_of(workspace, now)
+    lacks = not_adopted(workspace, status.diagnosis) if candidate else None
+    doubt = now.doubt
+    doubt = doubt if doubt and doubted(now, status.since, usable_ids(workspace)) else None
+    notes += [one for one in (lacks, doubt) if one]
     if candidate is None:
-        _, asked = unanswered(workspace)
-        if asked is not None:  # who proposes goes on; no candidate is handed out to show it
-            digest = workspace.store.find(asked.arguments[0]).digest
-            gone_on = {"note": "restore", "trial": digest, "why": ""}
-            with suppress(GroundedError):  # a folder that can't be written
-                workspace.notes.add(gone_on, again=False)
-            vars(workspace).pop("noted", None)
-            status = status_of(workspace, proposal.standing)
-        ended = replace(proposal, standing=status.standing)
-        then = PROPOSE if held else status.then  # after [task] start is changed, as noted
-        return Proposed(ended, None, then)
-    path = workspace.candidate_path(candidate.id)
+        return _ended(workspace, proposal, status, notes, held)
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
-    if not held and proposal.is_new and not proposal.standing.trials:
+    if not held and proposal.is_new and not now.trials:
         from grounded_trials.workspace.candidates.rest_at_end import to_end_at_rest
 
         if (rest := to_end_at_rest(workspace, candidate)) is not None:
-            note = (
-                "`next:` draws the same line so that the plan comes to rest. To run "
-                f"{candidate.id} as it is: `{rendered(then, workspace.address)}`"
-            )
-            then = rest
-            proposal = replace(proposal, notes=(*proposal.notes, note))
+            own = rendered(then, workspace.address)
+            note = found("plan.draw_again", then=rest, candidate=candidate.id, command=own)
+            then, notes = rest, [*notes, note]
+    return _told(workspace, proposal, status, notes, then)
+
+
+def _ended(
+    workspace: Folder,
+    proposal: Proposal,
+    status: Status,
+    notes: Sequence[Finding],
+    held: Finding | None,
+) -> Proposed:
+    """Return that there is nothing to run; who proposes goes on after a run that was doubted."""
+    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
+
+    _, asked = unanswered(workspace)
+    if asked is not None:  # no candidate is handed out to show that the user goes on
+        digest = workspace.store.find(asked.arguments[0]).digest
+        gone_on = {"note": "restore", "trial": digest, "why": ""}
+        with suppress(GroundedError):  # a folder that can't be written
+            workspace.notes.add(gone_on, again=False)
+        vars(workspace).pop("noted", None)
+        status = status_of(workspace, proposal.standing)
+    over = replace(proposal, standing=status.standing)
+    then = PROPOSE if held else status.then  # after [task] start is changed, as noted
+    return Proposed(over, None, then, settle((*proposal.findings, *notes)))
+
+
+def _told(
+    workspace: Folder,
+    proposal: Proposal,
+    status: Status,
+    notes: Sequence[Finding],
+    then: NextCommand,
+) -> Proposed:
+    """Return a candidate with what it promises and how far that can be trusted."""
+    from grounded_trials.workspace.candidates import trust
+
+    made, now, task = proposal.candidate, proposal.standing, workspace.task
+    assert made is not None
     noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
-    same = [t for t in proposal.standing.history if t.candidate.id == candidate.id]
-    noise = noises.before([candidate.id], candidate.seen)
-    cost = same[0].noise_missed if same else noise_missed(workspace.task, candidate, noise)
-    whole = noise_cost(workspace.task, candidate.policy, noise)
-    predicted = off_target_of(workspace.task, [candidate.predicted_run])
-    off_target = tuple(replace(one, end_std=0.0) for one in predicted)  # no log's last sample
-    if not candidate.grounded:  # a run that no sensor measured
-        off_target = tuple(replace(one, noise=0.0) for one in off_target)
-    begun = from_starts(workspace, candidate)
-    return Proposed(proposal, path, then, cost, off_target, lacks, whole, begun)
+    same = [t for t in now.history if t.candidate.id == made.id]
+    noise = noises.before([made.id], made.seen)
+    cost = same[0].noise_missed if same else noise_missed(task, made, noise)
+    whole = noise_cost(task, made.policy, noise)
+    ahead = off_target_of(task, [made.predicted_run])
+    ahead = tuple(replace(one, end_std=0.0) for one in ahead)  # no log's last sample
+    if not made.grounded:  # a run that no sensor measured
+        ahead = tuple(replace(one, noise=0.0) for one in ahead)
+    begun = from_starts(workspace, made)
+    best, again = now.incumbent, any(t.trials for t in same)
+    aged, slow = trust.samples(made, now, task), workspace.planner.plan.model.system.note
+    notes = [*notes, *([aged] if aged else []), *([found("plan.model", what=slow)] if slow else [])]
+    return Proposed(
+        proposal,
+        workspace.candidate_path(made.id),
+        then,
+        settle((*proposal.findings, *notes)),
+        cost,
+        ahead,
+        begun,
+        again,
+        trust.made_how(made, task, now.history),
+        trust.predicted(made, cost, whole, begun),
+        None if best is None else trust.so_far(made, best, cost),
+        trust.trust(workspace, made, now, cost, whole - cost, status.diagnosis, status.since),
+        trust.extent_of(made, task),
+    )
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -234,14 +284,15 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
         except Void as error:
             if proposal.is_new:
                 raise
-            if any(t.trial.candidate == candidate.id for t in workspace.trials()):
+            why, name = in_words(error.reasons), candidate.id
+            if any(t.trial.candidate == name for t in workspace.trials()):
+                waits = proposal.standing.sentence
                 raise GroundedError(
-                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Undo what was "
-                    f"changed, or run {candidate.id} regardless with --anyway"
+                    found("plan.waits_void", name, standing=waits, why=why, candidate=name)
                 ) from None
-            void[candidate.id] = "; ".join(error.reasons)
+            void[name] = why
         else:
-            return replace(proposal, notes=(*proposal.notes, *handed.notes)), void
+            return replace(proposal, findings=(*proposal.findings, *handed.findings)), void
 
 
 def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
@@ -262,25 +313,19 @@ def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[
     return None
 
 
-def _disowned(now: Standing, aside: Collection[str]) -> list[str]:
-    """Explain which latest candidates, never run, are void since a trial was discarded."""
-    found = []
+def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
+    """Return which latest candidates, never run, are void since a trial was discarded."""
+    void = []
     for tried in reversed(now.history):
         if not tried.gone or tried.accepted:
             break
         if tried.void:
-            name = tried.candidate.id
-            found.append(
-                f"{name} was not run and is void: {ranges(tried.gone)}, which it was made from, "
-                f"{'is' if len(tried.gone) == 1 else 'are'} {what_became(tried.gone, aside)}. If "
-                f"the robot has run it meanwhile, ingest that log with --candidate {name}: it "
-                "counts"
-            )
-    return found
+            void.append(disowned(tried, aside))
+    return void
 
 
-def _lost_by_starts(now: Standing) -> list[str]:
-    """Name the steps from the best candidate whose losses are mostly due to where runs began.
+def _lost_by_starts(now: Standing) -> list[Finding]:
+    """Return the steps from the best candidate whose losses are mostly due to where runs began.
 
     Their utilities in the table include that: one of -0.96 beside -0.51 was itself 0.04 worse.
     """
@@ -290,8 +335,7 @@ def _lost_by_starts(now: Standing) -> list[str]:
     steps = [t for t in now.history if t.accepted is False and t.candidate.base == own]
     lost = {t.candidate.id: (best.utility - t.utility, t.excused(best)) for t in steps}
     return [
-        f"{name} lost to {own} by {figure(loss)}; by the model {figure(due)} of that "
-        "is due to where their runs began"
+        found("search.lost_by_starts", name, candidate=name, best=own, loss=loss, start=due)
         for name, (loss, due) in lost.items()
         if math.isfinite(loss) and due > MOSTLY * loss
     ]
@@ -305,80 +349,94 @@ def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
     return last[0].model != workspace.planner.fingerprint
 
 
-def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
-    """Explain why the search's last candidate, never run, is replaced; [] if it is not."""
+def _void(workspace: Folder, before: Sequence[str]) -> list[Finding]:
+    """Return why the search's last candidate, never run, is replaced; [] if it is not."""
     if (last := _not_run(workspace, before)) is None:
         return []
     made, meta = last
+    model = workspace.base_model
     if meta.get("task") == workspace.task.hash:
         same = made.model == workspace.planner.fingerprint
         why = "the trial that it followed was set aside" if same else "the model was changed"
-        why += " since it was made"
     elif (made.policy.state_names, made.policy.input_names) != (
-        workspace.base_model.state_names,
-        workspace.base_model.input_names,
+        model.state_names,
+        model.input_names,
     ):
         why = "it is for another robot"
     else:
-        wider = list(outside_limits(workspace.task, made.policy))
-        why = "; ".join(wider) or "the task was changed since it was made"
-    return [f"{made.id} was not run and is void: {why}"]
+        wider = in_words(list(outside_limits(workspace.task, made.policy)))
+        why = wider or "the task was changed"
+    return [found("plan.void", made.id, candidate=made.id, why=why)]
 
 
-def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()) -> Status:
+def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = ()) -> Status:
     """Return a standing with the command to type next and the state of the last diagnosis.
 
     Raises:
         GroundedError: if a stored file is damaged.
     """
     usable = usable_ids(workspace)
-    found = readable_diagnosis(workspace.reports)
-    since = since_diagnosis(workspace, found, usable) if found else None
-    then = next_command(workspace, standing, found, usable)
-    if lost := unmapped(workspace):
+    last = readable_diagnosis(workspace.reports)
+    since = since_diagnosis(workspace, last, usable) if last else None
+    then = next_command(workspace, standing, last, usable)
+    lost = unmapped(workspace)
+    if lost:
         then = INSPECT
+    gone = () if standing.phase is Phase.PROPOSE else _disowned(standing, workspace.discarded())
+    every = [
+        *notes,
+        *_nothing_stored(workspace),
+        *([lost.weighing(Weight.NOTE)] if lost else []),
+        *gone,
+        *_lost_by_starts(standing),
+        *_namesakes(workspace),
+        *not_counted(uncounted(workspace, workspace.trials(), standing)),
+        *left_out(workspace),
+        *(since.findings if since else ()),
+    ]
+    best = standing.incumbent
     return Status(
-        _asking(workspace, standing, then),
+        outlook(_asking(workspace, standing, then), then),
         then,
         again_best(workspace, standing),
-        since.sentence if since else "",
-        (
-            *notes,
-            *_nothing_stored(workspace),
-            *([f"{lost}: `propose` and `export` refuse until it does"] if lost else ()),
-            *(_disowned(standing, workspace.discarded()) if standing.phase != "propose" else ()),
-            *_lost_by_starts(standing),
-            *_namesakes(workspace),
-            *not_counted(uncounted(workspace, workspace.trials(), standing)),
-            *left_out(workspace),
-        ),
+        settle(every),
+        _certainty(standing),
         workspace.discarded(),
-        off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
-        found,
+        off_target_of(workspace.task, best.trials if best else ()),
+        last,
         since,
     )
 
 
-def _nothing_stored(workspace: Folder) -> list[str]:
-    """Return a note that a log may be stored first, if it is not known which; [] if it is."""
+def _certainty(now: Standing) -> tuple[Finding, ...]:
+    """Return how certain the last gain is, and what the run that waits can show."""
+    from grounded.search.difference import beyond_one_trial
+
+    gain, waiting = last_gain(now.history), now.outstanding
+    ran = {t.candidate.id for t in now.history if t.trials}
+    small = None
+    if gain and waiting and waiting.id not in ran and now.incumbent is not None:
+        small = beyond_one_trial(waiting, now.incumbent, now.missing)
+    return tuple(one for one in (gain and gain.to_finding(), small, now.less_in_log) if one)
+
+
+def _nothing_stored(workspace: Folder) -> list[Finding]:
+    """Return that a log may be stored first, if it is not known which; [] if it is."""
     if workspace.store.list() or workspace.candidate_ids() or not_ingested(workspace):
         return []
     config = workspace.config
     if not config.log.has("state") or config.system.reachable:
         return []
-    return [
-        "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
-        "model lacks; without, `propose` plans with the model as it is"
-    ]
+    return [found("search.no_log")]
 
 
 def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
     """Return the standing, which asks for another run of the best one if `then` is that run."""
-    if not now.asks_again or now.missed or now.incumbent is None:
+    if not now.asks_again or now.asks or now.incumbent is None:
         return now
     own = now.incumbent.candidate.id
     runs = then == to_run(workspace, own, "best")
-    return replace(now, sentence=f"{now.sentence}; run {own} again") if runs else now
+    return now.with_finding(found("search.again", own, best=own)) if runs else now
 
 
 def status_in(workspace: Folder) -> Status:
@@ -389,7 +447,8 @@ def status_in(workspace: Folder) -> Status:
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
     now = undecided(standing_in(workspace), then.arguments[0])
-    return replace(status_of(workspace, now, asked), then=then)
+    notes = [found("search.asked", then.arguments[0], why=why) for why in asked]
+    return replace(status_of(workspace, now, notes), then=then)
 
 
 def undecided(now: Standing, trial: str) -> Standing:
@@ -400,10 +459,11 @@ def undecided(now: Standing, trial: str) -> Standing:
     ran = next((t for t in now.history if trial in [one.id for one in t.trials]), None)
     if ran is None:
         return now
-    sentence = f"discard {trial}, a run of {ran.candidate.id}, or go on with it: `propose`"
+    made = ran.candidate
+    why = found("search.discard_first", trial, trial=trial, candidate=made.id)
     history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
-    waits = replace(now, phase="await-trial", outstanding=ran.candidate, missing=1, history=history)
-    return replace(waits, sentence=sentence, ending="", then=None, doubt="", missed="")
+    waits = replace(now, phase=Phase.AWAIT, outstanding=made, missing=1, history=history)
+    return replace(waits, findings=(why,), ending=Ending.NONE)
 
 
 def again_best(workspace: Folder, now: Standing) -> NextCommand:
@@ -426,25 +486,17 @@ def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -
     ]
 
 
-def not_counted(names: Sequence[str]) -> list[str]:
-    """Return a sentence saying that these trials only serve fit and diagnose; [] for none."""
-    if not names:
-        return []
-    one, ran = len(names) < 2, "candidates of another task, or probes"
-    return [
-        f"{ranges(names)} {'counts' if one else 'count'} only as data, for fit and diagnose: "
-        f"{'it' if one else 'they'} ran {ran}"
-    ]
+def not_counted(names: Sequence[str]) -> list[Finding]:
+    """Return that these trials only serve fit and diagnose; [] for none."""
+    return [found("search.uncounted", *names)] if names else []
 
 
-def _namesakes(workspace: Folder) -> list[str]:
+def _namesakes(workspace: Folder) -> list[Finding]:
     """Report trials that ran another policy of a candidate's name (after merging two folders)."""
     names: dict[str, list[str]] = {}
     for one in workspace.trials():
         if "~" in one.trial.candidate:
             names.setdefault(one.trial.candidate, []).append(one.stored.id)
     return [
-        f"{', '.join(ids)} ran another policy that is also called {name.split('~')[0]}: only data, "
-        "for fit and diagnose"
-        for name, ids in names.items()
+        found("search.namesake", *ids, candidate=name.split("~")[0]) for name, ids in names.items()
     ]

@@ -87,7 +87,7 @@ def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
 
     It draws the same line so that free states rest at its end, and holds it there for a while.
     """
-    from grounded_trials.workspace.intake.remarks.after_run import ended_at_rest
+    from grounded_trials.workspace.candidates.last_command import ended_at_rest
 
     planner, task = workspace.planner, workspace.task
     held = np.clip(made.policy.past, made.policy.low, made.policy.high)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.findings import Finding, found, settle
 from grounded.plant import Noise, Plant
 from grounded.result import Result
 from grounded.search.ask_tell import learn
@@ -43,8 +44,7 @@ class Ran(Result):
 
     candidate: str
     trial_file: Path
-    notes: tuple[str, ...] = ()  # remarks on the candidate
-    overridden: tuple[str, ...] = ()  # reasons against it, overridden by `anyway`
+    findings: tuple[Finding, ...] = ()  # on the candidate
 
     @property
     def then(self) -> NextCommand:
@@ -72,7 +72,7 @@ def run_candidate(
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:
         for reason in handed.overridden:
-            warn(f"{identity} is run anyway: {reason}")
+            warn(found("plan.anyway", identity, why=reason.sentence).sentence)
     path = _next_run(workspace.folder / "runs", identity)
     if system.command:
         _call(workspace, system.command, handed, path)
@@ -85,7 +85,7 @@ def run_candidate(
             'give [system] command = "python drive.py {candidate} {trial}"',
             to_run(workspace, identity, *(() if candidate is None else (candidate,))),
         )
-    return Ran(identity, path, handed.notes, handed.overridden)
+    return Ran(identity, path, settle(handed.check.notes()))
 
 
 def simulated_plant(workspace: Folder) -> Plant:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,8 +18,9 @@ from typing import TYPE_CHECKING
 import grounded
 from grounded.compile.run.jit import store, stored
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding
 from grounded.search.planner import model_fingerprint
-from grounded.search.standing import Proposal, Standing, standing
+from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import (
     readable_diagnosis,
@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Proposal
 
 KIND = ".ended"
-UNSAID = ("not allowed", "gains too large")  # ends that are told with the refused candidate
-SAID = ("phase", "sentence", "ending", "doubt", "missed")
+UNSAID = (Ending.NOT_ALLOWED, Ending.GAINS)  # ends that are told with the refused candidate
 
 
 def standing_in(
@@ -56,14 +55,14 @@ def standing_in(
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
     workspace.save_index()
-    if ahead and now.phase == "propose" and now.incumbent is not None:
+    if ahead and now.phase is Phase.PROPOSE and now.incumbent is not None:
         now = planned(workspace, contents).standing
     return answered(workspace, now)
 
 
 def answered(workspace: Folder, now: Standing) -> Standing:
     """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
-    if not now.missed:
+    if not now.asks:
         return now
     if (found := readable_diagnosis(workspace.reports)) is None:
         return now
@@ -78,9 +77,9 @@ def planned(workspace: Folder, contents: Contents) -> Proposal:
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
-    planning = now.phase == "propose" and now.incumbent is not None
-    if planning and (ended := known_end(workspace, contents, now)) is not None:
-        return Proposal(ended, None, is_new=False)
+    planning = now.phase is Phase.PROPOSE and now.incumbent is not None
+    if planning and (known := known_end(workspace, contents, now)) is not None:
+        return Proposal(known, None, is_new=False)
     name = workspace.next_id()
     made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
     if planning and made.candidate is None:
@@ -96,24 +95,21 @@ def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing 
         contents: its contents.
         now: the standing, which asks for a candidate.
     """
-    found = stored(_place(workspace), KIND)
-    if found is None:
+    kept = stored(_place(workspace), KIND)
+    if kept is None:
         return None
-    said = json.loads(found)
+    said = json.loads(kept)
     if said["of"] != _digest(workspace, contents):
         return None
-    verb, *arguments = said["then"] or [""]
-    then = NextCommand(verb, tuple(arguments)) if verb else None
-    return replace(now, step=None, then=then, **{name: said[name] for name in SAID})
+    return ended(now, Ending(said["ending"]), *map(Finding.from_json, said["findings"]))
 
 
-def remember_end(workspace: Folder, contents: Contents, ended: Standing) -> None:
+def remember_end(workspace: Folder, contents: Contents, now: Standing) -> None:
     """Keep the end of a search, unless it goes on or a candidate was refused, with its reasons."""
-    if ended.phase not in ("converged", "stopped") or ended.ending in UNSAID:
+    if now.ending is Ending.NONE or now.ending in UNSAID:
         return
-    then = ended.then and [ended.then.verb, *ended.then.arguments]
-    said = {name: getattr(ended, name) for name in SAID}
-    document = {"of": _digest(workspace, contents), "then": then, **said}
+    findings = [one.to_json() for one in now.findings]
+    document = {"of": _digest(workspace, contents), "ending": now.ending, "findings": findings}
     store(_place(workspace), json.dumps(document).encode(), KIND)
 
 

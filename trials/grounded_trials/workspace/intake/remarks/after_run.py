@@ -41,68 +41,6 @@ GROWS = 1.5  # of a push, not of a speed: the second half of the drift exceeds t
 FASTER = 2.0  # and the drift exceeds by this what the speed at the end gives
 
 
-def kicked(planner: Planner, run: Trial, held: Array) -> str:
-    """Return a warning if a plan reaches its target only by a last command at its limit; or "".
-
-    Weights of the last state alone are met by a kick in the last steps, for one sample: by the
-    model, the robot leaves the target in the next second. An arm at rest against its weight leaves
-    it, too, but because the input that is sent afterwards lets it go.
-
-    Args:
-        planner: the task, and the model with adopted effects.
-        run: the predicted run, with the planning model's states.
-        held: the input that is sent after it (m,).
-    """
-    task = planner.task
-    groups = weighed_groups(task) if reaches(task) else []
-    ends = np.vstack([task.low, task.high])
-    full = np.ptp(np.where(np.isfinite(ends), ends, 0.0), axis=0) * AT_LIMIT
-    at = (np.abs(run.inputs[-LAST_STEPS:] - ends[:, None]) <= full).any(axis=(0, 1))
-    at &= ~(np.abs(held - ends) <= full).any(axis=0) & (full > 0)
-    if not groups or not at.any():
-        return ""
-    names, what = groups[0]
-    states, next_s = [task.model.state_names.index(n) for n in names], math.ceil(1.0 / task.dt)
-    after = coasting(planner.plan, run, held)[: 1 + next_s, : task.model.n]
-    errors, way = _from_target(task, after, states)
-    off = np.linalg.norm(errors, axis=1)
-    worst = int(np.argmax(off))
-    if off[0] > REACHED * way or not off[worst] > max(AWAY * way, 2 * off[0]):
-        return ""
-    rest = ended_at_rest(task, run, held)
-    let = coasting(planner.plan, rest, held)[: 1 + next_s, : task.model.n]
-    drift = np.linalg.norm(task.model.difference(let, let[:1])[:, states], axis=1)
-    later, then = measured_alike([off[worst], off[0]], task.model.states[names[0]])
-    sent = listed(name for name, odd in zip(task.model.input_names, at, strict=True) if odd)
-    if drift.max() > CAUSED * off[worst]:
-        return (
-            f"it ends with {sent} at a limit, and after it the runner sends "
-            f"{_told(task.model, held)}, which by the model lets it go: {what} {later} from its "
-            f"target {worst * task.dt:.2g} s later. Switch to a controller that "
-            "holds it as soon as `runner.done(t)` is true"
-        )
-    return (
-        f"it ends with {sent} at a limit and reaches its target for one sample only: the model "
-        f"predicts {what} {later} from it {worst * task.dt:.2g} s later, {then} at the end. Let "
-        "the target rest for longer (`grounded target --hold`), or lower [reward] terminal"
-    )
-
-
-def ended_at_rest(task: Task, run: Trial, held: Array) -> Trial:
-    """Return a run that ends where a predicted one does, but at rest and under the held input.
-
-    Args:
-        task: says which states are rates of positions.
-        run: the predicted run, with the planning model's states.
-        held: the input that is sent after it (m,).
-    """
-    from grounded.places import integrals
-
-    still = run.states.copy()
-    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
-    return replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
-
-
 @dataclass(frozen=True)
 class Drift:
     """What a robot did after its run: the warning, which states moved, and how far at most."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.result import listed
-from grounded.search.certainty import student
+from grounded.search.difference import student
 from grounded.search.returned.who_drove import LEAST
 from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start

@@ -1,0 +1,333 @@
+"""Difference: is one candidate better than another, by how much, and how sure is that?
+
+Every part that compares two utilities asks it: the verdicts and the end of the search, `status`,
+`propose`, the report and the page. Single runs scatter (`scatter`), and they begin at different
+start states, whose part of a difference the models tell (`starts`). Student's t-test with the
+scatter of all repeats of similar utility gives the probability. While nothing was repeated, costs
+are taken to scatter as chi-squared with eight degrees of freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+
+from grounded.findings import Finding, Quantity, found
+from grounded.search.candidate import PART, SURE, Candidate, Tried
+from grounded.search.scatter import Repeats, Scatter, beyond_noise
+
+LUCK = 2.0  # standard errors that a loss must exceed to break a promise
+SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
+MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
+CLEAR = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
+FEW = 8  # repeats below which a scatter may be off by half, so that their number is told
+
+
+class Doubt(StrEnum):
+    """What may explain that a candidate is ahead of another."""
+
+    NONE = ""
+    SCATTER = "scatter"  # that of repeats
+    STARTS = "starts"  # where the runs began
+    UNKNOWN = "unknown"  # nothing was repeated, so how much runs scatter is not known
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """The difference of the mean utilities of two candidates.
+
+    Args:
+        before: a candidate that was run.
+        after: another one.
+        history: all candidates with their trials, whose repeats tell the scatter.
+    """
+
+    before: Tried
+    after: Tried
+    history: Sequence[Tried]
+
+    @property
+    def gain(self) -> float:
+        """By how much the mean utility of `after` exceeds that of `before`, as measured."""
+        return self.after.utility - self.before.utility
+
+    @property
+    def own(self) -> float:
+        """The part of the gain that is not due to different start states."""
+        return self.gain - self.owed
+
+    @cached_property
+    def repeats(self) -> Repeats:
+        """All repeats in the history."""
+        return Repeats(self.history)
+
+    @cached_property
+    def scatter(self) -> Scatter:
+        """The scatter of runs of about the later one's utility."""
+        return self.repeats.near(self.after.utility)
+
+    @property
+    def few(self) -> int | None:
+        """On how few repeats the scatter rests; None if they are enough, or there are none."""
+        return few(self.scatter.repeats)
+
+    @property
+    def known(self) -> bool:
+        """Whether repeats tell the error."""
+        return self.freedom > 0
+
+    @property
+    def error(self) -> float:
+        """Standard error of the gain; NaN if it is not known."""
+        return self._spread[0]
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the error; 0 if it is not known."""
+        return self._spread[1]
+
+    @cached_property
+    def _spread(self) -> tuple[float, float]:
+        """Standard error and degrees of freedom; of different estimates as in Welch (1947).
+
+        If no repeats are near the earlier candidate, the scatter of the later one is used for both.
+        """
+        later = self.scatter
+        if not later.known:
+            return math.nan, 0.0
+        earlier = self.repeats.near(self.before.utility)
+        earlier = earlier if earlier.known else later
+        runs = len(self.before.utilities), len(self.after.utilities)
+        squares = earlier.error(runs[0]) ** 2, later.error(runs[1]) ** 2
+        error = math.sqrt(sum(squares))
+        if earlier == later or not error:
+            return error, later.freedom
+        parts = squares[0] ** 2 / earlier.freedom + squares[1] ** 2 / later.freedom
+        return error, error**4 / parts
+
+    @cached_property
+    def of_start(self) -> float:
+        """The model's part of the gain that is due to the start; 0 if alike, NaN if unknown.
+
+        It is the planning model's (`Starts`), which tells it of both; of the models that were
+        grounded on trials one may know only one of them. These tell it where that one can't.
+        """
+        before, after = self.before, self.after
+        grounded = self._of_grounded()
+        if after.starts is None or not before.trials:
+            return grounded
+        planned = after.starts.owed(after, before)
+        if not planned and grounded:  # NaN, too: they began apart
+            planned = after.starts.cost(before) - after.starts.cost(after)
+        return planned if math.isfinite(planned) else grounded
+
+    @property
+    def owed(self) -> float:
+        """How much of the gain is due to different start states; 0 if it is a small part."""
+        start = self.of_start
+        return start if abs(start) > PART * abs(self.gain) and math.isfinite(start) else 0.0
+
+    @property
+    def apart(self) -> bool:
+        """Whether they began apart, and no model tells what that is worth."""
+        return math.isnan(self.of_start)
+
+    @property
+    def probability(self) -> float:
+        """That the later one is better, start states apart; NaN if repeats or models can't tell."""
+        if not math.isfinite(self.before.utility):  # it failed
+            return 1.0
+        own = self.own
+        if not self.freedom or (self.error and self.apart):
+            return math.nan
+        return student(own / self.error, self.freedom) if self.error else float(own > 0)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the gain is one although no repeat tells how much runs scatter."""
+        if not math.isfinite(self.before.utility):  # it failed
+            return True
+        return self.before.utility < CLEAR * (self.after.utility - self.owed)
+
+    @property
+    def doubt(self) -> Doubt:
+        """What may explain the gain: none if it is one with probability SURE, or `clear`."""
+        sure = self.probability
+        if sure < SURE:
+            by_scatter = student(self.gain / self.error, self.freedom) if self.error else 0.0
+            return Doubt.STARTS if by_scatter >= SURE else Doubt.SCATTER
+        if math.isnan(sure) and not self.clear:
+            whole = self.before.utility < CLEAR * self.after.utility
+            return Doubt.STARTS if whole else Doubt.UNKNOWN
+        return Doubt.NONE
+
+    @property
+    def open(self) -> bool:
+        """Whether less than its error is left of the gain without the part of the start states."""
+        return not self.own > SHOWN * (self.error if self.freedom else 0.0)
+
+    @property
+    def lead(self) -> Finding:
+        """The share of the cost by which `after` is ahead, or what may explain that it is."""
+        after, before = self.after.candidate.id, self.before.candidate.id
+        if self.gain > 0 and (doubt := self.doubt):
+            return found("search.lead", after, doubt=doubt.value, before=before)
+        cost = abs(self.before.utility)
+        return found(
+            "search.better",
+            after,
+            before=before,
+            share=abs(self.gain) / cost,
+            better=int(self.gain > 0),
+            error=self.error / cost,
+            few=self.few if self.error else None,
+            start=abs(self.owed) / cost,
+        )
+
+    def to_finding(self) -> Finding:
+        """Return the gain with how certain it is. It asks for no run: that is decided elsewhere."""
+        told = self.known and not self.owed and not self.apart and self.error > 0
+        return found(
+            "search.gain",
+            self.after.candidate.id,
+            after=self.after.candidate.id,
+            before=self.before.candidate.id,
+            gain=Quantity(self.gain, "1", self.error),
+            probability=self.probability if told else None,
+            few=self.few if told else None,
+            start=self.owed or None,
+            own=self.own,
+            open=int(bool(self.owed) and self.open),
+            apart=int(self.apart and self.error > 0),
+            single=int(not self.known and not self.owed),
+            exact=int(self.known and self.error == 0 and not self.owed),
+        )
+
+    def _of_grounded(self) -> float:
+        before, after = self.before, self.after
+        if not (before.trials and after.trials and began_apart(before, after)):
+            return 0.0
+
+        def worth(one: Tried) -> float:
+            s_0 = one.candidate.predicted_states[0]
+            off = np.array([trial.began - s_0 for trial in one.trials])
+            if not beyond_noise(one.trials, off, s_0, one.candidate.predicted_states).any():
+                return 0.0
+            made = [c for t in self.history if (c := t.candidate).base == one.candidate.id]
+            known = [cost for c in made if math.isfinite(cost := cost_of_start(one, c))]
+            return known[-1] if known else math.nan
+
+        return worth(before) - worth(after)
+
+
+def last_gain(history: Sequence[Tried]) -> Difference | None:
+    """Return the last accepted improvement; None before there is one."""
+    accepted = [t for t in history if t.accepted]
+    return Difference(accepted[-2], accepted[-1], history) if len(accepted) > 1 else None
+
+
+def few(repeats: int) -> int | None:
+    """Return on how many repeats a scatter rests if it may be far off; else None."""
+    return repeats if 0 < repeats < FEW else None
+
+
+def one_trial_error(best: Tried, repeats: int = 1) -> float:
+    """Return the standard error of a new candidate's gain over the best; 0 if no noise is known."""
+    each = best.deviation
+    return each * math.sqrt(1 / repeats + 1 / len(best.utilities)) if each > 0 else 0.0
+
+
+def runs_to_show(gain: float, best: Tried) -> int | None:
+    """Return how many runs of a candidate and as many of the best show a gain, see `SHOWN`.
+
+    None if a single repeat tells the scatter: the number goes with its square. MANY + 1 for more.
+    """
+    if best.repeats == 1:
+        return None
+    return min(math.ceil(2 * (SHOWN * best.deviation / gain) ** 2), MANY + 1)
+
+
+def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
+    """Return that a trial can't show what a candidate promises; None if it can."""
+    own, least = best.candidate.id, SHOWN * one_trial_error(best, repeats)
+    gain = made.promised_over(best) if made.base == own else 0.0
+    if not 0 < gain < least:
+        return None
+    return found(
+        "plan.small",
+        made.id,
+        candidate=made.id,
+        best=own,
+        gain=gain,
+        least=least,
+        few=few(best.repeats),
+        runs=runs_to_show(gain, best),
+        stop=int(not made.doubtful and not best.is_unsteady),  # else `doubt` says it
+    )
+
+
+def planned_before(best: Tried, made: Candidate) -> bool:
+    """Return whether a candidate was planned before the latest run of its base, `best`."""
+    return bool(made.seen) and not {trial.id for trial in best.trials} <= {*made.seen}
+
+
+def cost_of_start(best: Tried, made: Candidate) -> float:
+    """Return what the starts of a candidate's runs cost on average, by the model; NaN if unknown.
+
+    Args:
+        best: the candidate.
+        made: one that was planned from its runs. The model that was grounded on those tells it; of
+            runs that came later the planning model does.
+    """
+    if planned_before(best, made):
+        return math.nan if best.starts is None else best.starts.cost(best)
+    return made.expected_of_base - made.base_as_run
+
+
+def missed_by_start(tried: Tried) -> float:
+    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
+
+    A part of what they missed its prediction by, which begins at [task] start. 0 if the model can't
+    tell it, too.
+    """
+    if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
+        return 0.0
+    cost = tried.starts.cost(tried)
+    small = abs(cost) < PART * abs(tried.promised - tried.utility)
+    return 0.0 if small or not math.isfinite(cost) else cost
+
+
+def began_apart(one: Tried, other: Tried) -> bool:
+    """Return whether the trials of two candidates began apart.
+
+    That is by more than the sensors' noise, and more than the scatter of where repeats begin, which
+    the scatter of their utilities includes.
+    """
+    first, second = (np.array([t.began for t in tried.trials]) for tried in (one, other))
+    s_0, apart = one.candidate.predicted_states[0], np.ones(first.shape[1], bool)
+    if (freedom := len(first) + len(second) - 2) > 0:
+        squares = sum(len(starts) * starts.var(axis=0) for starts in (first, second)) / freedom
+        error = np.sqrt(squares * (1 / len(first) + 1 / len(second)))
+        apart = np.abs(first.mean(axis=0) - second.mean(axis=0)) > LUCK * error
+    pairs = ((one, first - second.mean(axis=0)), (other, second - first.mean(axis=0)))
+    return all(
+        (apart & beyond_noise(tried.trials, off, s_0, tried.candidate.predicted_states)).any()
+        for tried, off in pairs
+    )
+
+
+def student(x: float, freedom: float) -> float:
+    """Return Student's t distribution, P(T <= x), to 1e-5, without the slow import of scipy.
+
+    T = sqrt(freedom) tan(a), and the density of the angle a goes with cos(a)^(freedom - 1).
+    """
+    angles = np.linspace(0.0, math.pi / 2, 20_001)
+    density = np.cos((angles[1:] + angles[:-1]) / 2) ** (freedom - 1.0)
+    within = np.append(0.0, np.cumsum(density)) / density.sum()
+    reached = np.interp(math.atan(abs(x) / math.sqrt(freedom)), angles, within)
+    return 0.5 + math.copysign(0.5, x) * float(reached)

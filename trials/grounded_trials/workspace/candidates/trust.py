@@ -1,0 +1,295 @@
+"""What a candidate promises, and how far its prediction can be trusted.
+
+Predictions of the model as it is now are compared with the runs that tested them. A prediction
+begins at [task] start; what it cost that runs began elsewhere is no error of it. Where no run has
+tested the model, the last diagnosis or the logs that it was fitted to stand in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.findings import Finding, Quantity, found
+from grounded.findings.finding import Fact
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.difference import missed_by_start
+from grounded.search.step.step_size import Step
+from grounded.task import Task
+from grounded_trials.workspace.off_target import reaches, weighed_groups
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.search.standing import Standing
+    from grounded_trials.workspace.folder import Folder
+    from grounded_trials.workspace.last_diagnosis import Since
+    from grounded_trials.workspace.placing import FromStarts
+
+LAST = 3  # recent predictions whose errors are told
+RIGHT = 0.5  # of a promised gain, which a prediction missed by at most and noise costs at least
+MUCH = 0.2  # share of a cost above which its part due to sensor noise is told
+PLACED = 0.02  # share of a predicted utility: where runs began is told if it changes more
+STATES = 3  # target states whose range is told; final values of models with 8 states at most
+ENDS = 8
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a predicted run goes in one state or input.
+
+    Args:
+        name: of the state or input.
+        unit: its unit.
+        low: least value.
+        high: greatest value.
+        limits: hard limits of an input that has them.
+        end: the last value, if the task has an aim at its end; else NaN.
+        aim: the target there; NaN for none.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    limits: tuple[float, float] | None = None
+    end: float = math.nan
+    aim: float = math.nan
+
+
+def extent_of(made: Candidate, task: Task) -> tuple[Extent, ...]:
+    """Return where a predicted run goes: its main states, then its inputs."""
+    model, rows = task.model, []
+    ends = (task.reward.terminal.any() or reaches(task)) and model.n <= ENDS
+    main = _main_states(task)
+    for i, (name, unit) in enumerate(model.states.items()):
+        if name in main:
+            values, aim = made.predicted_states[:, i], float(task.target[-1, i])
+            last = (float(values[-1]), aim) if ends else ()
+            rows.append(Extent(name, unit, values.min(), values.max(), None, *last))
+    for j, (name, unit) in enumerate(model.inputs.items()):
+        values, low, high = made.predicted_inputs[:, j], float(task.low[j]), float(task.high[j])
+        limits = (low, high) if high < math.inf else None
+        rows.append(Extent(name, unit, values.min(), values.max(), limits))
+    return tuple(rows)
+
+
+def _main_states(task: Task) -> set[str]:
+    """Return the states whose range is told: the position; else those in [safety] or a target."""
+    model, position = task.model, task.model.roles.get("position", ())
+    where = {position} if isinstance(position, str) else {*position}
+    if where & {*model.states}:
+        return where
+    assert task.safety_low is not None and task.safety_high is not None
+    bounded = np.isfinite(task.safety_low) | np.isfinite(task.safety_high)
+    guarded = {name for name, one in zip(model.state_names, bounded, strict=True) if one}
+    tracked = zip(model.state_names, (task.target == task.target).any(axis=0), strict=True)
+    wanted = [name for name, given in tracked if given and name not in guarded]
+    return {*guarded, *wanted[:STATES]}
+
+
+def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding:
+    """Return how a candidate was made."""
+    share = None
+    if made.way == "gentler gains":
+        base = next(t.candidate for t in history if t.candidate.id == made.base)
+        share = _gain(made) / _gain(base)
+    step = str(Step(made.damping, made.alpha)) if made.grounded else None
+    return found(
+        "plan.made",
+        made.id,
+        seconds=Quantity(task.horizon * task.dt, "s"),
+        base=made.base or None,
+        step=step,
+        iteration=made.iteration,
+        share=share,
+        own=int(made.way == "own plan"),
+        crashes=0 if made.base else round(made.caution),
+        corrected=int((made.grounded and bool(made.slopes)) or made.way == "slopes by step"),
+        original=int(made.of_original),
+        gentle=int(bool(made.base) and made.caution > 0 and share is None),
+    )
+
+
+def _gain(made: Candidate) -> float:
+    """Return the mean absolute feedback gain."""
+    gain = made.policy.gain
+    return 0.0 if gain is None else float(abs(gain).mean())
+
+
+def so_far(made: Candidate, best: Tried, missed: float) -> Finding:
+    """Return the best one's utility and, if it differs clearly, what the model gives it.
+
+    The gain of the candidate is counted from what the model gives the best one.
+
+    Args:
+        made: the candidate.
+        best: the best one so far.
+        missed: cost of the sensor noise in its log that its prediction lacks.
+    """
+    own = best.candidate.id
+    unlike = made.base == own and made.unlike(best.utility)
+    less = made.less_in_log(best, missed)
+    gain = made.predicted_gain if unlike else None
+    return found(
+        "plan.so_far",
+        own,
+        best=own,
+        candidate=made.id,
+        utility=best.utility,
+        noise=much_noise(best.noise_cost, best.utility),
+        model=made.expected_of_base if unlike else None,
+        gain=gain,
+    ).knowing({"log": less.facts["log"] if less else None})
+
+
+def much_noise(noise: float, utility: float) -> float | None:
+    """Return how much of a logged run's cost is due to sensor noise, if it is much."""
+    return min(noise, -utility) if noise > MUCH * -utility else None
+
+
+def predicted(made: Candidate, cost: float, whole: float, begun: FromStarts | None) -> Finding:
+    """Return the predicted utility, and what is to be expected of its log.
+
+    Args:
+        made: the candidate.
+        cost: of the sensor noise in its log that its prediction lacks.
+        whole: of all of the sensor noise in its log.
+        begun: what is predicted from where runs began so far.
+    """
+    promised = made.predicted_utility
+    in_log = promised - cost
+    moved = begun is not None and max(abs(begun.change), begun.std) > PLACED * abs(in_log)
+    return found(
+        "plan.predicted",
+        made.id,
+        utility=promised,
+        log=in_log if cost > 0 and f"{in_log:.4g}" != f"{promised:.4g}" else None,
+        noise=much_noise(whole, in_log),
+        usual=Quantity(in_log + begun.change, "1", begun.std) if begun and moved else None,
+        runs=begun.runs if begun and moved else None,
+    )
+
+
+def trust(
+    workspace: Folder,
+    made: Candidate,
+    now: Standing,
+    lacks: float,
+    replayed: float,
+    diagnosis: Diagnosis | None,
+    since: Since | None,
+) -> Finding:
+    """Return how far recent predictions were off, and whether the promised gain exceeds that.
+
+    Args:
+        workspace: the workspace with the model.
+        made: what to run next.
+        now: where the search stands.
+        lacks: cost of the sensor noise in its log that its prediction lacks.
+        replayed: cost of the noise that its prediction has, from the log that it replays.
+        diagnosis: the last one, which tells how well the model predicts if no run did.
+        since: what changed since then.
+    """
+    ran = [tried for tried in now.history if tried.utilities]
+    same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
+    if same:
+        return _tested(workspace, made, now, same, lacks, replayed)
+    logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
+    exact = not now.trials and not workspace.config.system.reachable
+    measured = _by_diagnosis(workspace.task, diagnosis, since)
+    untested = found("plan.untested", made.id, changed=int(bool(ran)), exact=int(exact))
+    return untested.knowing(measured or {"logs": logs})
+
+
+def _by_diagnosis(
+    task: Task, found_last: Diagnosis | None, since: Since | None
+) -> dict[str, Fact | None]:
+    """Return how far the model as it is now misses the first weighed states, by a diagnosis."""
+    if found_last is None or since is None or not found_last.prediction_error:
+        return {}
+    row, adopted = found_last.prediction_error[-1], bool(since.adopted) and not since.missing
+    if since.changed and not adopted:
+        return {}
+    errors = row.with_effects if adopted else row.crude
+    for names, what in weighed_groups(task):
+        miss = math.hypot(*(errors.get(name, math.nan) for name in names))
+        if math.isfinite(miss):
+            far = Quantity(miss, task.model.states[names[0]])
+            return {"what": what, "miss": far, "ahead": Quantity(row.horizon_s, "s")}
+    return {}
+
+
+def _tested(
+    workspace: Folder,
+    made: Candidate,
+    now: Standing,
+    same: list[Tried],
+    lacks: float,
+    replayed: float,
+) -> Finding:
+    """Return by how much the last predictions missed, and the gain that this one promises.
+
+    The gain is one of predictions, which may lack some of the sensor noise in a log (`lacks`), and
+    take the noise of a single log that they replay for what the robot does (`replayed`). Where the
+    model foretold its one run so far, and by itself finds nothing to gain, the promise may be no
+    more than the noise of that run.
+    """
+    last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
+    missed = [abs(one.promised - missed_by_start(one) - one.utility) for one in last]
+    whole = tuple(f"{off:.2g}" for off in missed if math.isfinite(off))
+    best, once = now.incumbent, len(missed) == 1
+    facts: dict[str, Fact | None] = {
+        "missed": whole,
+        "failed": len(missed) - len(whole),
+        "promised": last[-1].promised if once else None,
+        "real": last[-1].utility if once else None,
+    }
+    tried = {one.candidate.id for one in now.history}
+    if best is None or made.id in tried or not math.isfinite(missed[-1]):
+        return found("plan.tested", made.id).knowing(facts)
+    gain = made.promised_over(best)
+    if made.way == "gentler gains" or not gain > 0:  # no model swings, so none tells its gain
+        return found("plan.tested", made.id).knowing(facts)
+    noise = len(best.trials) == 1 and gain < replayed
+    if len(same) == 1 and not noise and missed[-1] < RIGHT * gain < lacks + replayed:
+        noise = -math.inf < _by_itself(workspace, made, best) <= 0
+    doubtful = gain < max(missed[-1], made.likely_off)
+    share = made.stake(best) if (doubtful or noise) and not made.doubtful else None
+    facts |= {"gain": gain, "less": int(doubtful), "noise": int(noise), "share": share}
+    return found("plan.tested", made.id, best=best.candidate.id).knowing(facts)
+
+
+def _by_itself(workspace: Folder, made: Candidate, best: Tried) -> float:
+    """Return a step's gain in the model without the bias of the best one's only run; else NaN."""
+    if len(best.trials) != 1 or made.base != best.candidate.id:
+        return math.nan
+    from grounded.rollout import simulate
+
+    both = (best.candidate.policy, made.policy)
+    planner = workspace.planner.feeding_back(both)
+    problem = planner.plan.problem(exact=True)
+    before, after = (simulate(problem, planner.widened(one)).utility for one in both)
+    return float(after - before)
+
+
+def samples(made: Candidate, now: Standing, task: Task) -> Finding | None:
+    """Return how old the samples are that a candidate is planned for."""
+    if not made.sample_age:
+        return None
+    from grounded.search.feedback.sample_age import different, run_ages
+
+    ages = run_ages(task, now.history)
+    apart = bool(ages) and different(task, min(ages), max(ages))
+    age = Quantity(abs(made.sample_age), "s")
+    return found(
+        "plan.samples",
+        made.id,
+        candidate=made.id,
+        age=age,
+        newer=int(made.sample_age < 0),
+        least=Quantity(min(ages), "s") if apart else None,
+        most=Quantity(max(ages), "s") if apart else None,
+    )
