@@ -70,7 +70,7 @@ def command(
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} has the extension {named}, but --format is {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
-    tell(done.findings, all_=True)
+    tell((*done.overridden, *done.findings), all_=True)
     if json_:
         show_json(done.to_json())
     else:

@@ -125,12 +125,12 @@ def test_a_trial_that_is_none_of_this_search_is_refused(change, said):
 def test_the_documents_have_the_commands_keys(search):
     now = search.standing.to_json()
     best = {"candidate": search.best.candidate.id, "utility": search.best.utility}
-    unknown = "how much runs scatter is not known, and may explain its lead"
-    best["lead_doubt"] = f"{unknown} on the model's own policy"
+    best["lead_doubt"] = search.standing.lead_doubt.sentence
+    assert search.standing.lead_doubt.facts["doubt"] == "unknown"
     assert now["best"] == best and now["trials"] == len(search.trials)
     assert len(now["history"]) == len(search.candidates)
     assert [row["verdict"] for row in now["history"]][:2] == ["first", "maybe better"]
-    assert now["certainty"].startswith("the last gain in utility is")
+    assert now["certainty"] and now["findings"][0]["code"] == "search.nothing_promised"
     ended = search.proposal.to_json()
     assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended
     first = propose(TASK, [], [], OPTIONS).to_json()

@@ -8,14 +8,8 @@ import pytest
 from scipy.stats import t, ttest_ind
 
 from grounded.search.candidate import Tried
-from grounded.search.certainty import (
-    beyond_one_trial,
-    chance,
-    error_between,
-    owed_to_start,
-    student,
-    with_chances,
-)
+from grounded.search.certainty import with_chances
+from grounded.search.difference import Difference, beyond_one_trial, student
 from grounded.trial import Trial
 
 
@@ -28,10 +22,10 @@ def tried(*utilities, accepted=True, base="c0001"):
 def test_the_probability_is_the_t_tests():
     a, b = (-5.0, -5.4, -4.9), (-4.2, -4.6, -4.5)
     history = [tried(*a), tried(*b)]
-    assert chance(*history, history) == pytest.approx(
+    assert Difference(*history, history).probability == pytest.approx(
         1 - ttest_ind(a, b, alternative="less").pvalue
     )
-    assert error_between(tried(*a), tried(*b), [tried(*a), tried(*b)])[1] == 4
+    assert Difference(*history, history).freedom == 4
 
 
 @pytest.mark.parametrize("freedom", [1.0, 1.7, 4.0, 30.5, 7500.0])
@@ -48,7 +42,7 @@ def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
 
 @pytest.mark.parametrize("deviation", [np.nan, 0.0])
 def test_nothing_is_below_a_noise_that_is_unknown_or_absent(deviation):
-    assert beyond_one_trial(*promising(0.05, deviation=deviation)) == ""
+    assert beyond_one_trial(*promising(0.05, deviation=deviation)) is None
 
 
 def test_more_repeats_of_each_candidate_show_smaller_gains():
@@ -58,14 +52,14 @@ def test_more_repeats_of_each_candidate_show_smaller_gains():
 
 def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
     failed = tried(-5.0, -np.inf)
-    assert error_between(tried(-5.0), tried(-4.0), [failed])[1] == 0
+    assert not Difference(tried(-5.0), tried(-4.0), [failed]).known
 
 
 def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
     first, a, b = tried(-9000.1, -9000.1, -9000.1, base=""), tried(-5.0), tried(-4.0)
-    assert chance(a, b, [first, a, b]) == 1.0
+    assert Difference(a, b, [first, a, b]).probability == 1.0
     noisy = tried(-9000.1, -9000.2, base="")
-    assert error_between(a, b, [noisy, a, b])[1] == 0
+    assert not Difference(a, b, [noisy, a, b]).known
 
 
 @pytest.mark.parametrize(
@@ -123,16 +117,16 @@ def test_what_a_start_is_worth_is_no_improvement():
 
     first = ran("c0001", "", -6.0, off=0.07)
     second = ran("c0002", "c0001", -3.9, off=0.0, as_run=-5.9)
-    assert owed_to_start(first, second, [first, second]) == pytest.approx(1.9)
+    assert Difference(first, second, [first, second]).owed == pytest.approx(1.9)
     costs = {"c0001": 0.5, "c0002": -0.2}
     planned = SimpleNamespace(owed=lambda *_: 0.0, cost=lambda one: costs[one.candidate.id])
     known = replace(second, starts=planned)  # which knows both, and a grounded model only one
-    assert owed_to_start(first, known, [first, known]) == pytest.approx(0.7)
+    assert Difference(first, known, [first, known]).owed == pytest.approx(0.7)
     here = ran("c0001", "", -6.0, off=0.0)
-    assert owed_to_start(here, second, [here, second]) == 0.0
+    assert Difference(here, second, [here, second]).owed == 0.0
     same = ran("c0002", "c0001", -3.9, off=0.07, as_run=-5.9)
-    assert owed_to_start(first, same, [first, same]) == 0.0  # both began 7 cm away
+    assert Difference(first, same, [first, same]).owed == 0.0  # both began 7 cm away
     away = ran("c0002", "c0001", -3.9, off=-0.07, as_run=-5.9)
-    assert owed_to_start(first, away, [first, away]) == 0.0  # nothing tells what -7 cm is worth
+    assert Difference(first, away, [first, away]).owed == 0.0  # nothing tells what -7 cm is worth
     little = ran("c0002", "c0001", -3.9, off=0.0, as_run=-4.1)
-    assert owed_to_start(first, little, [first, little]) == 0.0
+    assert Difference(first, little, [first, little]).owed == 0.0

@@ -19,7 +19,7 @@ def made():
 
 
 def test_nothing_speaks_against_a_sound_candidate(made):
-    assert objections(cart_task(), made) == []
+    assert not objections(cart_task(), made)
 
 
 @pytest.mark.parametrize("part", ["feedforward", "gain", "reference"])
@@ -48,7 +48,7 @@ def test_a_search_that_stops_for_a_gain_does_not_speak_of_safety(monkeypatch):
     monkeypatch.setattr("grounded.search.safety.MAX_GAIN", 1e-3)
     found = propose(cart_task(), [], [], SearchOptions())
     assert found.standing.ending == "gains too large" and found.candidate is None
-    assert "safety" not in " ".join(found.notes)
+    assert [one.code for one in found.findings] == ["plan.gain"]
 
 
 def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
@@ -56,15 +56,15 @@ def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
     task = cart_task(safety_low=low, safety_high=high)
     proposal = propose(task, [], [], SearchOptions())
     assert proposal.candidate is None and proposal.standing.phase == "stopped"
-    (note,) = proposal.notes
-    assert note == proposal.standing.sentence
+    assert proposal.findings == proposal.standing.findings
+    assert [one.code for one in proposal.findings] == ["plan.outside_safety"]
 
 
 def test_a_bound_that_is_just_kept_is_no_objection(made):
     top = float(made.predicted_states[:, 0].max())
     low = np.full(2, -np.inf)
     kept = cart_task(safety_low=low, safety_high=np.array([top, np.inf]))
-    assert objections(kept, made) == []
+    assert not objections(kept, made)
     crossed = cart_task(safety_low=low, safety_high=np.array([np.nextafter(top, 0), np.inf]))
     assert len(objections(crossed, made)) == 1
 
@@ -96,17 +96,17 @@ def test_the_run_that_most_of_the_spread_comes_from_is_named(made):
 
     def told(candidate, *trials) -> str:
         tried = Tried(candidate, trials, (-1.0,) * len(trials), True)
-        return objections(task, made, spread(task, [tried], made.model))[0]
+        return objections(task, made, spread(task, [tried], made.model))[0].facts["trial"]
 
     step = replace(made, base="c0001", way="")
-    assert "t0005" in told(step, ran(1.4, "t0005"))
+    assert told(step, ran(1.4, "t0005")) == "t0005"
     repeated = ran(0.0, "t0001"), ran(3.0, "t0002"), ran(0.0, "t0003")
     first = replace(made, base="")
-    assert "t0002" in told(first, *repeated)
-    assert "t000" not in told(first, *repeated[:2])  # either may be the one that was disturbed
+    assert told(first, *repeated) == "t0002"
+    assert not told(first, *repeated[:2])  # either may be the one that was disturbed
     far = replace(made, predicted_states=made.predicted_states + 2.0)  # the plan itself leaves
     tried = Tried(step, (ran(1.4, "t0005"),), (-1.0,), True)
-    assert "t0005" not in objections(task, far, spread(task, [tried], made.model))[0]
+    assert "trial" not in objections(task, far, spread(task, [tried], made.model))[0].facts
 
 
 def test_who_coasts_out_of_safety_after_a_run_is_found(made):
@@ -121,7 +121,7 @@ def test_who_coasts_out_of_safety_after_a_run_is_found(made):
     assert run.inputs[-1] != 0 and moved[2, 1] != pushed[2, 1]  # commands under way still arrive
     bound = np.array([moved[10, 0], np.inf])
     tight = cart_task(safety_low=-np.full(2, np.inf), safety_high=bound)
-    assert coasts_out(tight, task, run, np.zeros(1)) != ""
+    assert coasts_out(tight, task, run, np.zeros(1)) is not None
     wide = cart_task(safety_low=-np.full(2, np.inf), safety_high=np.array([99.0, np.inf]))
-    assert coasts_out(wide, task, run, np.zeros(1)) == ""
-    assert coasts_out(cart_task(), task, run, np.zeros(1)) == ""
+    assert coasts_out(wide, task, run, np.zeros(1)) is None
+    assert coasts_out(cart_task(), task, run, np.zeros(1)) is None

@@ -9,7 +9,8 @@ from scipy.stats import t
 from grounded.frozen import resampled_noise, white_noise
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
-from grounded.search.certainty import error_between, in_doubt
+from grounded.search.certainty import in_doubt
+from grounded.search.difference import Difference
 from grounded.search.improve import propose
 from grounded.search.scatter import (
     PIECES,
@@ -67,7 +68,8 @@ def test_one_number_serves_the_table_the_gain_and_the_doubt():
     rng = np.random.default_rng(3)
     first, best = runs(rng.normal(size=(2, PIECES)), 12.0), runs(rng.normal(size=(2, PIECES)))
     history = with_errors([first, best])
-    error, freedom = error_between(*history, history)
+    between = Difference(*history, history)
+    error, freedom = between.error, between.freedom
     each = Repeats(history).near(best.utility)
     assert freedom == each.freedom
     assert [t.standard_error for t in history] == [pytest.approx(each.error(2))] * 2

@@ -46,7 +46,7 @@ def sled(tmp_path):
 
 def assumed(w):
     """Notes on what the plan assumes before its start."""
-    return [n for n in Workspace(w.folder).propose().proposal.notes if "start = " in n]
+    return [n for n in Workspace(w.folder).propose().notes if "start = " in n]
 
 
 def driver(folder):
@@ -79,7 +79,7 @@ def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(sled, tmp_path
 def test_the_first_plan_says_what_the_task_leaves_open(sled):
     sled.target({"x": np.linspace(0, 1, 41)})
     edit(sled.folder, horizon="30")
-    notes = sled.propose().proposal.notes
+    notes = sled.propose().notes
     assert [("force" in one, "41 rows" in one) for one in notes[-2:]] == [(1, 0), (0, 1)]
 
 
@@ -127,7 +127,7 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     w.target({"h": np.linspace(0.2, 0.6, 101)})
     proposed = Workspace(w.folder).propose()
     assert proposed.standing.ending == "not allowed" and proposed.then.verb == "propose"
-    assert any("fan = 2700, pwm = 48.21" in note for note in proposed.proposal.notes)
+    assert any("fan = 2700, pwm = 48.21" in note for note in proposed.notes)
     edit(w.folder, start="{ h = 0.2, fan = 2700, pwm = 48.21 }")
     assert Workspace(w.folder).propose().candidate is not None
     heavier = '{name = "offset:v", c = -0.981}'  # a tenth more to carry

@@ -14,6 +14,8 @@ from facts import holds
 from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import found
+from grounded.search.standing import Ending, ended
 from grounded_cli.main import COMMANDS, cli
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
@@ -84,14 +86,22 @@ def taken_in(*numbers: int) -> dict:
     return {"trials": [f"t{k:04d}" for k in numbers], "adopted": [], "params": {}}
 
 
-def standings_with(monkeypatch, **changes) -> None:
-    """Every standing of a search has these fields."""
+ASK = found("search.lost_in_row", then=DIAGNOSE, lost=2)
+
+
+def asking(now):
+    """The standing, which asks for a diagnosis."""
+    return now.with_finding(ASK)
+
+
+def standings_asking(monkeypatch) -> None:
+    """Every standing of a search asks for a diagnosis."""
     from grounded.search import improve, standing
 
     plainly = standing.standing
     for module in (improve, standing):
         monkeypatch.setattr(
-            module, "standing", lambda *given, **more: replace(plainly(*given, **more), **changes)
+            module, "standing", lambda *given, **more: asking(plainly(*given, **more))
         )
 
 
@@ -245,7 +255,7 @@ def test_after_a_crash_what_was_diagnosed_is_adopted_before_another_policy_runs(
 def test_a_search_that_doubts_its_model_is_diagnosed_after_two_runs(tmp_path, monkeypatch):
     w = Workspace(make(tmp_path / "w").folder)
     w.learn(1)
-    standings_with(monkeypatch, doubt="lost", then=DIAGNOSE)
+    standings_asking(monkeypatch)
     assert w.status().then.verb == "propose"  # one run confirms nothing
     w.ingest(w.run(w.propose().candidate.id).trial_file)
     assert w.status().then.verb == "diagnose"
@@ -333,9 +343,7 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
     from grounded_trials.workspace.candidates import search_state as module
 
     plainly = module.standing
-    monkeypatch.setattr(
-        module, "standing", lambda *given, **more: replace(plainly(*given, **more), then=DIAGNOSE)
-    )
+    monkeypatch.setattr(module, "standing", lambda *given, **more: asking(plainly(*given, **more)))
     (w.reports / "diagnosis.json").unlink()
     assert w.status().then == DIAGNOSE
     usable = [trial.id for trial in diagnosable(w)]
@@ -348,9 +356,8 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
 def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, runs, then):
     now = w.status().standing
     best = replace(now.incumbent, trials=now.incumbent.trials[:1] * runs)
-    asked = " or diagnose the model"
-    kept = {"ending": "too doubtful", "incumbent": best, "then": DIAGNOSE}
-    doubtful = replace(now, phase="stopped", sentence=f"no trial{asked}", missed=asked, **kept)
+    why = found("search.too_doubtful", best="c0002", gain=1.0)
+    doubtful = ended(replace(now, incumbent=best), Ending.DOUBTFUL, why, ASK)
     monkeypatch.setattr(
         "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: doubtful
     )
@@ -364,9 +371,9 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
 
 @pytest.mark.parametrize("left", [{"look_for": 5}, {"again": True}, {}])
 def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(w, monkeypatch, left):
-    ended = replace(w.status().standing, phase="converged", ending="nothing promised")
+    over = ended(w.status().standing, Ending.NOTHING_PROMISED)
     monkeypatch.setattr(
-        "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: ended
+        "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: over
     )
     seen = taken_in(*range(1, len(w.trials()) + 1))
     diagnosed(w.folder, diagnosed=seen, verdict=one_effect("viscous_friction:v")["verdict"] | left)
@@ -543,8 +550,8 @@ def test_a_candidate_is_void_once_another_model_plans_though_a_probe_was_made_si
     w.adopt("viscous_friction:v")
     done = w.propose()
     assert done.candidate.id == "c0004"
-    assert any(holds(note, "c0002", "void") for note in done.proposal.notes)
-    assert not any("void" in note for note in w.propose().proposal.notes)  # it is said once
+    assert any(holds(note, "c0002", "void") for note in done.notes)
+    assert not any("void" in note for note in w.propose().notes)  # it is said once
 
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(w):

@@ -34,9 +34,9 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "the gain of {input} on {state} reaches {gain} in {candidate}, at t = {at}, more than "
         "{most:g}[[; the plan moves {state} by {moved}]]",
-        "[[weigh {state} less in [reward] (now {state_weight:g}), or ]][[!state_weight? check the unit of "
-        "{state} and what it drives in the model, or ]]raise [reward] input_change of {input} (now "
-        "{change:g})",
+        "[[weigh {state} less in [reward] (now {state_weight:g}), or ]][[!state_weight? check the "
+        "unit of {state} and what it drives in the model, or ]]raise [reward] input_change of "
+        "{input} (now {change:g})",
     ),
     # what it is, what it promises, how far to trust it
     "made": Entry(
@@ -145,8 +145,8 @@ ENTRIES: dict[str, Entry] = {
     "limits_of_log": Entry(
         "note",
         "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]"
-        "[[; those of {beyond} reach more than {times:g} times as far as was ever sent: check their "
-        "unit]]",
+        "[[; those of {beyond} reach more than {times:g} times as far as was ever sent: check "
+        "their unit]]",
         "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
         "(`target`): target.csv is the run in that log]]",
     ),
@@ -179,8 +179,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "outweighed": Entry(
         "note",
-        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:g} times the "
-        "weight on it",
+        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:g} times "
+        "the weight on it",
         "[[helps? weigh it so in [reward] state ({weights}) if that matters more than the other "
         "states]][[!helps? check its weight in [reward] state, and whether the model and [limits] "
         "allow the target]]",
@@ -194,7 +194,8 @@ ENTRIES: dict[str, Entry] = {
     "unguarded": Entry(
         "note",
         "{about} {about:leaves/leave} [safety], and [[unweighed? [reward] has no weight for "
-        "{about:its/their} target]][[!unweighed? nothing in [reward] keeps {about:it/them} inside]]",
+        "{about:its/their} target]][[!unweighed? nothing in [reward] keeps {about:it/them} "
+        "inside]]",
         "[[unweighed? add one in [reward] state]][[!unweighed? draw the target with a column for "
         "{about:it/each of them}]][[ (`{command}`)]]",
     ),

@@ -112,7 +112,7 @@ def test_only_stronger_feedback_is_a_risk(told):
     history = told.ran((-1.0, -9.0), (0.3, -20.0))
     found = quiet_gains(told.task, history)
     loud, gentle = (tried.candidate for tried in history)
-    assert found.risk(gentle) == ""
+    assert found.risk(gentle) is None
     policy = replace(loud.policy, gain=1.5 * loud.policy.gain)
     assert found.risk(loud) and found.risk(replace(loud, id="c0003", policy=policy))
     assert quiet_gains(told.task, history, "another model") is None

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded.findings import Finding
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
 from grounded_trials.workspace.candidates import rest_at_end
 from grounded_trials.workspace.candidates.at_rest import rest_value
-from grounded_trials.workspace.candidates.first_plan import in_another_unit
+from grounded_trials.workspace.candidates.first_plan import Plan, in_another_unit
 from grounded_trials.workspace.folder import Folder
 from workspaces import blank, edit, make
 
@@ -56,9 +57,9 @@ model = Model({{"x": "m", "y": "m", "psi": "rad", "v": "m/s"}}, {{"steer": "rad"
 """
 
 
-def told(w, words: str) -> list[str]:
-    """The notes of a proposal that have these words."""
-    return [note for note in Workspace(w.folder).propose().proposal.notes if words in note]
+def told(w, code: str) -> list[Finding]:
+    """The findings of a proposal with this code."""
+    return [one for one in Workspace(w.folder).propose().findings if one.code == code]
 
 
 def reward_of(w) -> dict:
@@ -80,15 +81,15 @@ def lifted(tmp_path):
 def test_what_holds_the_start_is_offered_for_the_model_as_it_is(lifted):
     def start(effects: str, given: str) -> str:
         edit(lifted.folder, effects=effects, start=f"{{ {given} }}")
-        return " ".join(told(lifted, "start = ")).partition("start = ")[2]
+        return "".join(str(one.facts["start"]) for one in told(lifted, "plan.not_at_rest"))
 
     fading = '{name = "input_fade:thrust", k = 0.001}'  # which never rests
     dead = '{name = "dead_zone:thrust", c = 0.2}'
     given = "h = 1, thrust = 0.4905, turn = 0"
-    assert start(fading, "h = 1") == f"{{ {given} }}"
-    assert start(dead, "h = 1") == "{ h = 1, thrust = 0.6905, turn = 0 }"
+    assert start(fading, "h = 1") == given
+    assert start(dead, "h = 1") == "h = 1, thrust = 0.6905, turn = 0"
     assert start("", given) == ""
-    assert start(dead, given) == "{ h = 1, thrust = 0.6905, turn = 0 }"
+    assert start(dead, given) == "h = 1, thrust = 0.6905, turn = 0"
     assert start(dead, given) == ""  # once
 
 
@@ -154,7 +155,7 @@ def test_a_position_that_a_target_leaves_free_is_named_with_the_target_that_hold
     drawn(plane, "line", "--to", "x=2")
     proposed = Workspace(plane.folder).propose()
     assert proposed.candidate is None and proposed.standing.ending == "not allowed"
-    (command,) = re.findall("`grounded (.*)`", " ".join(proposed.proposal.notes))
+    (command,) = re.findall("`grounded (.*)`", " ".join(proposed.notes))
     assert command.endswith("target line --to x=2 --to z=1")
     assert grounded(*command.split()).code == 0
     assert Workspace(plane.folder).propose().candidate is not None
@@ -190,7 +191,7 @@ def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(t
     for given, weight in (("", 0.01), ("[-20, 20]", 2.5e-5), ("[-2, 2]", 0.0025)):
         if given:
             edit(w.folder, limits=f"force = {given}")
-            assert told(w, "input_change")  # which is still of the other limits
+            assert told(w, "plan.of_other_limits")  # which is still of the other limits
             drawn(w, "step", "--to", "x=1", "--seconds", "2")
         assert reward_of(w)["input_change"]["force"] == pytest.approx(weight, rel=1e-3)
     edit(w.folder, input_change="{ force = 1 }", limits="force = [-20, 20]")
@@ -203,7 +204,7 @@ def test_a_target_that_turns_tighter_than_the_model_can_is_told(tmp_path, size, 
     limits = "steer = [-0.36, 0.36]\nspeed = [0, 3]"
     w = blank(tmp_path / "w", STEERED, dt=0.05, limits=limits)
     drawn(w, "figure-8", "--size", size, "--speed", "1.5")
-    assert bool(told(w, "tighter than the model")) == tight
+    assert bool(told(w, "plan.at_limits")) == tight
 
 
 @pytest.fixture
@@ -254,7 +255,7 @@ def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(ball):
     drawn(ball, *line)
     new = (ball.folder / "target.csv").read_text().splitlines()
     assert len(new) == len(old) + 50 and new[0] == "t,x,v,th,w"
-    assert not told(ball, "leaves [safety]")
+    assert not told(ball, "plan.coasts_out")
 
 
 def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_path):
@@ -266,16 +267,16 @@ def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_p
     w = Workspace(tmp_path / "w")
     w.ingest(tmp_path / "r.csv", data=True)
 
-    def found(start: str = "", safety: str = "") -> list[str]:
+    def found(start: str = "", safety: str = "") -> list[Finding]:
         edit(w.folder, start=f"{{ {start} }}", safety=safety)
-        return in_another_unit(Folder(w.folder))
+        return [*in_another_unit(Plan(Folder(w.folder), None, None))]
 
     assert not found() and not found("th = 0.3", "x = [-3, 3]\nth = [-6, 6]")
     assert not found("", "x = [-1e6, 1e6]")  # as good as none, in mm too
     (note,) = found("th = 20")
-    assert "0.017453293" in note
+    assert note.facts["factor"] == pytest.approx(np.pi / 180)
     (note,) = found("", "x = [-1500, 1500]")
-    assert "0.001" in note and note in Workspace(w.folder).propose().proposal.notes
+    assert note.facts["factor"] == 0.001 and told(w, "plan.another_unit")
     columns = np.genfromtxt(w.folder / "target.csv", delimiter=",", names=True)
     columns["th"] *= 57.3
     names = columns.dtype.names

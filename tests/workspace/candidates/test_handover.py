@@ -82,30 +82,30 @@ def refused(w, tmp_path, *parts, **how):
 
 
 def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
-    assert w.propose().proposal.notes == ()
+    assert w.propose().notes == ()
     ran, exported = w.run("c0001"), w.export("c0001", tmp_path / "c.json")
     assert ran.notes == ran.overridden == exported.notes == exported.overridden == ()
 
 
 def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     configure(w, CONFIG.replace(LIMITS, NARROW))
-    refused(w, tmp_path, "c0001", "[-5, 5]", "[limits] force = [-0.5, 0.5]", "--anyway")
+    refused(w, tmp_path, "c0001", "force = -5", "[limits] force = [-0.5, 0.5]", "--anyway")
     with pytest.raises(GroundedError) as caught:
         w.run()
     assert caught.value.then == NextCommand("propose")
     made = w.propose()
     assert made.candidate.id == "c0002" and made.proposal.is_new
-    note, held = made.proposal.notes
+    note, held = made.notes
     assert holds(note, "c0001", "void", "c0002")
     assert holds(held, "force", "[limits]")  # half a newton does not reach the target
     assert w.run().candidate == "c0002"
-    assert w.propose().proposal.notes == ()  # said once
+    assert w.propose().notes == ()  # said once
 
 
 def test_another_target_makes_it_void_too(w, tmp_path):
     configure(w, CONFIG.replace("x = 10.0", "x = 11.0"))
     refused(w, tmp_path, "c0001", "task")  # though the limits hold
-    (note,) = w.propose().proposal.notes
+    (note,) = w.propose().notes
     assert holds(note, "c0001", "void", "c0002")
     assert w.export("c0001", tmp_path / "c.json", anyway=True).overridden
 
@@ -119,7 +119,7 @@ def test_safety_holds_for_the_run_as_the_model_of_today_predicts_it(ran):
     configure(ran, CONFIG + SAFETY.format(high=real + 1e-6), model=heavier)
     assert ran.run("best").notes
     configure(ran, CONFIG + SAFETY.format(high=(real + stored) / 2))
-    with pytest.raises(GroundedError, match=holding("[safety] x", f"{real:.3f}")):
+    with pytest.raises(GroundedError, match=holding("[safety] x", f"{real:.2f}")):
         ran.run("best")
 
 
@@ -127,7 +127,7 @@ def test_a_best_of_an_earlier_task_is_exported_only_inside_the_limits(ran, tmp_p
     configure(ran, CONFIG.replace(LIMITS, "force = [-9.0, 9.0]"))
     ran.export("c0001", tmp_path / "c.json")
     configure(ran, CONFIG.replace(LIMITS, NARROW))
-    with pytest.raises(GroundedError, match="wider than"):
+    with pytest.raises(GroundedError, match=holding("[limits]", "force")):
         ran.export("c0001", tmp_path / "d.json")
     assert (tmp_path / "c.json").exists() and not (tmp_path / "d.json").exists()
 
@@ -139,7 +139,7 @@ def test_safety_that_was_narrowed_replaces_it_or_ends_the_search(w, tmp_path):
         w.run()
     made = w.propose()
     assert made.candidate is None and made.standing.ending == "not allowed"
-    assert any(holds(note, "c0001", "void") for note in made.proposal.notes)
+    assert any(holds(note, "c0001", "void") for note in made.notes)
     configure(w, CONFIG)
     assert w.propose().candidate.id == "c0001"
 
@@ -157,7 +157,7 @@ def test_a_step_that_safety_forbids_now_gives_way_to_another(ran):
     most = float(second.predicted_states[:, 0].max())
     configure(ran, CONFIG + SAFETY.format(high=most - 1e-3))
     made = ran.propose()
-    assert any(holds(note, "c0002", "void") for note in made.proposal.notes)
+    assert any(holds(note, "c0002", "void") for note in made.notes)
     assert made.candidate.id == "c0003"
     assert made.candidate.predicted_states[:, 0].max() < most - 1e-3
     assert ran.run().candidate == "c0003"
@@ -182,7 +182,7 @@ def test_a_model_that_was_changed_makes_an_unrun_candidate_void(w, tmp_path):
     configure(w, model=MODEL.replace("Param(1.0", "Param(1.2"))
     refused(w, tmp_path, "c0001", "model")
     made = w.propose()
-    (note,) = made.proposal.notes
+    (note,) = made.notes
     assert made.candidate.id == "c0002" and holds(note, "c0001", "void", "model")
 
 
@@ -252,19 +252,10 @@ def test_metadata_that_was_rewritten_is_found(w, key):
     assert len(w.verify().damaged) == 1
 
 
-def test_a_file_of_an_older_version_is_handed_over_with_a_note(w):
-    forget_hand_outs(w)
-    path = w.candidate_path("c0001")
-    path.write_bytes(with_metadata(path.read_bytes(), "sha256", None))
-    (note,) = w.propose().proposal.notes
-    assert holds(note, "c0001", "checksum")
-    assert w.run().notes == (note,) and w.verify().damaged == ()
-
-
 def test_another_robots_candidate_is_refused_even_anyway(w, tmp_path):
     other = MODEL.replace("s.v", "s.w").replace('"v"', '"w"')
     configure(w, model=other, real=other)
-    refused(w, tmp_path, "another robot", "x, v", "x, w", anyway=True)
+    refused(w, tmp_path, "robot", "x and v", "x and w", anyway=True)
 
 
 def test_other_units_and_another_dt_are_refused(w, tmp_path):
@@ -273,7 +264,7 @@ def test_other_units_and_another_dt_are_refused(w, tmp_path):
     configure(w, CONFIG.replace("dt = 0.05", "dt = 0.1"), model=MODEL)
     rows = [f"{0.1 * i:.1f},0.5" for i in range(41)]
     (w.folder / "target.csv").write_text("t,x\n" + "\n".join(rows) + "\n")
-    refused(w, tmp_path, "0.05 s", "dt", "0.1 s")
+    refused(w, tmp_path, "dt", "0.100 s")
 
 
 def test_anyway_says_what_it_overrides_before_the_robot_moves(w, tmp_path):
@@ -305,7 +296,7 @@ def test_an_open_loop_policy_must_send_and_hold_what_is_allowed(w):
     sent = np.zeros((40, 1))
     assert not list(outside_limits(w.task, replace(policy, feedforward=sent)))
     (found,) = outside_limits(w.task, replace(policy, feedforward=sent, past=np.array([-6.0])))
-    assert holds(found, "force", "-6", "[-5, 5]")
+    assert found.about == ("force",) and found.facts["value"] == "-6"
     sent[7] = 5.1
     (found,) = outside_limits(w.task, replace(policy, feedforward=sent))
-    assert holds(found, "force", "5.1", "[-5, 5]")
+    assert found.about == ("force",) and found.facts["value"] == "5.1"

@@ -1,17 +1,16 @@
 """The end of a search is planned once, not by every command."""
 
-from dataclasses import replace
-
 import pytest
 
 from cli import grounded
 from grounded.errors import NextCommand
+from grounded.findings import found
 from grounded.search import improve
-from grounded.search.standing import Proposal, standing
+from grounded.search.standing import Ending, Proposal, ended, standing
 from grounded_trials import Workspace
 from workspaces import make
 
-ENDED = {"phase": "stopped", "ending": "too doubtful", "sentence": "no; ask", "missed": "; ask"}
+ASK = found("search.diagnose", then=NextCommand("diagnose"))
 
 
 @pytest.fixture
@@ -29,8 +28,7 @@ def planned(monkeypatch):
     def propose(task, candidates, trials, options, *, identity, planner):
         calls.append(identity)
         now = standing(task, candidates, trials, options, planner.fingerprint)
-        ended = replace(now, step=None, then=NextCommand("diagnose"), **ENDED)
-        return Proposal(ended, None, is_new=False)
+        return Proposal(ended(now, Ending.DOUBTFUL, ASK), None, is_new=False)
 
     monkeypatch.setattr(improve, "propose", propose)
     return calls
@@ -40,9 +38,9 @@ def test_an_end_is_planned_once_for_all_commands(w, planned):
     before = sorted(path.name for path in w.folder.rglob("*"))
     first, second, third = w.status(), w.status(), Workspace(w.folder).propose()
     assert planned == ["c0002"] and third.candidate is None
-    for found in (second.standing, third.standing):
-        assert found.to_json() == first.standing.to_json()
-        assert (found.then, found.missed) == (NextCommand("diagnose"), "; ask")
+    for now in (second.standing, third.standing):
+        assert now.to_json() == first.standing.to_json()
+        assert now.findings == (ASK,)
     assert sorted(path.name for path in w.folder.rglob("*")) == before
 
 

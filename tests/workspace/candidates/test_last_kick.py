@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from grounded.trial import Trial
+from grounded_trials.workspace.candidates.last_command import kicked
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.after_run import kicked, moved_on
+from grounded_trials.workspace.intake.remarks.after_run import moved_on
 from small_tasks import rover_task
 from workspaces import CONFIG, MODEL, make
 
@@ -33,7 +34,7 @@ def test_a_kick_or_a_hold_at_the_end_of_a_plan_is_told(tmp_path, model, last, mo
     inputs[:] = last if model == RESTS else 0.0
     inputs[-3:] = last
     told = kicked(planner, Trial(states, inputs, task.dt, ("x", "v"), ("force",)), np.zeros(1))
-    assert bool(told) == bool(fact) and (fact or "") in (told or "")
+    assert bool(told) == bool(fact) and (fact or "") in (told.sentence if told else "")
 
 
 @pytest.mark.parametrize(("turned", "noise"), [(0.0, 0.0), (0.008, 0.0), (0.0, 0.003)])

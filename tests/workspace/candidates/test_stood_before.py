@@ -51,7 +51,7 @@ def stored(w: Workspace, trial: Trial, tmp_path) -> Workspace:
 
 
 def offered(w: Workspace) -> str:
-    notes = Workspace(w.folder).propose().proposal.notes
+    notes = Workspace(w.folder).propose().notes
     return " ".join(note for note in notes if "start = " in note)
 
 

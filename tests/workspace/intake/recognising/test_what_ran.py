@@ -322,7 +322,7 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
     new = w.propose()
     assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
     for proposed, told in ((again, True), (new, False)):  # once
-        notes = proposed.proposal.notes
+        notes = proposed.notes
         assert any("c0002" in note and "set aside" in note for note in notes) == told
 
 
@@ -338,7 +338,7 @@ def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_disca
     w.discard(short)
     again = w.propose()
     assert (again.candidate.id, again.proposal.is_new) == ("c0002", False)
-    for notes in (again.proposal.notes, w.status().notes):
+    for notes in (again.notes, w.status().notes):
         assert any(holds(note, "c0003", short, "void", "--candidate c0003") for note in notes)
     assert w.propose().candidate.id == "c0002"
     assert any(short in note for note in w.export("c0003", tmp_path / "c.npz").notes)

@@ -98,7 +98,7 @@ def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path
     w = Workspace(make(tmp_path / "w", config=seen).folder)
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
     w.ingest(tmp_path / "d.mcap", data=True)
-    (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
+    (note,) = (one for one in w.propose().notes if "seen_in" in one)
     assert holds(note, "57.4 times", "(0.0204 N)", "unit") is far
     assert ("only the range used in a.csv" in note) is not far
 
@@ -111,7 +111,7 @@ def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
     limits = f'force = [-{limit}, {limit}]\nseen_in = "a.csv"'
     config = CONFIG.replace("force = [-5.0, 5.0]", limits)
     w = Workspace(make(tmp_path / "w", config=config).folder)
-    (note,) = (one for one in w.propose().proposal.notes if "seen_in" in one)
+    (note,) = (one for one in w.propose().notes if "seen_in" in one)
     assert ("force is at them for" in note and "of this plan" in note) is bound
     done = grounded("-C", w.folder, "target", "line", "--to", "x=1")
     said = " ".join(done.err.split())
@@ -132,7 +132,7 @@ def test_a_side_without_a_limit_has_no_beyond(w):
 def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
     """It sent 1.17 m/s for 8 s, reached 2.2 of 3 m, and had no note."""
     config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
-    notes = Workspace(make(tmp_path / "w", config=config).folder).propose().proposal.notes
+    notes = Workspace(make(tmp_path / "w", config=config).folder).propose().notes
     told = [one for one in notes if "at its limit" in one]
     assert len(told) == said
     assert all(holds(one, "force", "0.3 N", "x", "[limits]") for one in told)

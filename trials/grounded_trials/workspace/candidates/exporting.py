@@ -10,7 +10,7 @@ from typing import Any
 
 from grounded import onboard
 from grounded.errors import GroundedError, nearest
-from grounded.findings import Finding, settle
+from grounded.findings import Finding
 from grounded.result import Result
 from grounded.search.standing import Ending, Phase, Standing
 from grounded_trials.store.store import write_atomically
@@ -43,9 +43,15 @@ class Exported(Result):
     file: Path
     format: str
     runner: Path | None = None  # the program that runs it, if requested
-    findings: tuple[Finding, ...] = ()  # on the candidate, and what it would be refused for
+    findings: tuple[Finding, ...] = ()  # on the candidate
+    overridden: tuple[Finding, ...] = ()  # reasons against it, overridden by `anyway`
     named: tuple[str, ...] = ()  # options of `ingest` for its log if another one is outstanding
     ended: bool = False  # whether it is the best candidate of a search that has ended
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
 
     def summary(self) -> str:
         """Return the candidate and its file."""
@@ -99,7 +105,7 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     ended = _has_ended(workspace, identity, handed.check.standing)
-    return Exported(identity, path, form, program, settle(handed.findings), how, ended)
+    return Exported(identity, path, form, program, handed.findings, handed.overridden, how, ended)
 
 
 def _has_ended(workspace: Folder, identity: str, now: Standing) -> bool:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Proposal
 
 MOSTLY = 0.9  # share of the cost due to inputs above which it is told
-LIMITED = 0.25  # share of a plan at one limit of an input, which keeps it off its target then
+LIMITED = 0.25  # share of a plan at the limits of an input, which keep it off its target then
 MISSED = 0.1  # share of the target's extent above which an error is told; SHORT: at the plan's end
 SHORT = 0.25
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
@@ -84,7 +84,7 @@ class Plan:
 
     @cached_property
     def off_path(self) -> tuple[float, float, float]:
-        """How far the plan is off its path, the path's extent, and what is near, see `_off_path`."""
+        """How far the plan is off its path, its extent, and what is near, see `_off_path`."""
         return (0.0, 0.0, 0.0) if self.made is None else _off_path(self.task, self.made)
 
     @property
@@ -93,15 +93,15 @@ class Plan:
         return self.off_path[0] > self.off_path[2]
 
     def at_limits(self, made: Candidate) -> Iterator[tuple[str, float]]:
-        """Yield the share of a plan for which each input is at the limit where it is most."""
+        """Yield the share of a plan for which each input is at one of its limits."""
         task, aim = self.task, self.task.input_target
         assert aim is not None
         for j, name in enumerate(task.model.input_names):
             ends = [float(end) for end in (task.low[j], task.high[j]) if np.isfinite(end)]
             ends = [end for end in ends if not np.allclose(aim[:, j], end)]
             sent = made.predicted_inputs[:, j]
-            at = (float(np.isclose(sent, end, rtol=1e-3, atol=1e-9).mean()) for end in ends)
-            yield name, max(at, default=0.0)
+            at = [np.isclose(sent, end, rtol=1e-3, atol=1e-9) for end in ends]
+            yield name, float(np.any(at, axis=0).mean()) if at else 0.0
 
 
 def left_open(workspace: Folder, proposal: Proposal, held: Finding | None) -> list[Finding]:
@@ -260,7 +260,7 @@ def off_target(plan: Plan) -> Iterator[Finding]:
     task, limited = plan.task, [*plan.at_limits(plan.made)]
     what, off, share = _most_missed(task, plan.made.predicted_run)
     at = [name for name, part in limited if part > LIMITED]
-    if at and share > MISSED:
+    if at and (share > MISSED or plan.astray):
         most = max(part for _, part in limited)
         yield found("plan.at_limits", *at, share=most, what=what, off=off)
         return
@@ -385,9 +385,11 @@ def unguarded(plan: Plan) -> Iterator[Finding]:
     given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
     if bare := [names[i] for i in np.flatnonzero(out & ~given)]:
         line, command = drawn(task), None
-        to = [f"--to={name}={task.start[names.index(name)]:g}" for name in bare]
+        to = [("--to", f"{name}={task.start[names.index(name)]:g}") for name in bare]
         if line is not None:
-            again = NextCommand(line.verb, (*line.arguments, *to))
+            again = NextCommand(
+                line.verb, (*line.arguments, *(word for pair in to for word in pair))
+            )
             command = rendered(again, plan.workspace.address)
         yield found("plan.unguarded", *bare, command=command)
     if free := [names[i] for i in np.flatnonzero(out & given & (weight == 0))]:

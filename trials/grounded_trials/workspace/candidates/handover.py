@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, Weight, found
+from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.policy import Policy
 from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
@@ -64,9 +64,8 @@ class Handed:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is told of the candidate; what it is refused for first, if that is overridden."""
-        weighed = (one.weighing(Weight.WARN) for one in self.overridden)
-        return (*weighed, *self.check.notes())
+        """What is told of the candidate, the heaviest first."""
+        return settle(self.check.notes())
 
 
 class Void(GroundedError):
@@ -117,7 +116,7 @@ def checked_candidate(
     if (lost := unmapped(workspace)) is not None:
         reasons = (lost, *reasons)
     _note(workspace, identity, data)
-    return Handed(candidate, meta, data, check, reasons)
+    return Handed(candidate, meta, data, check, tuple(one.weighing(Weight.WARN) for one in reasons))
 
 
 def unmapped(workspace: Folder) -> Finding | None:
@@ -468,26 +467,24 @@ def outside_limits(task: Task, policy: Policy) -> Iterator[Finding]:
     A feed-forward with feedback may lie outside the limits: its sum with the feedback is clipped to
     the policy's own limits, so only those need to be inside.
     """
-    for j, (name, unit) in enumerate(task.model.inputs.items()):
+    for j, name in enumerate(task.model.input_names):
         low, high = task.low[j], task.high[j]
         room = 1e-9 * max([1.0, *(abs(v) for v in (low, high) if np.isfinite(v))])
+        ends = ((policy.low[j], policy.low[j] < low), (policy.high[j], policy.high[j] > high))
+        outside = [end for end, out in ends if out]
         sent = policy.past[j : j + 1]
         if policy.gain is None:
             sent = np.append(sent, policy.feedforward[:, j])
-        ends = np.array([policy.low[j], policy.high[j]])
-        for values, least in ((ends, 0.0), (sent, room)):
-            excess = np.maximum(low - values, values - high)
-            if excess.max() > least:
-                value = Quantity(float(values[np.argmax(excess)]), unit)
-                yield found(
-                    "plan.outside_limits",
-                    name,
-                    input=name,
-                    value=value,
-                    low=f"{low:g}",
-                    high=f"{high:g}",
-                )
-                break
+        outside += [v for v in sent if v < low - room or v > high + room]
+        if outside:
+            yield found(
+                "plan.outside_limits",
+                name,
+                input=name,
+                value=f"{max(outside, key=abs):g}",
+                low=f"{low:g}",
+                high=f"{high:g}",
+            )
 
 
 def disowned(tried: Tried, aside: Collection[str]) -> Finding:

@@ -79,6 +79,11 @@ class Proposed(Result):
     extent: tuple[Extent, ...] = ()  # where the predicted run goes
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
+
+    @property
     def candidate(self) -> Candidate | None:
         """The candidate to run next; None if the search has ended."""
         return self.proposal.candidate
@@ -104,7 +109,7 @@ class Proposed(Result):
         }
         every = [*self.standing.findings, *self.findings]
         every += [one for one in (self.made, self.predicted, self.so_far, self.trust) if one]
-        told |= {"notes": [one.sentence for one in self.findings]}
+        told |= {"notes": list(self.notes)}
         told |= {"findings": [one.to_json() for one in every]}
         told |= {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
         return told | {"from_usual_starts": begun}
@@ -123,6 +128,11 @@ class Status(Result):
     off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
     diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
     since: Since | None = None  # what changed since the diagnosis
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
 
     def summary(self) -> str:
         """Return the phase and the best candidate."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.findings import Finding, found, settle
+from grounded.findings import Finding, found
 from grounded.plant import Noise, Plant
 from grounded.result import Result
 from grounded.search.ask_tell import learn
@@ -45,6 +45,12 @@ class Ran(Result):
     candidate: str
     trial_file: Path
     findings: tuple[Finding, ...] = ()  # on the candidate
+    overridden: tuple[Finding, ...] = ()  # reasons against it, overridden by `anyway`
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
 
     @property
     def then(self) -> NextCommand:
@@ -85,7 +91,7 @@ def run_candidate(
             'give [system] command = "python drive.py {candidate} {trial}"',
             to_run(workspace, identity, *(() if candidate is None else (candidate,))),
         )
-    return Ran(identity, path, settle(handed.check.notes()))
+    return Ran(identity, path, handed.findings, handed.overridden)
 
 
 def simulated_plant(workspace: Folder) -> Plant:
