@@ -13,6 +13,7 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
+from grounded.findings import found
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN
@@ -142,7 +143,7 @@ def hostile(folder):
     document["where"]["split"]["horizon"]["channels"][0]["name"] = EVIL
     document["where"]["whiteness"][EVIL] = 0.0
     document["lookalikes"][0]["like"] = EVIL
-    standing = replace(findings.standing, sentence=EVIL)
+    standing = replace(findings.standing, findings=(found("search.gentler", crashed=EVIL),))
     model = replace(
         findings.task.model,
         name=EVIL,

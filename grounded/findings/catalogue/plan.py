@@ -163,7 +163,7 @@ ENTRIES: dict[str, Entry] = {
     "of_other_limits": Entry(
         "note",
         "[reward] input_change of {about} was made for a different range from that in [limits]",
-        "write input_change = { {new} }, or draw the target again",
+        "write input_change = {new} there, or draw the target again",
     ),
     "at_limits": Entry(
         "note",
@@ -214,7 +214,7 @@ ENTRIES: dict[str, Entry] = {
         "the plan assumes {held} before the start and after the end, under which {state} changes "
         "at once, by {rate}",
         "if nothing but its inputs holds the robot there, put what does into [task] of "
-        "grounded.toml: start = { {start} }; else just propose again",
+        "grounded.toml: start = {start}; else just propose again",
     ),
     # it is not handed over, or not without a warning
     "refused": Entry(

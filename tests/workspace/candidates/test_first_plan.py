@@ -86,10 +86,10 @@ def test_what_holds_the_start_is_offered_for_the_model_as_it_is(lifted):
     fading = '{name = "input_fade:thrust", k = 0.001}'  # which never rests
     dead = '{name = "dead_zone:thrust", c = 0.2}'
     given = "h = 1, thrust = 0.4905, turn = 0"
-    assert start(fading, "h = 1") == given
-    assert start(dead, "h = 1") == "h = 1, thrust = 0.6905, turn = 0"
+    assert start(fading, "h = 1") == f"{{ {given} }}"
+    assert start(dead, "h = 1") == "{ h = 1, thrust = 0.6905, turn = 0 }"
     assert start("", given) == ""
-    assert start(dead, given) == "h = 1, thrust = 0.6905, turn = 0"
+    assert start(dead, given) == "{ h = 1, thrust = 0.6905, turn = 0 }"
     assert start(dead, given) == ""  # once
 
 

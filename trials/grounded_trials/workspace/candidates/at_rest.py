@@ -103,7 +103,7 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
         held=held,
         state=states[k],
         rate=Quantity(rate[k], per_second(units[states[k]])),
-        start=", ".join(f"{name} = {whole[name]}" for name in units if name in whole),
+        start=f"{{ {', '.join(f'{n} = {whole[n]}' for n in units if n in whole)} }}",
     )
 
 

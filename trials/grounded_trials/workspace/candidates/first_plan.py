@@ -250,7 +250,7 @@ def of_other_limits(plan: Plan) -> Iterator[Finding]:
     ]
     if off:
         new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
-        yield found("plan.of_other_limits", *off, new=new)
+        yield found("plan.of_other_limits", *off, new=f"{{ {new} }}")
 
 
 def off_target(plan: Plan) -> Iterator[Finding]:
