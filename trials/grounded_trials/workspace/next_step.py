@@ -1,9 +1,11 @@
-"""Choose the command to type next, for every command, the page and the text report."""
+"""What comes next: one table for every command, the page, JSON and Python, see `NEXT`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,12 +45,9 @@ TARGET = NextCommand("target", ("SHAPE",))
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 
-def next_command(
-    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
-) -> NextCommand:
-    """Return the command to type next, given the standing of the search and the last diagnosis.
-
-    If that is the first plan and no manoeuvre was drawn yet, `target` comes first.
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What decides what comes next; each property is a condition of `NEXT`, or a command there.
 
     Args:
         workspace: the workspace, whose model may have changed since the diagnosis.
@@ -56,8 +55,144 @@ def next_command(
         diagnosis: the last diagnosis, or None.
         usable: the trials that a diagnosis can use now, in order of arrival.
     """
-    then = _follows(workspace, now, diagnosis, usable)
-    return to_plan(workspace) if then == PROPOSE else then
+
+    workspace: Folder
+    now: Standing
+    diagnosis: Diagnosis | None
+    usable: Sequence[str]
+
+    @cached_property
+    def since(self) -> Since:
+        """What changed since the diagnosis."""
+        if self.diagnosis is None:
+            return Since()
+        return since_diagnosis(self.workspace, self.diagnosis, self.usable)
+
+    # conditions
+
+    always = True
+
+    @property
+    def lacks_what_was_found(self) -> bool:
+        """A better model plans better, at any point of the search."""
+        return bool(self.adopt) and (not self.since.newer or _none_stood(self.now))
+
+    @property
+    def plan_leaves_safety(self) -> bool:
+        """Proposing again would not help: another target does."""
+        return self.now.ending is Ending.NOT_ALLOWED and not self.now.trials
+
+    @property
+    def log_not_stored(self) -> bool:
+        """The log that the workspace was made from was not ingested."""
+        return self.diagnosis is None and bool(not_ingested(self.workspace))
+
+    @property
+    def search_asks(self) -> bool:
+        """The search asks for a command, and trials enough exist to answer it."""
+        unsure = self.now.doubt and not doubted(self.now, None, self.usable)
+        return self.diagnosis is None and bool(self.now.then) and not unsure
+
+    @property
+    def never_diagnosed(self) -> bool:
+        """Logs before the first candidate, or an ended search, were not diagnosed."""
+        logs = not self.now.history or self.now.phase is not Phase.PROPOSE
+        return self.diagnosis is None and bool(self.usable) and logs
+
+    @property
+    def diagnosis_is_old(self) -> bool:
+        """Newer logs, another model or the search's doubt ask for another diagnosis."""
+        if self.diagnosis is None:
+            return False
+        logs = self.adopt is not None and not self.now.history
+        other = _of_another_model(self.workspace, self.diagnosis, self.since)
+        return logs or other or doubted(self.now, self.since, self.usable)
+
+    @property
+    def not_settled(self) -> bool:
+        """An ended search was not diagnosed with all of its trials and its model."""
+        if self.diagnosis is None:
+            return False
+        since = self.since
+        done = since.settled or _came_true(self.workspace, self.now, self.diagnosis)
+        return bool(since.repeats) or not done
+
+    @property
+    def again_tells(self) -> bool:
+        """Another run of the best candidate may settle the doubt that ended the search."""
+        return self.now.asks_again and self.diagnosis is not None
+
+    @property
+    def nothing_known(self) -> bool:
+        """The trials can't identify any cause."""
+        return self.diagnosis is not None and bool(self.diagnosis.no_cause)
+
+    @property
+    def diagnosed(self) -> bool:
+        """There is a diagnosis."""
+        return self.diagnosis is not None
+
+    # commands
+
+    @cached_property
+    def adopt(self) -> NextCommand | None:
+        """The command that acts on the claims of the diagnosis, if it is of this model."""
+        if self.diagnosis is None or self.since.changed:
+            return None
+        return to_adopt(self.workspace, self.diagnosis)
+
+    @property
+    def run(self) -> NextCommand:
+        """One more trial of the candidate that waits, or of the best."""
+        return another_trial(self.workspace, self.now)
+
+    @property
+    def ingest(self) -> NextCommand:
+        """The log that the workspace was made from."""
+        return NextCommand("ingest", ("--data", not_ingested(self.workspace)))
+
+    @property
+    def asked(self) -> NextCommand | None:
+        """The command that the search asks for."""
+        return self.now.then
+
+    @property
+    def propose(self) -> NextCommand:
+        """The next candidate; `target` if no manoeuvre was drawn yet."""
+        return to_plan(self.workspace)
+
+    target, diagnose, export = TARGET, DIAGNOSE, EXPORT
+
+
+ANY, ENDED = tuple(Phase), (Phase.CONVERGED, Phase.STOPPED)
+# what comes next: the first row whose phase and condition hold gives the command
+NEXT: tuple[tuple[tuple[Phase, ...], str, str], ...] = (
+    (ANY, "lacks_what_was_found", "adopt"),
+    ((Phase.AWAIT,), "always", "run"),
+    (ANY, "plan_leaves_safety", "target"),
+    (ANY, "log_not_stored", "ingest"),
+    (ANY, "search_asks", "asked"),
+    (ANY, "never_diagnosed", "diagnose"),
+    ((Phase.PROPOSE,), "diagnosis_is_old", "diagnose"),
+    ((Phase.PROPOSE,), "always", "propose"),
+    (ENDED, "not_settled", "diagnose"),
+    (ENDED, "again_tells", "run"),
+    (ENDED, "nothing_known", "run"),
+    (ENDED, "diagnosed", "export"),
+    (ENDED, "always", "propose"),
+)
+
+
+def next_command(
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+) -> NextCommand:
+    """Return the command to type next by `NEXT`, see `Situation`."""
+    here = Situation(workspace, now, diagnosis, usable)
+    for phases, condition, command in NEXT:
+        if now.phase in phases and getattr(here, condition):
+            then = getattr(here, command)
+            return to_plan(workspace) if then == PROPOSE else then
+    raise AssertionError(now.phase)
 
 
 def outlook(now: Standing, then: NextCommand) -> Standing:
@@ -88,36 +223,6 @@ def undrawn(workspace: Folder) -> bool:
     if first.any() or not all(np.isnan(column).all() for column in others):
         return bool(logged_target(workspace))
     return not task.start.get(workspace.base_model.state_names[0])
-
-
-def _follows(
-    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
-) -> NextCommand:
-    """Return the command to type next regardless of target.csv, see `next_command`."""
-    since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
-    follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
-    if follow and (not since.newer or _none_stood(now)):
-        return follow  # at any point of the search: a better model plans better
-    if now.phase is Phase.AWAIT:
-        return another_trial(workspace, now)
-    if now.ending is Ending.NOT_ALLOWED and not now.trials:
-        return TARGET  # the plan for this target leaves [safety]: proposing again would not help
-    if diagnosis is None:
-        if log := not_ingested(workspace):
-            return NextCommand("ingest", ("--data", log))
-        logs = usable and not now.history  # diagnose logs before the first candidate
-        teach = usable and (logs or now.phase is not Phase.PROPOSE)
-        then = None if now.doubt and not doubted(now, None, usable) else now.then
-        return then or (DIAGNOSE if teach else PROPOSE)
-    if now.phase is Phase.PROPOSE:
-        logs = follow is not None and not now.history
-        due = logs or _of_another_model(workspace, diagnosis, since)
-        return DIAGNOSE if due or doubted(now, since, usable) else PROPOSE
-    if since.repeats or not (since.settled or _came_true(workspace, now, diagnosis)):
-        return DIAGNOSE
-    if now.asks_again and now.incumbent:
-        return to_run(workspace, now.incumbent.candidate.id, "best")
-    return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
 
 
 def not_ingested(workspace: Folder) -> str:

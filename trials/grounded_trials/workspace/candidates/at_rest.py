@@ -38,7 +38,6 @@ MOVED = 0.01  # fraction of the same by which a given input must differ to be re
 SETTLED = 10  # least steps over which a rest is tried
 SLOW = 0.05  # fraction of its range in the target that a state may move in that time
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
-NEWTON, PROBE = 10, 1e-4  # iterations for a state at rest, difference for its slope
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
@@ -211,26 +210,12 @@ def rest_value(workspace: Folder, at: Mapping[str, float], name: str) -> float:
     names = task.model.state_names
     logged = {i: names[k] for i, k in true_values(names, names[workspace.task.model.n :]).items()}
     x = np.array([at.get(logged.get(i, own), 0.0) for i, own in enumerate(names)])
-    problem, k = task.problem(), names.index(name)
-    still = np.array([is_clock(own) for own in names])
-
-    def moved(value: float) -> Array:
-        begun = x.copy()
-        begun[[k, *(i for i, own in logged.items() if own == name)]] = value
-        u = task.past[None]
-        with np.errstate(all="ignore"):
-            after = problem.system.step(begun[None], u, problem.p, problem.dt, problem.smoothing)
-        return np.where(still, 0.0, task.model.difference(after[0], begun))
-
-    value, first = 0.0, float(np.abs(moved(0.0)).max())
-    for _ in range(NEWTON):
-        now = moved(value)
-        slope = (moved(value + PROBE) - now) / PROBE
-        if not (steep := float(slope @ slope)) > 0 or not np.isfinite(steep):
-            return 0.0
-        value -= float(slope @ now) / steep
-    rests = np.abs(moved(value)).max() <= STILL * first
-    return value if rests and abs(value) > NOTHING else 0.0
+    free = np.array([logged.get(i, own) == name for i, own in enumerate(names)])
+    room = NOTHING * NOTHING * (1 + np.abs(task.past))  # the input is held
+    held = replace(task, start=x, low=task.past - room, high=task.past + room)
+    found_at = resting(held, free)
+    value = 0.0 if found_at is None else float(found_at[names.index(name)])
+    return value if abs(value) > NOTHING else 0.0
 
 
 def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
