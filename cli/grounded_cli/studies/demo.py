@@ -46,10 +46,10 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
+    from grounded.diagnosis.telling import sentence, told
     from grounded.engine import Engine, idle
     from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
-    from grounded_trials.report.three_lines import three_lines
     from grounded_trials.starting.examples import example
     from grounded_trials.workspace.candidates.running import optimum
 
@@ -95,7 +95,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     once = bool(status.standing.lead_doubt) and not any(
         len(tried.trials) > 1 for tried in status.standing.history
     )
-    _tell(document, three_lines(diagnosed, workspace.task), once=once)
+    _tell(document, [sentence(one) for one in told(diagnosed).lines], once=once)
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
