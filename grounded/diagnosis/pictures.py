@@ -7,26 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Credit, RulerRow, furthest
+from grounded.diagnosis.error_report import RulerRow, furthest
 from grounded.diagnosis.parts import Diagnosed
-from grounded.diagnosis.tables import larger, weighed_beside
+from grounded.diagnosis.tables import larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded.result import figure, listed, measured, measured_alike, number, percent, shown
+from grounded.result import figure, measured, measured_alike, percent, shown
 
 MOST = 12  # bars
-BEFORE = "before these causes"  # also where they were adopted since, or others before
-ALL = "with all causes"
+CREDIT_S = 1.0  # horizon at which a cause's worth is measured [s]
+STATES = 6  # whose error without each cause is drawn
 APART = 0.01  # relative difference of errors below which curves coincide
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
-SHOWS = 1.02  # ratio of errors, such as without and with a cause, from which bars show it
-SPARED = "All but: with every cause of this diagnosis except one, fitted again."
-OFFSET = f" Where such a bar is longer than that of the model {BEFORE}, causes offset each other."
-SHORTER = (
-    " A cause is claimed for the mean over all states and horizons. If predictions of one state "
-    "are better without it, its bar is shorter than that of all."
-)
-CREDIT_S = 1.0  # horizon at which an effect's worth is measured [s]
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
     "crude": ("model", "model"),
@@ -65,7 +57,7 @@ def gap_figures(diagnosis: Diagnosed) -> list[Figure]:
     """Return the figures of a diagnosis, most important first; none if no cause can be named."""
     if diagnosis.no_cause:
         return []
-    found = (accuracy_figure(diagnosis), credit_figure(diagnosis, 6), where_figure(diagnosis))
+    found = (accuracy_figure(diagnosis), credit_figure(diagnosis), where_figure(diagnosis))
     return [figure for figure in found if figure is not None]
 
 
@@ -73,23 +65,14 @@ def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
     """Return the prediction errors without and with the diagnosis, in each state's unit."""
     errors = diagnosis.prediction_error
     if not errors:
-        panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
-        held, apart = diagnosis.gap.held_out, False
-    else:
-        apart = any(not e.whole_trial for e in errors) and len(errors) > 1
-        panels = _over_horizons(errors) if apart else _by_channel(errors[0])
-        held = errors[0].held_out != "no"
+        return None
+    apart = any(not e.whole_trial for e in errors) and len(errors) > 1
+    panels = _over_horizons(errors) if apart else _by_channel(errors[0])
     if not panels:
         return None
-    where = "on held-out data" if held else "on the data used for the diagnosis"
-    least = " No model gets below the noise."
-    if any(e.floor_bound for e in errors):
-        least = " The noise is at most that, and perhaps far less: a better model may get below it."
-    if apart and not any(v > 0 for e in errors for v in e.noise_floor.values()):
-        known = any(v == 0 for e in errors for v in e.noise_floor.values())
-        least = " Repeated trials agree exactly: the noise is 0." * known
-    caption = f"Rms error of predictions, {where}.{least}"
+    held = "held-out data" if errors[0].held_out != "no" else "the data used for the diagnosis"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
+    caption = f"Rms error of predictions on {held}."
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
@@ -142,121 +125,41 @@ def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ..
     return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
-def credit_figure(diagnosis: Diagnosed, channels: int = 1) -> Figure | None:
-    """Return how much larger errors are without each effect and without calibration.
+def credit_figure(diagnosis: Diagnosed, states: int = STATES) -> Figure | None:
+    """Return each cause's share of the gain, and the errors of some states without each cause.
 
     Args:
         diagnosis: the diagnosis.
-        channels: number of states for which errors without each cause are drawn, in their unit;
-            those with the largest improvement first.
+        states: largest number of states, those with the largest improvement first.
     """
-    credit, known = diagnosis.credit, _second_ahead(diagnosis)
-    if not credit:
-        return None
-    bars = tuple(Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST])
-    panels = [Bars("Errors without each, mean of all (logarithmic)", bars)]
-    for name in _improved(known)[:channels] if known else ():
-        panels += worth_of([name], name, diagnosis)
-    caption = _all_but(panels[1:]) * (len(credit) > 1)
-    return Figure("credit", "What each is worth", caption, tuple(panels))
+    credit, error = diagnosis.credit, _second_ahead(diagnosis.prediction_error)
+    names = _improved(error)[:states] if error else []
+    panels = [worth_of(name, error, diagnosis) for name in names if error]
+    if credit:
+        bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST]]
+        panels.insert(0, Bars("Errors without each, mean of all (logarithmic)", tuple(bars)))
+    caption = "All but: with every cause of this diagnosis except one, fitted again."
+    found = tuple(panel for panel in panels if panel.bars)
+    return Figure("credit", "What each is worth", caption, found) if found else None
 
 
-def worth_figure(
-    diagnosis: Diagnosed, groups: Sequence[tuple[Sequence[str], str]]
-) -> Figure | None:
-    """Return the prediction errors without each cause, for some states.
-
-    A cause is claimed for the mean over all states and horizons. If predictions of the given states
-    lose nothing without it, the state that loses most is drawn, too. A cause that shows in no state
-    a second ahead is named in the caption.
-
-    Args:
-        diagnosis: the diagnosis.
-        groups: names of states with one unit, and a label for them together.
-
-    Returns:
-        The figure, or None if no error a second ahead is known.
-    """
-    error, drawn, hidden = _second_ahead(diagnosis), list(groups), []
-    if error is None:
-        return None
-    for credit in diagnosis.credit[:MOST]:
-        if any(_loss(credit, error, names) > SHOWS for names, _ in drawn):
-            continue
-        most = max(error.with_effects, key=lambda name: _loss(credit, error, [name]), default="")
-        if most and _loss(credit, error, [most]) > SHOWS:
-            drawn.append(([most], most))
-        else:
-            hidden.append(credit.of)
-    panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
-    caption = _all_but(panels) * (len(diagnosis.credit) > 1)
-    caption += (
-        f" The improvement by {', '.join(hidden)} shows at other horizons, in no state 1 s ahead."
-    ) * bool(hidden)
-    return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
-
-
-def _all_but(panels: Sequence[Bars]) -> str:
-    """What the bars of all causes but one say where they are unusually long or short."""
-    longer = shorter = False
-    for panel in panels:
-        by = {bar.label: bar.value for bar in panel.bars}
-        without = [value for name, value in by.items() if name.startswith("all but")]
-        longer |= max(without, default=0.0) > SHOWS * by.get(f"model {BEFORE}", math.inf)
-        shorter |= SHOWS * min(without, default=math.inf) < by.get(ALL, 0.0)
-    return (SPARED + OFFSET * longer + SHORTER * shorter) * bool(panels)
-
-
-def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
-    """Return the ratio of errors without and with a cause, 0 if it is not known."""
-    if not set(names) <= set(credit.without_it) & set(error.with_effects):
-        return 0.0
-    without, whole = (
-        math.hypot(*(v[n] for n in names)) for v in (credit.without_it, error.with_effects)
-    )
-    return without / whole if whole > 0 else 0.0
-
-
-def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosed) -> list[Bars]:
-    """Return the combined error of some states a second ahead, with all causes and all but each.
+def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
+    """Return the error of a state with all causes and all but each.
 
     If effects were adopted before, also that of the model without them.
-
-    Args:
-        names: names of states with one unit, such as those of a position.
-        what: their label.
-        diagnosis: the diagnosis.
-
-    Returns:
-        One panel, or none if an error is not known.
     """
-    error = _second_ahead(diagnosis)
-    if error is None or not set(names) <= set(error.crude):
-        return []
-    unit = error.unit_by_channel.get(names[0], "")
-    said = BEFORE if diagnosis.credit else "with what was adopted" if error.outset else "as it is"
-    rows = [((MODELS["outset"][0], "model.py, nothing adopted"), error.outset)]  # {} if it is so
-    rows += [(("model", f"model {said}"), error.crude)]
-    if diagnosis.credit:  # else nothing was found: the same error once more
-        rows += [(("best", ALL), error.with_effects)]
-    if len(diagnosis.credit) > 1:  # without the only one, it is the model before
-        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
+    causes = diagnosis.credit
+    rows = [(("limit", "model.py, nothing adopted"), error.outset)]  # {} if it is so
+    rows += [(("model", "model before these causes" if causes else "model"), error.crude)]
+    if causes:  # else nothing was found: the same error once more
+        rows += [(("best", "with all causes"), error.with_effects)]
+    if len(causes) > 1:  # without the only one, it is the model before
+        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST]]
     rows += [(models(error)["noise_floor"], error.noise_floor)]
-    found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
-    bars = _in_unit([(n, v, role) for (role, n), v in found if math.isfinite(v)], unit)
-    if not bars:  # the state was never measured
-        return []
-    title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
-    return [Bars(f"{title}: error {error.horizon_s:.3g} s ahead", bars)]
-
-
-def _second_ahead(diagnosis: Diagnosed) -> RulerRow | None:
-    errors = diagnosis.prediction_error
-    horizons = [e for e in errors if not e.whole_trial]
-    if horizons and horizons[0].horizon_s > CREDIT_S / 2:  # a slow process
-        return furthest(horizons)
-    ahead = (e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1))
-    return next((e for e in ahead if not e.drowned), None)
+    known = [(look, errors[name]) for look, errors in rows if name in errors]
+    bars = [(label, v, role) for (role, label), v in known if math.isfinite(v)]
+    unit = error.unit_by_channel.get(name, "")
+    return Bars(f"{name}: error {error.horizon_s:.3g} s ahead", _in_unit(bars, unit))
 
 
 def _improved(error: RulerRow) -> list[str]:
@@ -267,6 +170,15 @@ def _improved(error: RulerRow) -> list[str]:
         if error.crude.get(name) and math.isfinite(error.crude[name])
     }
     return sorted(gain, key=lambda name: -gain[name])
+
+
+def _second_ahead(errors: Sequence[RulerRow]) -> RulerRow | None:
+    """Return the errors at the horizon at which credit is measured; None if they tell nothing."""
+    horizons = [e for e in errors if not e.whole_trial]
+    if horizons and horizons[0].horizon_s > CREDIT_S / 2:  # a slow process
+        return furthest(horizons)
+    ahead = (e for e in horizons if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1))
+    return next((e for e in ahead if not e.drowned), None)
 
 
 def where_figure(diagnosis: Diagnosed) -> Figure | None:
@@ -280,7 +192,10 @@ def where_figure(diagnosis: Diagnosed) -> Figure | None:
     by_time = [(f"{t.start:.4g} to {t.end:.4g} s", t.share, "") for t in where.times]
     by_region = [(r.told, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
     panels = [
-        Bars(f"Share of the gap by {word}", _shares(shares, role))
+        Bars(
+            f"Share of the gap by {word}",
+            tuple(Bar(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST]),
+        )
         for word, shares, role in (
             ("channel", by_channel, "best"),
             ("time", by_time, "step2"),
@@ -289,63 +204,16 @@ def where_figure(diagnosis: Diagnosed) -> Figure | None:
         if shares
     ]
     if diagnosis.ranking:
-        panels.append(Bars("Evidence for an effect [nats]", _ranking(diagnosis)))
-    if not panels:
-        return None
-    located = by_channel or by_time or by_region
-    caption = "Shares are of the squared one-step errors beyond the noise." * bool(located)
-    if by_channel:
-        caption += f" Beside a channel's share: the model's prediction error{_ahead(diagnosis)}."
+        evidence = tuple(
+            Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
+            for r in diagnosis.ranking[:MOST]
+        )
+        panels.append(Bars("Evidence for an effect [nats]", evidence))
+    caption = "Shares are of the squared one-step errors beyond the noise." * bool(by_channel)
     if diagnosis.ranking:
-        caption += f" {_evidence_words(diagnosis)}"
-    title = "Where the gap is" if located else "Effects compared"
-    return Figure("gap", title, caption.strip(), tuple(panels))
-
-
-def _evidence_words(diagnosis: Diagnosed) -> str:
-    """What the lengths and colours of the bars of evidence mean."""
-    beside = weighed_beside(diagnosis) - {*diagnosis.effects}
-    tied = listed([r.effect for r in diagnosis.ranking[:MOST] if r.effect in beside])
-    words = "Evidence is the gain in log-likelihood less a price for parameters. "
-    if diagnosis.effects:
-        words += "Blue: the loss without a claimed effect, 3 nats or more. "
-    words += "Grey: the gain of another effect alone"
-    if diagnosis.effects:
-        words += ", in place of all claimed ones, so compare it with other grey bars only"
-    words += "; below 0, it is not worth its parameters."
-    return words + f" {tied}: beside the other claimed effects, in place of a tied one." * bool(
-        tied
-    )
-
-
-def _ahead(diagnosis: Diagnosed) -> str:
-    """Return the horizon at which errors by channel are measured, as text."""
-    row = furthest(diagnosis.prediction_error)
-    return f" {row.horizon_s:.3g} s ahead, rms" if row else ", rms"
-
-
-def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
-    """Return bars of (label, share, note)."""
-    return tuple(
-        Bar(label, share, f"{percent(share)}{note}", role) for label, share, note in shares[:MOST]
-    )
-
-
-def _ranking(diagnosis: Diagnosed) -> tuple[Bar, ...]:
-    named = set(diagnosis.effects)
-    return tuple(
-        Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.effect in named else "other")
-        for r in diagnosis.ranking[:MOST]
-    )
-
-
-def _shrinkage(diagnosis: Diagnosed) -> Bars:
-    gap = diagnosis.gap
-    ahead = f" {gap.horizon_s:.3g} s ahead" if math.isfinite(gap.horizon_s) else ""
-    rows = (
-        ("model", gap.before, "model"),
-        ("as diagnosed", gap.after, "best"),
-        ("noise alone", gap.floor, "other"),
-    )
-    bars = tuple(Bar(name, v, number(v), role) for name, v, role in rows)
-    return Bars(f"Prediction error{ahead}, in units of the noise", bars)
+        caption += (
+            " Evidence: of a claimed effect (blue) what is lost without it, of another one what it "
+            "gains in place of all claimed ones."
+        )
+    title = "Where the gap is" if by_channel else "Effects compared"
+    return Figure("gap", title, caption.strip(), tuple(panels)) if panels else None

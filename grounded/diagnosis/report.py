@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
-from typing import Any
+from typing import Any, Self
 
 from grounded.diagnosis.parts import Diagnosed
 from grounded.diagnosis.pictures import gap_figures
@@ -23,6 +23,12 @@ UNKNOWABLE = (  # codes of what the trials can't show
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Diagnosed):
     """The result of a diagnosis, as in `diagnose --json`."""
+
+    @classmethod
+    def from_json(cls, document: Any) -> Self:
+        """Read what `to_json` wrote; findings of other versions are left out."""
+        found = super().from_json(document)
+        return replace(found, findings=tuple(one for one in found.findings if one.printable))
 
     @property
     def sentence(self) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from grounded.errors import NextCommand
 from grounded.findings.catalogue import entry_of
-from grounded.findings.numbers import filled
+from grounded.findings.numbers import filled, slots
 
 
 class Weight(StrEnum):
@@ -71,6 +71,15 @@ class Finding:
         """Return it with more facts; those that are None are left out."""
         known = {name: value for name, value in facts.items() if value is not None}
         return replace(self, facts={**self.facts, **known})
+
+    @property
+    def printable(self) -> bool:
+        """Whether the catalogue has words for it: it may be from a document of another version."""
+        try:
+            entry = entry_of(self.code)
+        except (KeyError, ImportError):
+            return False
+        return slots(entry.short) | slots(entry.remedy) <= {"about", *self.facts}
 
     def weighing(self, weight: Weight) -> Finding:
         """Return it with another weight."""

@@ -100,6 +100,11 @@ def test_an_older_document_is_read_with_what_it_has():
     oldest = Diagnosis.from_json({"verdict": {"kind": "none"}})
     assert not oldest.gap.measured and math.isnan(oldest.gap.before) and oldest.ranking == ()
     assert again(oldest) == oldest
+    unknown = {"code": "gap.of_old", "weight": "note", "about": [], "facts": {}, "nats": None}
+    other = unknown | {"code": "gap.tie"}  # whose facts had other names
+    both = [one | {"then": None} for one in (unknown, other)]
+    later = Diagnosis.from_json({"verdict": {"kind": "none"}, "findings": both})
+    assert later.findings == () and later.sentence
 
 
 @pytest.mark.parametrize(

@@ -125,11 +125,6 @@ ENTRIES: dict[str, Entry] = {
         "{effect} is part of the model and was not compared again with {others}, from which the "
         "trials could not tell it",
     ),
-    "utility": Entry(
-        "note",
-        "utilities of whole trials are predicted to {before:.3g} rms by the model[[, {after:.3g} "
-        "as diagnosed]]",
-    ),
     # the next step: one of them
     "next.record": Entry(
         "note", "run another trial, or record a longer log, in which every input changes"

@@ -89,7 +89,7 @@ def _error(d: Diagnosis, now: str = "with_effects", before: str = "crude") -> Fi
 
 
 def _open(d: Diagnosis) -> Finding | None:
-    return next(open_line(d), None)
+    return next(open_line(d), None) if d.leftover else None
 
 
 def measured_now(workspace: Folder) -> str:

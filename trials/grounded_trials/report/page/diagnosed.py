@@ -21,7 +21,6 @@ from grounded_trials.wording import percent, rendered
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import DIAGNOSE
 
-MOST = 6  # states whose error without each effect is drawn
 NO_TRIAL = "Nothing to diagnose yet: no trial and no log of data is stored."
 HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
@@ -41,7 +40,7 @@ def gap_section(findings: Findings) -> list[Block]:
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
-    proof += drawn(credit_figure(diagnosis, MOST), title=True)
+    proof += drawn(credit_figure(diagnosis), title=True)
     proof += [*ahead, *forecast_table(findings)]
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 

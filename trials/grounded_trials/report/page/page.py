@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.diagnosis.errors_told import states_told, telling
-from grounded.diagnosis.pictures import credit_figure, worth_figure
+from grounded.diagnosis.pictures import credit_figure
 from grounded.diagnosis.tables import instrument_lines
 from grounded.diagnosis.telling import FINDINGS, sentence
 from grounded.errors import needs
@@ -284,9 +283,6 @@ def _why(findings: Findings) -> dict[str, Any]:
     diagnosis, said = findings.diagnosis, findings.told
     if diagnosis is None or said is None:
         return {}
-    row = telling(diagnosis.prediction_error)
-    names = states_told(row, diagnosis.tracked) if row else []
-    credit = worth_figure(diagnosis, [([name], name) for name in names])
     adopted = [] if findings.settled is None else findings.settled.rows
     return {
         "kind": diagnosis.kind,
@@ -296,7 +292,7 @@ def _why(findings: Findings) -> dict[str, Any]:
         "header": said.header,
         "preflight": instrument_lines(diagnosis.preflight),
         "notes": [sentence(one) for one in said.findings[FINDINGS:]],
-        "credit": credit or credit_figure(diagnosis),
+        "credit": credit_figure(diagnosis, 2),
     }
 
 
