@@ -74,7 +74,7 @@ def test_loss_axes_put_better_higher_and_space_by_ratio():
 
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
-FIGURES += ("accuracy", "gap", "forecast", "residual", "autocorrelation")
+FIGURES += ("gap", "forecast", "residual", "autocorrelation")
 
 
 @pytest.mark.slow
