@@ -36,7 +36,7 @@ LEAST_STEPS = 30  # shortest trial whose residual is drawn
 def forecast_figures(findings: Findings) -> list[Figure]:
     """Return forecasts of a run unknown to the diagnosis, else of the best; and of long logs."""
     found, ahead = [], f"{findings.ahead_s:.3g} s"
-    run = _unseen(findings) or findings.lately
+    run = forecast_run(findings)
     if run is not None:
         title = f"Predictions restarted every {ahead}, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
@@ -70,12 +70,12 @@ def _caption(findings: Findings, place: int, own: str) -> str:
     return f"{caption} {own}".rstrip()
 
 
-def _unseen(findings: Findings) -> Run | None:
-    """Return the latest run that the diagnosis did not use."""
+def forecast_run(findings: Findings) -> Run | None:
+    """Return the latest run that the diagnosis did not use, else the latest of the best one."""
     made = findings.diagnosis.made if findings.diagnosis is not None else None
     seen = set(made.trials) if made is not None else None
     fresh = [r for r in findings.runs if seen is not None and r.trial.id not in seen]
-    return fresh[-1] if fresh else None
+    return fresh[-1] if fresh else findings.lately
 
 
 def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from grounded.figures.body import Body
-from grounded.figures.figure import typeset
+from grounded.figures.figure import Bars, Figure, Panel, typeset
 from grounded.frozen import Array
 from grounded_trials.report.bodies import is_mechanism, reach
+from grounded_trials.report.figures.gap import forecast_figures
+from grounded_trials.report.figures.runs import bias_figure, input_figure, state_figure
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.scene import Scene, reading_order
-from grounded_trials.wording import figure, labelled, per_second
+from grounded_trials.report.scene import Scene
+from grounded_trials.wording import figure, labelled
 
 FAR = 1.1  # distance of the camera, times the size of the contents
 TALL = 1.35  # the distance in a view that is higher than wide, times that
@@ -86,20 +88,34 @@ NAMES = {"state": "states", "input": "inputs", "bias": "bias"}
 FIRST = 4  # states in the overview; all of them have a tab
 
 
+def over_time(findings: Findings) -> list[Figure]:
+    """Return the page's figures over time: states, inputs, bias, forecasts."""
+    made = (state_figure(findings), input_figure(findings), bias_figure(findings))
+    return [figure for figure in (*made, *forecast_figures(findings)[:1]) if figure is not None]
+
+
+def escaped(name: str) -> str:
+    """Return a name as a part of an entity's path."""
+    import rerun as rr
+
+    return rr.new_entity_path([name]).removeprefix("/")
+
+
+def entity_of(figure: Figure, panel: Panel | Bars) -> str:
+    """Return the path of a panel's entities."""
+    return f"/{figure.name}/{escaped(panel.title)}"
+
+
 def blueprint(findings: Findings, space: Space) -> Any:
     """Return the views: overview, effects on and off, states, inputs, bias, one tab per trial."""
     import rerun.blueprint as rrb
 
-    model, ordered = findings.task.model, _ordered(findings)
-    states = [_plot(f"/state/{n}", labelled(n, u)) for n, u in ordered.items()]
-    inputs = [_plot(f"/input/{n}", labelled(n, u)) for n, u in model.inputs.items()]
-    biases = [_plot(f"/bias/{n}", labelled(n, per_second(u))) for n, u in ordered.items()]
+    figures = over_time(findings)
+    plots = {figure.name: _plots(figure) for figure in figures}
     tabs = [
-        _overview(findings, space),
-        *_effects(findings, space),
-        rrb.Grid(*states, name="States"),
-        rrb.Grid(*inputs, name="Inputs"),
-        rrb.Grid(*biases, name="Bias"),
+        _overview(findings, space, plots),
+        *_effects(findings, space, plots.pop("forecast", [])),
+        *(rrb.Grid(*plots[one.name], name=one.title) for one in figures if one.name in plots),
         rrb.Tabs(*_trials(findings, space), name="By trial"),
     ]
     only_logs = bool(findings.logs) and not findings.runs
@@ -116,20 +132,14 @@ def blueprint(findings: Findings, space: Space) -> Any:
     )
 
 
-def _overview(findings: Findings, space: Space) -> Any:
+def _overview(findings: Findings, space: Space, drawn: Mapping[str, Sequence[Any]]) -> Any:
     import rerun.blueprint as rrb
 
-    model, reward = findings.task.model, findings.task.reward
-    weighed = reward.state + reward.terminal != 0
-    chosen = sorted(_ordered(findings), key=lambda n: not weighed[model.state_names.index(n)])[
-        :FIRST
+    plots = [
+        plot
+        for name, most in (("states", FIRST), ("inputs", 2), ("bias", 2))
+        for plot in drawn.get(name, ())[:most]
     ]
-    named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
-    named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
-    named += [
-        (f"/bias/{n}", labelled(f"bias of {n}", per_second(model.states[n]))) for n in chosen[:2]
-    ]
-    plots = [_plot(origin, name, legend=False) for origin, name in named]
     hidden = rrb.PlotLegend(visible=False)
     bars = rrb.BarChartView(origin="/utilities", name="Utility by iteration", plot_legend=hidden)
     words = rrb.TextDocumentView(origin="/summary", name="Summary")
@@ -161,8 +171,8 @@ def _rows(findings: Findings) -> list[float]:
     return [1, 8] if findings.diagnosis is None else [2, 5]
 
 
-def _effects(findings: Findings, space: Space) -> list[Any]:
-    """Return views of the best run and the model's forecasts, without effects and with them."""
+def _effects(findings: Findings, space: Space, plots: Sequence[Any]) -> list[Any]:
+    """Return views of a run and the model's forecasts, without effects and with them."""
     import rerun.blueprint as rrb
 
     better = findings.better
@@ -173,11 +183,6 @@ def _effects(findings: Findings, space: Space) -> list[Any]:
             ["/ahead/real/**", f"/ahead/{key}/**"], f"{findings.ahead_s:.3g} s ahead: {words}"
         )
         for key, words in (("off", findings.plain), ("on", f"model {better.name}"))
-    ]
-    units = _ordered(findings)
-    plots = [
-        _plot(f"/ahead/{n}", labelled(n, u), legend=k == 0)
-        for k, (n, u) in enumerate(units.items())
     ]
     both = rrb.Horizontal(*views)
     return [rrb.Vertical(both, rrb.Grid(*plots, grid_columns=3), name="Effects off and on")]
@@ -206,14 +211,13 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
     return tabs
 
 
-def _ordered(findings: Findings) -> dict[str, str]:
-    """Return the units of the states by name, in the order of charts."""
-    units = list(findings.task.model.states.items())
-    return dict(units[i] for i in reading_order(findings.task))
+def _plots(figure: Figure) -> list[Any]:
+    """Return a view of each panel of a figure."""
+    return [_plot(entity_of(figure, panel), panel.title) for panel in figure.panels]
 
 
-def _plot(origin: str, name: str, legend: bool = True) -> Any:
+def _plot(origin: str, name: str) -> Any:
     import rerun.blueprint as rrb
 
-    key = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+    key = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
     return rrb.TimeSeriesView(origin=origin, name=typeset(name), plot_legend=key)

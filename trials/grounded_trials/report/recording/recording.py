@@ -1,9 +1,9 @@
 """Writes a workspace for the Rerun viewer, as one .rrd file.
 
     /paths/...                desired, the model's own policy, the best so far and its prediction
-    /state/x/...              the same over time, one plot per state;  /input/u/...  with limits
-    /bias/x/...               bias of the crude model along the run [unit/s], by candidate
-    /ahead/...                the best run, and forecasts restarted every second: effects off, on
+    /states, /inputs, /bias   the page's figures over time: a plot a panel, a curve an entity
+    /forecast                 the same of a run and its predictions, restarted every second
+    /ahead/...                the same in space: the run, effects off, effects on
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
     /verdict, /credit         what to run next, why the model was wrong; the share of each cause
@@ -28,24 +28,23 @@ import numpy as np
 from grounded.errors import GroundedError, needs
 from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
-from grounded.figures.figure import rgb, typeset
+from grounded.figures.figure import Bars, Figure, rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.calmed import averaged, window_of
+from grounded_trials.report.figures.gap import forecast_run
 from grounded_trials.report.figures.paths import crash, ended
-from grounded_trials.report.findings import Findings, Run, selection
+from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import forecast
-from grounded_trials.report.recording.layout import Space, blueprint
+from grounded_trials.report.recording.layout import Space, blueprint, entity_of, escaped, over_time
 from grounded_trials.report.recording.texts import credit, summary, verdict
 from grounded_trials.report.scene import scene_of
 from grounded_trials.wording import labelled, per_second
-from grounded_trials.workspace.off_target import tracked
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
 SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
-ITERATIONS = 4  # largest number of iterations whose bias is drawn
 FINE = 600  # steps above which the bias of a trial is averaged, to keep files small
 Colour = tuple[int, int, int]
 FRAMES = 600  # largest number of poses of a body in an animation
@@ -102,8 +101,8 @@ class _Recorder:
         if values:
             log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
         self.paths()
-        self.over_time()
-        self.biases()
+        for figure in over_time(findings):
+            self.series(figure)
         self.forecasts()
         for run in findings.runs:
             self.trial(run)
@@ -128,57 +127,27 @@ class _Recorder:
             if run is not None:
                 self.moving(f"paths/{role}", run.trial, role)
 
-    def over_time(self) -> None:
-        """Record states and inputs over time, one plot each, with target, prediction and limits."""
-        task, best, known = self.task, self.findings.best, tracked(self.task)
-        for i, name in enumerate(task.model.state_names):
-            if i in known:
-                self.line(f"state/{name}/desired", task.target[:, i], self.dt, "desired")
-            self.runs(f"state/{name}", "states", i)
-            if best is not None:
-                predicted = best.candidate.predicted_states[:, i]
-                self.line(f"state/{name}/predicted", predicted, self.dt, "predicted", width=1)
-        for j, name in enumerate(task.model.input_names):
-            self.runs(f"input/{name}", "inputs", j)
-            for bound, limit in (("low", task.low[j]), ("high", task.high[j])):
-                if np.isfinite(limit):
-                    span, whole = np.full(2, limit), self.dt * task.horizon
-                    self.line(f"input/{name}/{bound}", span, whole, "limit", width=1)
-
-    def runs(self, at: str, kind: str, column: int) -> None:
-        """Record one quantity along the model's policy and along the best run so far."""
-        words = {"model_policy": "the model's policy", "best": "best so far"}
-        for role, run in self.compared.items():
-            if run is not None:
-                values = getattr(run.trial, kind)[:, column]
-                name, width = f"{words[role]}, {run.label}", 3.0 if role == "best" else 1.5
-                self.line(f"{at}/{role}", values, self.dt, role, name, width)
-
-    def biases(self) -> None:
-        """Record the crude model's bias by candidate, and that of the model with effects."""
-        best, better = self.findings.best, self.findings.better
-        shown, found = selection(self.findings.improvements, ITERATIONS), []
-        for number, run in enumerate(shown):
-            last = number == len(shown) - 1 and number > 0
-            colour = "best" if last else ("model_policy", "accepted", "other")[number % 3]
-            found.append((run.candidate.id, run.residual, colour))
-        if best is not None and best.explained is not None and better is not None:
-            found.append((f"left, {better.name}", best.explained, "limit"))
-        for i, name in enumerate(self.task.model.state_names):
-            window = window_of([residual[:, i] for _, residual, _ in found])
-            for key, residual, colour in found:
-                values, dt = rate(residual[:, [i]], self.dt, window)
-                at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
-                self.line(at, values[:, 0], dt, colour, key, 1.0, 0.5 * (dt - self.dt))
+    def series(self, figure: Figure) -> None:
+        """Record the curves, limits and marks of a figure over time."""
+        for panel in figure.panels:
+            if isinstance(panel, Bars):
+                continue
+            at, ends = entity_of(figure, panel), [np.nanmax(curve.x) for curve in panel.curves]
+            for curve in panel.curves:
+                place = f"{at}/{escaped(curve.name)}"
+                self.line(place, curve.x, curve.y, curve.role, curve.name, curve.width)
+            for rule in panel.rules:
+                span, level = np.array([0.0, max(ends)]), np.full(2, rule.y)
+                self.line(f"{at}/{escaped(f'{rule.name} {rule.y:g}')}", span, level, rule.role)
+            for k, dot in enumerate(panel.dots):
+                self.marks(f"{at}/mark{k}", dot.x, np.array([dot.y]), COLOURS[dot.role], dot.note)
 
     def forecasts(self) -> None:
-        """Record the best run, and its forecasts by the model without effects and with them."""
-        run = self.findings.best or self.findings.latest
+        """Record a run, and its forecasts by the model without effects and with them."""
+        run = forecast_run(self.findings)
         if run is None or self.findings.better is None:
             return
         self.moving("ahead/real", run.trial, "best")
-        for i, name in enumerate(self.task.model.state_names):
-            self.line(f"ahead/{name}/real", run.trial.states[:, i], self.dt, "best", "real")
         for key, planner, colour in (
             ("off", self.findings.crude, "model_policy"),
             ("on", self.findings.better.planner, "predicted"),
@@ -188,9 +157,6 @@ class _Recorder:
                 continue
             states = found.along(run.trial)
             self.moving(f"ahead/{key}", replace(run.trial, states=states), colour, width=1.5)
-            words = self.findings.plain if key == "off" else f"model {self.findings.better.name}"
-            for i, name in enumerate(self.task.model.state_names):
-                self.line(f"ahead/{name}/{key}", states[:, i], self.dt, colour, words)
 
     def trial(self, run: Run) -> None:
         """Record all of one trial under its own name."""
@@ -213,16 +179,13 @@ class _Recorder:
         early = [run for run in self.findings.runs if crash(run) is not None]
         reached = [self.body.path(run.trial.states[: run.trial.finite_steps + 1]) for run in early]
         size = float(np.ptp(np.vstack([points, *reached]), axis=0).max()) if early else 0.0
-        every = list(range(self.task.model.n))
         for run in early:
             name, few = run.trial.id, len(early) <= LABELS
             self.cross(f"paths/crashes/{name}", run, ARM * size, few)
             self.cross(f"trials/{name}/crash", run, ARM * size, True)
-            self.last_values(f"trials/{name}/state/ended", run, every, COLOURS["model"])
-        for role, one in self.compared.items():
-            for i, name in enumerate(self.task.model.state_names):
-                if one is not None:
-                    self.last_values(f"state/{name}/ended_{role}", one, [i], COLOURS[role])
+            at, last = f"trials/{name}/state/ended", run.trial.finite_steps
+            values = run.trial.states[last]
+            self.marks(at, last * self.dt, values, COLOURS["model"], ended(run))
 
     def cross(self, at: str, run: Run, arm: float, labelled: bool) -> None:
         """Record a cross where a run ended early, with a label to see or to hover over."""
@@ -238,23 +201,21 @@ class _Recorder:
         strips = rr.LineStrips3D(lines, labels=labels, show_labels=labelled, **look)
         self.stream.log(at, strips, static=True)
 
-    def last_values(self, at: str, run: Run, columns: list[int], colour: Colour) -> None:
-        """Record the last values of some states as crosses, when a run ended early."""
+    def marks(self, at: str, time: float, values: Array, colour: Colour, note: str) -> None:
+        """Record values at one time as crosses with a note."""
         import rerun as rr
 
-        last = crash(run)
-        values: Array = np.zeros(0) if last is None else run.trial.states[last, columns]
-        if last is None or not np.isfinite(values).all():
+        if not np.isfinite(values).all():
             return
         look = rr.SeriesPoints(
-            colors=[colour] * len(columns),
-            markers=["cross"] * len(columns),
-            marker_sizes=[5.0] * len(columns),
-            names=[ended(run)] * len(columns),
+            colors=[colour] * len(values),
+            markers=["cross"] * len(values),
+            marker_sizes=[5.0] * len(values),
+            names=[note] * len(values),
         )
         self.stream.log(at, look, static=True)
-        when = [rr.TimeColumn("time", duration=np.array([last * self.dt]))]
-        parts = rr.Scalars.columns(scalars=values).partition([len(columns)])
+        when = [rr.TimeColumn("time", duration=np.array([time]))]
+        parts = rr.Scalars.columns(scalars=values).partition([len(values)])
         self.stream.send_columns(at, when, parts)
 
     def signals(self, at: str, trial: Trial, residual: Array) -> None:
@@ -307,17 +268,16 @@ class _Recorder:
         self.stream.log(at, strip, static=True)
 
     def line(
-        self, at: str, values: Array, dt: float, colour: str, name: str = "", width: float = 1.5,
-        begin: float = 0.0,
-    ) -> None:  # fmt: skip
-        """Record the finite values of a curve over time, named by default after its colour."""
+        self, at: str, times: Array, values: Array, role: str, name: str = "", width: float = 1.0
+    ) -> None:
+        """Record the finite values of a curve over time, named by default after its role."""
         import rerun as rr
 
-        style = rr.SeriesLines(colors=COLOURS[colour], names=name or colour, widths=width)
+        style = rr.SeriesLines(colors=COLOURS[role], names=name or role, widths=width)
         self.stream.log(at, style, static=True)
         keep = np.flatnonzero(np.isfinite(values))
-        times = [rr.TimeColumn("time", duration=keep * dt + begin)]
-        self.stream.send_columns(at, times, rr.Scalars.columns(scalars=values[keep]))
+        when = [rr.TimeColumn("time", duration=times[keep])]
+        self.stream.send_columns(at, when, rr.Scalars.columns(scalars=values[keep]))
 
     def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
         """Record the columns of an array as one entity; `units` by the names of the columns."""
@@ -333,16 +293,9 @@ class _Recorder:
         self.stream.send_columns(at, times, scalars.partition([width] * steps))
 
 
-def rate(residual: Array, dt: float, window: int | None = None) -> tuple[Array, float]:
-    """Return a residual per second (T, n) and its interval [s]; averaged if long or noisy.
-
-    Args:
-        residual: (T, n).
-        dt: its interval [s].
-        window: steps to average over; by default the most that any of its columns needs.
-    """
-    if window is None:
-        window = max(window_of([column]) for column in residual.T)
+def rate(residual: Array, dt: float) -> tuple[Array, float]:
+    """Return a residual per second (T, n) and its interval [s]; averaged if long or noisy."""
+    window = max(window_of([column]) for column in residual.T)
     step = max(window, -(-len(residual) // FINE))
     return averaged(residual, step) / dt, step * dt
 
