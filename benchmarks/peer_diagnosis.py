@@ -9,9 +9,7 @@ crude model's residual over five steps on features, and each true law is close t
 
 grounded    the diagnosis
 pysindy     STLSQ of PySINDy, its threshold chosen on held-out trials
-sysidentpy  FROLS of SysIdentPy, terms chosen by its information criterion
 parameters  the model's parameters alone, by maximum likelihood (`grounded.fit`)
-boosting    gradient boosting of scikit-learn; names nothing
 
 Needs the extra `peers`; missing libraries are skipped with a note. A name is "first" if it is the
 true effect, of the "same kind" if it acts alike at the same place, else "wrong".
@@ -39,7 +37,6 @@ from grounded.fit import fit
 
 AHEAD, EVERY, PIECE = 1.0, 10, 5  # [s]; steps between starts; steps of a piece that is regressed
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # of STLSQ, features and targets scaled to one
-MOST_TERMS = 8
 LATE = ("delay", "first_order_lag", "rate_limit", "backlash", "slew_limit")
 STRAIGHT = ("input_gain", "input_curve", "input_fade", "saturation")
 STEADY = ("offset", "input_bias", "drift_world", "drift_body", "slope", "trend", "sensor_bias")
@@ -191,61 +188,10 @@ def by_pysindy(case, log):
     return linear(case, log, solve)
 
 
-def by_sysidentpy(case, log):
-    from sysidentpy.basis_function import Polynomial
-    from sysidentpy.model_structure_selection import FROLS
-    from sysidentpy.parameter_estimation import LeastSquares
-
-    def solve(F, r):
-        k = F.shape[-1]
-        X = np.roll(F.reshape(-1, k)[:, 1:], -1, axis=0)  # a lag of one is its least
-        model = FROLS(
-            order_selection=True,
-            n_info_values=MOST_TERMS,
-            info_criteria="bic",
-            model_type="NFIR",
-            xlag=[[1]] * (k - 1),
-            ylag=1,
-            estimator=LeastSquares(),
-            basis_function=Polynomial(degree=1),
-        )
-        model.fit(X=X, y=r.reshape(-1, 1))
-        c = np.zeros(k)
-        for term, value in zip(model.final_model, np.ravel(model.theta), strict=False):
-            code = int(np.max(term))
-            c[0 if code == 0 else code // 1000 - 1] = value
-        return c
-
-    return linear(case, log, solve)
-
-
-def by_boosting(case, log):
-    from sklearn.ensemble import HistGradientBoostingRegressor
-
-    F, R, _ = regression(log)
-    models = [
-        HistGradientBoostingRegressor(early_stopping=True).fit(
-            F.reshape(-1, F.shape[-1]), R[..., i].reshape(-1)
-        )
-        for i in range(R.shape[-1])
-    ]
-    fresh = Log(case, case.fresh)
-
-    def advance(x, u, change, t):
-        F, _ = features(log, x, u, change)
-        rows = F.reshape(-1, F.shape[-1])
-        rate = np.stack([m.predict(rows) for m in models], axis=-1)
-        return fresh.step(x, u) + log.data.dt * rate.reshape(x.shape)
-
-    return [], errors(fresh, advance)
-
-
 METHODS = {
     "grounded": by_grounded,
     "pysindy": by_pysindy,
-    "sysidentpy": by_sysidentpy,
     "parameters": by_parameters,
-    "boosting": by_boosting,
 }
 
 

@@ -17,6 +17,14 @@ from grounded.challenge import mechanism
 from grounded.compile import Named
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.models.aircraft import model as aircraft_model
+from grounded.models.aircraft_trim import level_trim
+from grounded.models.arm import model as arm_model
+from grounded.models.buggy import model as buggy_model
+from grounded.models.car import model as car_model
+from grounded.models.cart_pole import model as cart_pole_model
+from grounded.models.lift import model as lift_model
+from grounded.models.pendulum import model as pendulum_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +99,6 @@ def _swing(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    from grounded.models.aircraft_trim import level_trim
-
     level = level_trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
     u = np.tile(level.inputs[0], (len(t), 1))
     names = model.input_names
@@ -107,13 +113,11 @@ def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array
 
 def car() -> SystemUnderTest:
     """Return the RC car of section 5.2 (20 to 50 Hz, overhead camera)."""
-    from grounded.models.car import model
-
     process = {"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
     measured = {"delta": 0.01, "v": 0.02, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
     return SystemUnderTest(
         name="car",
-        model=model,
+        model=car_model,
         low=np.array([-1.0, 0.0]),
         high=np.array([1.0, 1.0]),
         process=process,
@@ -128,11 +132,9 @@ def car() -> SystemUnderTest:
 
 def pendulum() -> SystemUnderTest:
     """Return a torque-driven pendulum with an encoder."""
-    from grounded.models.pendulum import model
-
     return SystemUnderTest(
         name="pendulum",
-        model=model,
+        model=pendulum_model,
         low=np.array([-5.0]),
         high=np.array([5.0]),
         process={"theta": 0.004, "omega": 0.06},
@@ -147,8 +149,6 @@ def pendulum() -> SystemUnderTest:
 
 def aircraft() -> SystemUnderTest:
     """Return the small aircraft of section 5.1 (50 Hz)."""
-    from grounded.models.aircraft import model
-
     process = {"u": 0.05, "v": 0.05, "w": 0.05, "p": 0.05, "q": 0.05, "r": 0.03}
     process |= {"north": 0.02, "east": 0.02, "altitude": 0.02, "phi": 0.003, "theta": 0.003}
     process |= {"psi": 0.003}
@@ -156,7 +156,7 @@ def aircraft() -> SystemUnderTest:
     measured |= {"phi": 0.005, "theta": 0.005, "psi": 0.008, "p": 0.02, "q": 0.02, "r": 0.02}
     return SystemUnderTest(
         name="aircraft",
-        model=model,
+        model=aircraft_model,
         low=np.array([0.0, -0.4, -0.4, -0.4]),
         high=np.array([1.0, 0.4, 0.4, 0.4]),
         process=process,
@@ -180,11 +180,9 @@ def _crawl(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 def buggy() -> SystemUnderTest:
     """Return a car with a kink between driving and braking and noise that grows with speed."""
-    from grounded.models.buggy import model
-
     return SystemUnderTest(
         name="buggy",
-        model=model,
+        model=buggy_model,
         low=np.array([-1.0, -0.3]),
         high=np.array([1.0, 1.0]),
         process={"x": 0.01, "y": 0.01, "psi": 0.04, "v": 0.15},
@@ -207,11 +205,9 @@ def _hoist(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 def lift() -> SystemUnderTest:
     """Return an axis with kinks in drive and friction and noise that grows with speed."""
-    from grounded.models.lift import model
-
     return SystemUnderTest(
         name="lift",
-        model=model,
+        model=lift_model,
         low=np.array([-6.0]),
         high=np.array([6.0]),
         process={"z": 0.001, "w": 0.12},
@@ -257,11 +253,9 @@ def _accelerations(model: Model, x: Array) -> tuple[Array, Array]:
 
 def arm() -> SystemUnderTest:
     """Return a two-link arm with encoders, whose real system is simulated by MuJoCo."""
-    from grounded.models.arm import model
-
     return SystemUnderTest(
         name="arm",
-        model=model,
+        model=arm_model,
         low=np.array([-15.0, -15.0]),
         high=np.array([15.0, 15.0]),
         process={"q1_vel": 0.03, "q2_vel": 0.05},
@@ -289,11 +283,9 @@ def _shove(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 def cart_pole() -> SystemUnderTest:
     """Return a cart with a hanging pole, whose real system is simulated by MuJoCo."""
-    from grounded.models.cart_pole import model
-
     return SystemUnderTest(
         name="cart_pole",
-        model=model,
+        model=cart_pole_model,
         low=np.array([-10.0]),
         high=np.array([10.0]),
         process={"x_vel": 0.02, "theta_vel": 0.03},

@@ -17,13 +17,16 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from grounded.challenge import Case, judge, of_crude, oracle, sealed, task_of
 from grounded.diagnosis.parts import Verdict
 from grounded.diagnosis.report import Diagnosis
+from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
+from grounded.experiments.jobs import Job, Progress, run_jobs
 from grounded.findings import found
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
@@ -35,11 +38,6 @@ from grounded_trials.workspace.last_diagnosis import FILE as DIAGNOSIS
 from grounded_trials.workspace.last_diagnosis import write_diagnosis
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import write_target
-
-if TYPE_CHECKING:
-    from grounded.challenge import Case
-    from grounded.engine import Engine
-    from grounded.experiments.jobs import Progress
 
 MANIFEST, TIMES = "manifest.json", "times.json"
 
@@ -62,8 +60,6 @@ def write_cases(
         GroundedError: if the folder already holds a challenge or other cases, or if `labels` lies
             inside it.
     """
-    from grounded.challenge import sealed
-
     if (folder / MANIFEST).exists():
         raise GroundedError(f"{folder} already holds a challenge: name another folder")
     if labels.resolve().is_relative_to(folder.resolve()):
@@ -84,8 +80,6 @@ def write_cases(
 
 def _write_case(case: Case, folder: Path) -> list[str]:
     """Write a case as a workspace; return the SHA-256 of each of its trials."""
-    from grounded.challenge import task_of
-
     store = Store(folder / "trials")
     files = [trial_bytes(trial, {"kind": "data"}) for trial in case.trials]
     hashes = [hashlib.sha256(data).hexdigest() for data in files]
@@ -165,8 +159,6 @@ def score_case(
     Raises:
         GroundedError: if it was not diagnosed, or a trial or label was changed.
     """
-    from grounded.challenge import judge, of_crude, oracle
-
     workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
@@ -205,8 +197,6 @@ def diagnose_cases(
     Raises:
         GroundedError: if the folder holds no challenge, or workers keep dying.
     """
-    from grounded.experiments.jobs import Job, run_jobs
-
     names = undiagnosed(folder, again=again)
     jobs = [
         Job(
@@ -258,8 +248,6 @@ def score_cases(
     Raises:
         GroundedError: if a case was not diagnosed, or a trial or label was changed.
     """
-    from grounded.experiments.jobs import Job, run_jobs
-
     entries = read_manifest(folder)
     where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
     jobs = [Job(score_case, where | {"name": name, "entry": e}) for name, e in entries.items()]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from grounded.challenge import make, simulator, summary
+from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded_cli.console.options import as_json, parallel
 from grounded_cli.console.terminal import bar, names_in, number, say, show, show_json, table
 from grounded_cli.console.workspace_option import typed
+from grounded_trials.challenge import diagnose_cases, score_cases, undiagnosed, write_cases
 from grounded_trials.wording import count
-
-if TYPE_CHECKING:
-    from grounded.engine import Engine
 
 
 @click.group("challenge")
@@ -62,9 +62,6 @@ def make_cases(
     json_: bool,
 ) -> None:
     """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
-    from grounded.challenge import make
-    from grounded_trials.challenge import write_cases
-
     sealed = Path(labels or f"{folder}-labels")
     groups = _at_hand(names_in(systems))
     drawn = make(kind, cases, seed, groups=groups, param_error=param_error)  # type: ignore[arg-type]
@@ -80,8 +77,6 @@ def make_cases(
 
 def _at_hand(groups: list[str]) -> list[str]:
     """Drop the group `mujoco` if it is not installed and others are named; warn on stderr."""
-    from grounded.challenge import simulator
-
     try:
         if "mujoco" in groups:
             simulator()
@@ -107,8 +102,6 @@ def run_cases(
     json_: bool,
 ) -> None:
     """Diagnose the cases of DIR that have no diagnosis yet; an interrupted run resumes."""
-    from grounded_trials.challenge import diagnose_cases, undiagnosed
-
     families = [name for text in without for name in names_in(text)]
     waiting = undiagnosed(Path(folder), again=again)
     with bar("diagnoses") as progress:
@@ -137,9 +130,6 @@ def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
 
     The oracle knows the effects of each case.
     """
-    from grounded.challenge import summary
-    from grounded_trials.challenge import score_cases
-
     sealed = _labels(folder, labels)
     with bar("cases") as progress:
         marks = score_cases(Path(folder), sealed, engine=engine, progress=progress)

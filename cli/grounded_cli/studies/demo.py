@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from grounded.diagnosis.telling import sentence, told
+from grounded.engine import Engine, idle
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import percent
 from grounded_cli.console.options import as_json
@@ -24,12 +26,12 @@ from grounded_cli.console.terminal import (
 from grounded_cli.console.workspace_option import located, next_line
 from grounded_cli.learn import narrated
 from grounded_cli.status import summary
+from grounded_trials import Workspace
+from grounded_trials.report.reporting import save_optimum
+from grounded_trials.starting.examples import example
 from grounded_trials.wording import count, rendered
-
-if TYPE_CHECKING:
-    from grounded_trials import Workspace
-    from grounded_trials.workspace.candidates.proposing import Status
-
+from grounded_trials.workspace.candidates.proposing import Status
+from grounded_trials.workspace.candidates.running import optimum
 
 MOST = 3  # effects that are looked for if not all trials are used: each more takes 20 s
 MANY = 1.5  # times as many trials as fit into STEPS: fewer are all used
@@ -46,13 +48,6 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
-    from grounded.diagnosis.telling import sentence, told
-    from grounded.engine import Engine, idle
-    from grounded_trials import Workspace
-    from grounded_trials.report.reporting import save_optimum
-    from grounded_trials.starting.examples import example
-    from grounded_trials.workspace.candidates.running import optimum
-
     example(name)
     target = Path(folder or f"demo-{name}")
     if target.exists() and any(target.iterdir()):

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from grounded.engine import Engine
+from grounded.experiments import car, flight, footnote9, nondeterminism, theorem1
 from grounded_cli.console.options import as_json, parallel
 from grounded_cli.console.terminal import bar, show, show_json, table
+from grounded_trials.report.study_pictures import draw_study
+from grounded_trials.store.documents import StudyStore
 
-if TYPE_CHECKING:
-    from grounded.engine import Engine
-
-# name -> (module, function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
-STUDIES = {
-    "flight": ("flight", "run", "count", "Table 1 and Figure 1: the aircraft's figure-8"),
-    "car": ("car", "run", "seeds", "the car's three tasks, Figures 4 and 5"),
-    "nondeterminism": ("nondeterminism", "run", "runs", "repeated open-loop runs (5.2)"),
-    "footnote9": ("footnote9", "run", "", "a model that is wrong by a constant"),
-    "theorem1": ("theorem1", "run", "seeds", "gradient error and where the search ends"),
+# name -> (function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
+STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
+    "flight": (flight.run, "count", "Table 1 and Figure 1: the aircraft's figure-8"),
+    "car": (car.run, "seeds", "the car's three tasks, Figures 4 and 5"),
+    "nondeterminism": (nondeterminism.run, "runs", "repeated open-loop runs (5.2)"),
+    "footnote9": (footnote9.run, "", "a model that is wrong by a constant"),
+    "theorem1": (theorem1.run, "seeds", "gradient error and where the search ends"),
 }
 
 
@@ -46,15 +47,12 @@ def command(
     Without NAME the studies are listed. Finished jobs are kept, so an interrupted study resumes.
     """
     if name is None and json_:
-        show_json({"studies": {key: text for key, (_, _, _, text) in STUDIES.items()}})
+        show_json({"studies": {key: text for key, (_, _, text) in STUDIES.items()}})
         return
     if name is None:
-        show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
+        show("\n".join(f"{key:15} {text}" for key, (_, _, text) in STUDIES.items()))
         return
-    from grounded_trials.store.documents import StudyStore
-
-    module, function, kind, _ = STUDIES[name]
-    study = getattr(importlib.import_module(f"grounded.experiments.{module}"), function)
+    study, kind, _ = STUDIES[name]
     given: dict[str, Any] = _seeds(seeds, kind, name)
     if kind:
         given |= {
@@ -66,8 +64,6 @@ def command(
             given["progress"] = progress
         result = study(**given)
     if png:
-        from grounded_trials.report.study_pictures import draw_study
-
         draw_study(name, result, Path(png))
     if json_:
         show_json(result.to_json())

@@ -9,21 +9,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from grounded.errors import GroundedError, needs
-from grounded.figures.figure import typeset
+from grounded.figures.figure import Figure, typeset
 from grounded.result import Result
+from grounded_trials.report.figures.png import png as drawn
+from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.layouts import write_layouts
+from grounded_trials.report.page.page import page
+from grounded_trials.report.recording.recording import write_recording
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
-
-if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
 
 RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
 STAMP = "watched.svg"
@@ -43,8 +46,6 @@ class Report(Result):
 
     def _repr_html_(self) -> str:
         """Return the candidates, the diagnosis in three lines and the next command as HTML."""
-        from html import escape
-
         findings = self.findings
         lines = "".join(f"<p>{escape(typeset(line))}</p>" for line in findings.lines)
         lines += f"<p>next: <code>{escape(findings.next_command)}</code></p>"
@@ -53,8 +54,6 @@ class Report(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return all figures of the page."""
-        from grounded_trials.report.figures.runs import all_figures
-
         return all_figures(self.findings)
 
     def to_json(self) -> dict[str, Any]:
@@ -132,8 +131,6 @@ def report_in(workspace: Folder, *, html: bool, png: bool, rrd: bool) -> Report:
 
 def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     """Write reports/recording.rrd for the Rerun viewer; return its path."""
-    from grounded_trials.report.recording.recording import write_recording
-
     path = made_folder(workspace.reports) / RECORDING
     write_recording(findings or gather(workspace), path)
     return path
@@ -141,8 +138,6 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
 
 def save_layouts(workspace: Folder, findings: Findings) -> tuple[Path, Path]:
     """Write the layouts for Foxglove and PlotJuggler to reports/; return their paths."""
-    from grounded_trials.report.layouts import write_layouts
-
     return write_layouts(made_folder(workspace.reports), findings.task.model)
 
 
@@ -152,8 +147,6 @@ def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
     A page opened from a file may load pictures from its folder, but no data. So the revision is
     stored as the width of an empty picture.
     """
-    from grounded_trials.report.page.page import page
-
     path = made_folder(workspace.reports) / PAGE
     write_atomically(path, page(findings, watched).encode())
     if watched:
@@ -194,13 +187,10 @@ def _changed(workspace: Folder) -> list[tuple[str, int, int]]:
 
 def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
     """Write the figures of the page as reports/utility.png, paths.png etc.; return their paths."""
-    from grounded_trials.report.figures.png import png
-    from grounded_trials.report.figures.runs import all_figures
-
     paths = []
     for figure in all_figures(findings):
         path = made_folder(workspace.reports) / f"{figure.name}.png"
-        write_atomically(path, png(figure))
+        write_atomically(path, drawn(figure))
         paths.append(path)
     return paths
 
