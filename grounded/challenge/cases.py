@@ -79,7 +79,7 @@ def make(
         raise GroundedError(f"kinds of challenge: {', '.join(KINDS)}; got '{kind}'")
     if only is not None and only not in systems.SYSTEMS:
         raise GroundedError(f"systems of the challenge: {', '.join(systems.SYSTEMS)}; got '{only}'")
-    share = _shares(groups)
+    share = shares_of(groups)
     if only is None and "mujoco" in groups:
         simulator()
     for i in range(count):
@@ -93,7 +93,7 @@ def make(
         yield case
 
 
-def _shares(groups: Sequence[str]) -> dict[str, float]:
+def shares_of(groups: Sequence[str]) -> dict[str, float]:
     """Return the probability of each system.
 
     Raises:

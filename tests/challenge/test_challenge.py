@@ -215,7 +215,7 @@ def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
     folder, seen = tmp_path / "cases", []
     said("make", folder, "--kind", "none", "--cases", "1", "--seed", "5")
     monkeypatch.setattr(
-        "grounded_trials.challenge.diagnose_cases",
+        "grounded_cli.studies.challenge.diagnose_cases",
         lambda folder, *, without, **others: seen.append(without) or {"none-0000": 1.0},
     )
     out = said("run", folder, "--without", "delay,offset", "--without", "stall").out

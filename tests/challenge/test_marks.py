@@ -5,7 +5,7 @@ import pytest
 
 from cli import grounded
 from grounded.challenge import judge, make, of_crude, summary
-from grounded.challenge.cases import _shares
+from grounded.challenge.cases import shares_of
 from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
 from grounded.challenge.score import Oracle, share
 from grounded.challenge.systems import SYSTEMS
@@ -59,12 +59,12 @@ def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
 
 
 def test_own_systems_are_half_of_a_mixture():
-    share = _shares(("own", "kinked", "mujoco"))
+    share = shares_of(("own", "kinked", "mujoco"))
     assert sum(share.values()) == pytest.approx(1.0)
     assert share["car"] + share["pendulum"] + share["aircraft"] == pytest.approx(0.5)
     assert set(share) == set(SYSTEMS)
     with pytest.raises(GroundedError, match="groups of systems: own, kinked, mujoco; got 'others'"):
-        _shares(["others"])
+        shares_of(["others"])
 
 
 @pytest.mark.parametrize(

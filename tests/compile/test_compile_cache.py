@@ -35,7 +35,7 @@ def test_compiles_once(home, monkeypatch):
     def never(*args):
         raise AssertionError("compiled again")
 
-    monkeypatch.setattr("grounded.compile.run.compiled.Kernels._text", never)
+    monkeypatch.setattr("grounded.compile.run.compiled.Kernels.text", never)
     assert np.array_equal(run(), first)
 
 

@@ -74,14 +74,14 @@ def test_from_manual_driving_to_trials_of_a_policy(robot, tmp_path, monkeypatch)
 def from_manual_driving_to_trials(room):
     room.mkdir()
     log, w = room / "bag", room / "car"
-    drive("--manual", 8, log)
+    drive("--manual", 6, log)
     unless_stopped(next(log.glob("*.mcap")))
     made = grounded("init", w, "--from", log, "--model", HERE / "model.py", "--json").json
     paths = {one["name"]: one["path"] for one in made["signals"]}
     assert paths["v"] == "/odom.twist.twist.linear.x"
     assert paths["speed"] == "/drive.twist.linear.x" and paths["steering"].endswith("angular.z")
     assert grounded("-C", w, "ingest", "--data", log).code == 0
-    assert grounded("-C", w, "target", "circle", "--speed", 1.2, "--size", 1.5).code == 0
+    assert grounded("-C", w, "target", "circle", "--speed", 1.2, "--size", 1).code == 0
     program = f"{sys.executable} {HERE}/drive.py {{candidate}} {{trial}}"
     kept = f"cp {{trial}} {room}/$$.mcap"
     with (w / "grounded.toml").open("a") as file:

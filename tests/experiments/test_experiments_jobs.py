@@ -12,7 +12,7 @@ import pytest
 
 import experiment_jobs
 from facts import holding
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.engine import Engine
 from grounded.errors import GroundedError
 from grounded.experiments.jobs import Job, run_jobs
@@ -90,9 +90,10 @@ def test_engines_that_make_no_sense_are_refused():
             Engine(**wrong)
 
 
-@pytest.fixture
-def cluster(tmp_path):
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
     """A scheduler and two worker processes of their own: (address, workers)."""
+    tmp_path = tmp_path_factory.mktemp("cluster")
     pytest.importorskip("distributed", reason='dask is not installed: pip install ".[cluster]"')
     path = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(path), "OPENBLAS_NUM_THREADS": "1"}
@@ -128,22 +129,6 @@ def _wait_for(condition, seconds=60):
 def _address(text):
     found = re.search(r"Scheduler at:\s*(tcp://[\d.:]+)", text)
     return found.group(1) if found else None
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of Dask and tornado, about themselves
-def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
-    address, workers = cluster
-    jobs = draws(12, sleep=0.3)
-
-    def kill_one_half_way(done, total):
-        if done == 5:
-            workers[0].kill()
-
-    engine = Engine(name="dask", address=address)
-    found = run_jobs(jobs, engine, progress=kill_one_half_way)
-    assert workers[0].wait(20) != 0
-    assert found == run_jobs(jobs)
 
 
 @pytest.mark.slow
@@ -195,13 +180,29 @@ def runs_of(model, count, steps):
 def test_a_fit_and_a_diagnosis_on_a_cluster_give_the_same_bits(cluster, tmp_path, monkeypatch):
     (tmp_path / "lag.py").write_text(LAG)  # as in a workspace: no worker can import it
     model = load_module(tmp_path, "lag.py").model
-    trials, engine = runs_of(model, 12, 100), Engine(name="dask", address=cluster[0])
+    trials, engine = runs_of(model, 6, 60), Engine(name="dask", address=cluster[0])
     blocks = sys.modules["grounded.diagnosis.likelihood.refine"]
     monkeypatch.setattr(blocks, "MOST_NUMBERS", 1.0)
     one, many = (fit(model, trials, engine=e) for e in (None, engine))
     assert one.to_json() == many.to_json() and one.loglik == many.loglik
     assert np.array_equal(one.covariance, many.covariance)
     assert one.params["gain"].value == pytest.approx(2.4, abs=0.1)
-    few = trials[:2]
-    one, many = (diagnose(model, few, engine=e).to_json() for e in (None, engine))
+    short = DiagnosisOptions(max_effects=1)
+    one, many = (diagnose(model, trials[:2], short, engine=e).to_json() for e in (None, engine))
     assert one == many and one["verdict"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Dask and tornado, about themselves
+def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
+    address, workers = cluster
+    jobs = draws(12, sleep=0.3)
+
+    def kill_one_half_way(done, total):
+        if done == 5:
+            workers[0].kill()
+
+    engine = Engine(name="dask", address=address)
+    found = run_jobs(jobs, engine, progress=kill_one_half_way)
+    assert workers[0].wait(20) != 0
+    assert found == run_jobs(jobs)

@@ -104,10 +104,11 @@ class Kernels:
         with self._lock:
             if key not in self._libraries:
                 digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
-                self._libraries[key] = jit.library(digest, lambda: self._text(key), names)
+                self._libraries[key] = jit.library(digest, lambda: self.text(key), names)
             return self._libraries[key]
 
-    def _text(self, which: Layout | str) -> str:
+    def text(self, which: Layout | str) -> str:
+        """Write the LLVM code of a kernel."""
         from grounded.compile.emit import modules  # only what no cache holds is written
 
         about = (self._variant, self.sizes, self._kind, self._integrator)
