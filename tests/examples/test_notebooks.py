@@ -16,12 +16,14 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 BOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 
 
-def run(name, folder, monkeypatch):
-    """The code cells of a notebook in order, in one namespace, in an empty folder."""
+def run(name, folder, monkeypatch, since="#", **known):
+    """The code cells of a notebook from a heading on, in one namespace, in an empty folder."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    space = {"__name__": "__main__"}
-    for cell in json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]:
+    space = {"__name__": "__main__", **known}
+    cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
+    first = next(k for k, cell in enumerate(cells) if cell["source"][0].startswith(since))
+    for cell in cells[first:]:
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), f"{name}:{cell['id']}", "exec"), space)
     return space
@@ -66,7 +68,7 @@ def test_a_diagnosis(tmp_path, monkeypatch):
 def test_a_diagnosis_of_a_real_machine(tmp_path, monkeypatch):
     """It has dry and viscous friction of the published size, and its amplifier an offset."""
     monkeypatch.setenv("EMPS_DATA", str(data("emps_prismatic_axis")))
-    machine = run("diagnosis", tmp_path, monkeypatch)["machine"]
+    machine = run("diagnosis", tmp_path, monkeypatch, "## A real machine", Path=Path)["machine"]
     assert machine.values("coulomb_friction:v")["c"] == pytest.approx(20.394 / 95.109, rel=0.07)
     assert machine.values("viscous_friction:v")["k"] == pytest.approx(203.5 / 95.109, rel=0.05)
     assert machine.values("input_bias:u")["b"] == pytest.approx(3.165 / 35.1507, rel=0.05)

@@ -12,7 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.estimate import NoiseStd, of_states
+from grounded.estimate.likelihood import first_noise
+from grounded.estimate.record import batch_of, records_of
+from grounded.estimate.trials import smooth_trials
 from grounded.frozen import Array
+from grounded.places import true_values
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
 from grounded.solve.bias import residuals
@@ -91,17 +96,10 @@ def _known(planner: Planner, trial: Trial) -> Trial:
     Of a sensor that is late, a filter estimates the true value. Its motion is as uncertain as a
     tenth of its change in a step, see `first_noise`.
     """
-    from grounded.places import true_values
-
     lifted, model, n = anchored(planner, trial), planner.plan.model, planner.task.model.n
     behind = true_values(model.state_names, model.state_names[n:])
     if not behind:
         return lifted
-    from grounded.estimate import NoiseStd, of_states
-    from grounded.estimate.likelihood import first_noise
-    from grounded.estimate.record import batch_of, records_of
-    from grounded.estimate.trials import smooth_trials
-
     seen = np.where(np.arange(model.n) < n, lifted.states, np.nan)
     seen[0] = lifted.states[0]  # before the start they were settled
     logged, measures = replace(lifted, states=seen), of_states(model)
@@ -124,8 +122,6 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
     The true value of a state that is logged late or with a lag follows from the model alone, and
     drifts. The model's residual of that state is the drift, and is added to the memory.
     """
-    from grounded.places import true_values
-
     lifted, n = planner.lift(trial), planner.task.model.n
     names = planner.plan.model.state_names
     behind = true_values(names, names[n:])
