@@ -34,12 +34,15 @@ import re
 import subprocess
 import sys
 import tomllib
+from contextlib import chdir
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from cli import Done, grounded
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
 from shared_data import DATA
@@ -183,6 +186,23 @@ class Page:
         finally:
             os.chdir(before)
 
+    def done(self, command: str, folder: Path) -> Done:
+        """A command's result: in this process if it is `grounded` and plain words, else in bash."""
+        program, *words = command.split()
+        if program == "grounded" and re.fullmatch(r"[\w ./:,=+-]*", " ".join(words)):
+            with chdir(folder), patch.dict(os.environ, self.env):
+                return grounded(*words)
+        ran = subprocess.run(
+            ["bash", "-c", command],
+            cwd=folder,
+            env=self.env,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=False,
+        )
+        return Done(ran.returncode, ran.stdout, ran.stderr)
+
     def console(self, block: Block) -> None:
         steps = sessions(block.text)
         if block.language != "console" and not steps:
@@ -195,25 +215,17 @@ class Page:
                 if "&&" not in command:
                     continue
                 command = command.split("&&", 1)[1].strip()
-            done = subprocess.run(
-                ["bash", "-c", command],
-                cwd=folder,
-                env=self.env,
-                capture_output=True,
-                text=True,
-                timeout=600,
-                check=False,
-            )
+            done = self.done(command, folder)
             last = k == len(steps) - 1
             wanted = int(block.marks.get("exit", "0")) if last else 0
-            said = f"line {block.line}: $ {command}\n{done.stdout}{done.stderr}"
-            assert done.returncode == wanted, said
+            said = f"line {block.line}: $ {command}\n{done.out}{done.err}"
+            assert done.code == wanted, said
             if part := float(block.marks.get("figures", "0")):
-                otherwise = told_otherwise("\n".join(shown), done.stdout, part)
+                otherwise = told_otherwise("\n".join(shown), done.out, part)
                 assert not otherwise, f"{said}\nthe page shows {otherwise}"
                 continue
-            lost = missing_lines(shown, done.stdout + done.stderr)
-            lost = missing_lines(shown, done.stderr + done.stdout) if lost else lost
+            lost = missing_lines(shown, done.out + done.err)
+            lost = missing_lines(shown, done.err + done.out) if lost else lost
             assert not lost, f"{said}\nshown in the page, not in the output: {lost}"
 
 
