@@ -20,23 +20,23 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, Weight
 from grounded.frozen import Array
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials import Workspace
 
 BEFORE = 12  # rows before the run, at its start
 DEGREES = 180 / np.pi
-ACCUSED = re.compile(
-    r"scale|in each other's column|look exchanged|of the other sign|degrees|too (?:large|small)"
-    r"|offset|is 0 from the first"
-)
+FAULTS = ("unit", "folded", "sign", "exchange", "dead", "offset", "zero", "crossed", "stated")
+FAULTS = (*(f"log.{kind}" for kind in FAULTS), "run.exchanged")  # of columns
+OTHERS = {"log.another", "log.earlier"}  # it ran another candidate
 
 
 def columns(w: Workspace, trial: Trial) -> tuple[list[str], Array]:
@@ -91,23 +91,17 @@ def faults(w: Workspace, names: list[str], rows: Array) -> Iterator[tuple[str, s
     yield "second half lost", set(), rows[: BEFORE + T // 2]
 
 
-def judged(w: Workspace, at: set[str], said: str, stored: bool, warned: str) -> str:
-    """Return the class of what was said of a log."""
-    text = re.split(r"\(misses|differs by [^;]*;", warned if stored else said)
-    text = " ".join(part.split("; the opposite sign")[0] for part in (text[0], text[-1])).strip()
-    accused = {n for n in (*w.base_model.states, *w.base_model.inputs) if _named(n, text)}
-    blamed = accused if ACCUSED.search(text) else set()
-    if re.search(r"(?:are|be) those of c\d", text) or "made for an earlier task" in text:
+def judged(w: Workspace, at: set[str], findings: Sequence[Finding]) -> str:
+    """Return the class of what was found in a log."""
+    names = {*w.base_model.states, *w.base_model.inputs}
+    blamed = names & {name for one in findings if one.code in FAULTS for name in one.about}
+    if any(one.code in OTHERS for one in findings):
         return "wrong"
     if blamed - at and not (at and at <= blamed and len(blamed) <= len(at) + 1):
         return "wrong"
     if blamed & at:
         return "told"
-    return "unsaid" if text else "stored"
-
-
-def _named(name: str, text: str) -> bool:
-    return re.search(rf"(?<![\w.]){re.escape(name)}(?![\w])", text) is not None
+    return "unsaid" if any(one.weight is not Weight.NOTE for one in findings) else "stored"
 
 
 def study(folder: Path, room: Path) -> Counter[str]:
@@ -132,17 +126,14 @@ def study(folder: Path, room: Path) -> Counter[str]:
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(base, copy)
         np.savetxt(log, changed, "%.9g", ",", header=",".join(names), comments="")
-        said, warned, stored = "", "", False
         try:
-            done = Workspace(copy).ingest(log, candidate=None)
-            warned, stored = " ".join(done.warnings), True
-            if done.candidate != trial.candidate:
-                warned += f" they are those of {done.candidate}"
+            findings = Workspace(copy).ingest(log, candidate=None).findings
         except GroundedError as error:
-            said = str(error)
-        kind = judged(w, at, said, stored, warned)
+            findings = (error.finding or Finding("log.reading", weight=Weight.REFUSE),)
+        kind = judged(w, at, findings)
         found[kind] += 1
-        print(f"{kind:7} {name:24} {(warned if stored else said)[:230]}", flush=True)
+        told = ", ".join(f"{one.code} {' '.join(one.about)}" for one in findings)
+        print(f"{kind:7} {name:24} {told}", flush=True)
     print(f"{folder.name}: {dict(found)}\n", flush=True)
     return found
 

@@ -100,7 +100,6 @@ def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
 
 
 def test_a_case_that_is_refused_counts_and_the_others_go_on(made, tmp_path, monkeypatch):
-    """An alarm of the instruments in one of 100 cases ended their run."""
     folder, labels, document = made
     name = document["cases"][0]
     case = tmp_path / name
