@@ -13,15 +13,14 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from helpers import grounded
 
+from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import trial_bytes, write_trial
 from grounded_trials.workspace.identity import encoded
@@ -29,9 +28,7 @@ from grounded_trials.workspace.identity import encoded
 BUDGET = {"status": 1, "propose": 1, "ingest": 1, "report --html": 5, "million": 10}  # [s]
 NOISE, LEFT, SEED = 1e-4, 0.2, 7  # [m, m/s, rad]; of the first error, after the last candidate
 
-ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # as for users: modules are compiled once
-ENVIRONMENT["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "many-trials-bytecode")
+BYTECODE = str(Path(tempfile.gettempdir()) / "many-trials-bytecode")  # as for users: compiled once
 
 
 def made(folder, trials, candidates):
@@ -99,8 +96,6 @@ def long_log(folder, steps=1_000_000):
         w = Workspace.create(folder, example="pendulum")
         rng = np.random.default_rng(SEED)
         model, dt = w.base_model, w.config.task.dt
-        from grounded.trial import Trial
-
         trial = Trial(
             states=rng.standard_normal((steps + 1, model.n)),
             inputs=rng.standard_normal((steps, model.m)),
@@ -115,23 +110,13 @@ def long_log(folder, steps=1_000_000):
 
 def timed(name, *command):
     """Run a command and print its row."""
-    code = "from grounded_cli.start import main; main()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=ENVIRONMENT,
-    )
-    told = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
-    seconds = used.ru_utime + used.ru_stime
+    ran = grounded(*command, PYTHONDONTWRITEBYTECODE="", PYTHONPYCACHEPREFIX=BYTECODE)
     budget = BUDGET.get(name.split(",")[0])
-    ratio = f"{seconds / budget:5.2f} of {budget} s" if budget else " " * 10
-    print(f"{name:24} {seconds:7.2f} s CPU {ratio}; {used.ru_maxrss / 1024:6.0f} MB", flush=True)
-    if status:
-        print(told)
-    return told
+    ratio = f"{ran.seconds / budget:5.2f} of {budget} s" if budget else " " * 10
+    print(f"{name:24} {ran.seconds:7.2f} s CPU {ratio}; {ran.megabytes:6.0f} MB", flush=True)
+    if ran.status:
+        print(ran.out)
+    return ran.out
 
 
 def main():

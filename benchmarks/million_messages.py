@@ -11,9 +11,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from helpers import fastest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from peers import fastest
 
 from grounded_trials.logs.signals import SignalSpec, read_signals
 

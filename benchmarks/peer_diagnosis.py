@@ -26,6 +26,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from helpers import table
 
 from grounded.challenge import make, task_of
 from grounded.diagnosis.diagnose import diagnose
@@ -250,20 +251,19 @@ def measured(case, methods):
     return row
 
 
-def table(rows):
+def results(rows):
     """Return the rows as a Markdown table."""
-    lines = [
-        "| method | first | same kind | wrong | nothing | error over the oracle's, median | CPU s |"
-    ]
-    lines.append("|---" * 7 + "|")
+    head = ["method", "first", "same kind", "wrong", "nothing"]
+    head += ["error over the oracle's, median", "CPU s"]
+    lines = []
     for name in dict.fromkeys(n for row in rows for n in row):
         some = [row[name] for row in rows if name in row]
         marks = Counter(one["mark"] for one in some)
         median = np.median([one["over_oracle"] for one in some])
         seconds = np.mean([one.get("cpu_s", 0.0) for one in some])
-        cells = [str(marks[k]) for k in ("first", "same kind", "wrong", "nothing")]
-        lines.append(f"| {' | '.join([name, *cells, f'{median:.3f}', f'{seconds:.1f}'])} |")
-    return "\n".join(lines)
+        counts = [marks[k] for k in ("first", "same kind", "wrong", "nothing")]
+        lines.append([name, *counts, f"{median:.3f}", f"{seconds:.1f}"])
+    return table(head, lines)
 
 
 def main():
@@ -284,7 +284,7 @@ def main():
         print(f"{case.name} {case.label['effects'][0]['effect']}: {told}", file=sys.stderr)
         if asked.json:
             asked.json.write_text(json.dumps(rows, indent=1))
-    print(table(rows))
+    print(results(rows))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ includes the previous input. Prints a JSON line.
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
+from helpers import fastest
 
 from grounded.compile import Problem
 from grounded.experiments.car_tasks import car_task
@@ -32,21 +32,6 @@ from grounded.search.first_guess import first_guess
 CLOSE = 1e-4  # relative distance from the best known cost at which a solver is done
 STEP = 6e-6  # of Crocoddyl's differences
 Solver = Callable[[SimpleNamespace], dict[str, object]]
-
-
-def fastest(function: Callable[[], object], repeats: int = 20) -> float:
-    """Return the least CPU seconds of a few calls, child processes included."""
-
-    def spent() -> float:
-        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return time.process_time() + ended.ru_utime + ended.ru_stime
-
-    times = []
-    for _ in range(repeats):
-        start = spent()
-        function()
-        times.append(spent() - start)
-    return min(times)
 
 
 xp: ModuleType = np  # whose functions the smooth car calls; see `load`

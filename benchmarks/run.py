@@ -15,15 +15,14 @@ import argparse
 import json
 import os
 import platform
-import resource
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import llvmlite
 import numpy as np
-from peers import CLOSE, case, fastest
+from helpers import fastest, grounded, python
+from peers import CLOSE, case
 
 from grounded.compile import DescentOptions
 from grounded.solve.ddp import solve
@@ -93,39 +92,32 @@ def process_part(options):
     installation of a package.
     """
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"GROUNDED_CACHE": str(Path(folder) / "cache")}
-        environment |= {"PYTHONPYCACHEPREFIX": str(Path(folder) / "pyc"), "PYTHONPATH": ROOM}
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)
-
-        def spent(*command):
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            subprocess.run(
-                [sys.executable, *command], env=environment, check=True, capture_output=True
-            )
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        environment = {"GROUNDED_CACHE": f"{folder}/cache", "PYTHONPYCACHEPREFIX": f"{folder}/pyc"}
+        environment |= {"PYTHONPATH": ROOM, "PYTHONDONTWRITEBYTECODE": ""}
 
         codes = ("pass", "import grounded_cli.main")
-        bare, imported = (min(spent("-c", code) for _ in range(5)) for code in codes)
+        bare, imported = (
+            min(python("-c", code, **environment).seconds for _ in range(5)) for code in codes
+        )
         print(f"\nWhole processes, CPU seconds (bare python: {bare:.3f})")
         print(f"  import grounded_cli.main    {imported:.3f}  ({imported - bare:.3f} over bare)")
         made = Path(folder) / "flight"
 
-        def grounded(*words):
-            return spent("-m", "grounded_cli.main", "-C", str(made), *words)
+        def ours(*words):
+            return grounded("-C", made, *words, **environment).seconds
 
         def proposed(identity):
             for old in (made / "candidates").glob(f"{identity}*"):
                 old.unlink()  # or the outstanding one is proposed again
-            return grounded("propose")
+            return ours("propose")
 
-        spent("-m", "grounded_cli.main", "init", str(made), "--example", "flight-figure8")
+        grounded("init", made, "--example", "flight-figure8", **environment)
         proposed("c0001")
-        environment["GROUNDED_CACHE"] = str(Path(folder) / "empty")
+        environment["GROUNDED_CACHE"] = f"{folder}/empty"
         print(f"  propose, first policy, cold {proposed('c0001'):.3f}")
         print(f"  propose, first policy, warm {min(proposed('c0001') for _ in range(7)):.3f}")
-        grounded("run")
-        grounded("ingest", *map(str, (made / "runs").glob("*.mcap")))
+        ours("run")
+        ours("ingest", *(made / "runs").glob("*.mcap"))
         proposed("c0002")
         print(f"  propose, improvement, warm  {min(proposed('c0002') for _ in range(7)):.3f}")
 

@@ -14,7 +14,7 @@ import sys
 
 from benchmarks.foreign.optimum import optimum, remember
 from benchmarks.foreign.setups import SETUPS, setup
-from benchmarks.foreign.study import adopting, measured, table
+from benchmarks.foreign.study import adopting, measured, results
 
 
 def main() -> int:
@@ -43,11 +43,11 @@ def main() -> int:
             print(adopting(one, asked.adopt), flush=True)
         else:
             rows.append(measured(one))
-            say(table(rows[-1:]).splitlines()[-1])
+            say(results(rows[-1:]).splitlines()[-1])
     if asked.json:
         print(json.dumps([row.to_json() for row in rows], indent=1))
     elif rows:
-        print(table(rows))
+        print(results(rows))
     return 0
 
 

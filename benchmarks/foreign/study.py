@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
+from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
@@ -128,7 +129,7 @@ def adopting(setup: Setup, after: int) -> str:
         trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
     utilities = [task.utility(trial) for trial in trials]
     best, final = known().get(setup.name, {}).get("utility"), max(utilities)
-    reached = "/".join("-" if t is None else str(t) for t in trials_to(setup, utilities, best))
+    reached = reached_in(trials_to(setup, utilities, best))
     off = "-" if best is None else f"{100 * (best - final) / abs(best):.1f} %"
     cells = (setup.name, claimed, f"{final:.4g}", off, str(len(trials)), reached)
     return f"| {' | '.join(cells)} |"
@@ -148,12 +149,17 @@ def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple
     )
 
 
+def reached_in(trials: tuple[int | None, ...]) -> str:
+    """Return the trials of `trials_to` as text."""
+    return "/".join("-" if t is None else str(t) for t in trials)
+
+
 def held(setup: Setup) -> Policy:
     """Return a policy that holds the inputs from before the start."""
     return setup.task.policy(np.tile(setup.task.past, (setup.task.horizon, 1)), None, None)
 
 
-def table(rows: list[Row]) -> str:
+def results(rows: list[Row]) -> str:
     """Return the rows as a Markdown table."""
 
     def number(value: float | None) -> str:
@@ -163,12 +169,11 @@ def table(rows: list[Row]) -> str:
         "set-up", "withheld", "first", "final", "optimum", "trials", "to 90/97/99 %",
         "CPU s", "ended",
     )  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for r in rows:
-        reached = "/".join("-" if t is None else str(t) for t in r.reached)
-        cells = (
-            r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), str(r.trials),
-            reached, f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
-        )  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    cells = [
+        (
+            r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), r.trials,
+            reached_in(r.reached), f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
+        )
+        for r in rows
+    ]  # fmt: skip
+    return table(head, cells)
