@@ -144,7 +144,7 @@ def test_the_weights_of_a_wheels_speed_follow_the_track():
 
 @pytest.mark.slow
 def test_friction_of_two_wheels_is_named_and_the_parameters_are_right():
-    found = gr.diagnose(rover, [driven(k, np.array([0.6, 0.9])) for k in range(3)])
+    found = gr.diagnose(rover, [driven(k, np.array([0.6, 0.9]), 150) for k in range(2)])
     assert {*found.verdict.effects} == {LEFT, RIGHT}
     values = {one.effect: one.params for one in found.ranking}
     assert values[LEFT]["c"].value == pytest.approx(0.6, abs=0.02)
