@@ -158,7 +158,7 @@ def probe(
     expected = trust * most
     pair: dict[str, Any] = {"effect": group[0], "others": group[1]}
     if expected >= NATS:
-        step = found("gap.next.probe", *group[:2], nats=expected, probe=words, **pair)
+        step = found("gap.next.probe", *group[:2], by=expected, probe=words, **pair)
         return Probe(chosen, expected, (group[0], group[1]), step)
     claimed = next((name for name in group[:2] if name in diagnosis.effects), None)
     claimed = claimed if most < NOTHING and not diagnosis.contested else None

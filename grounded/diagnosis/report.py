@@ -10,7 +10,7 @@ from typing import Any, Self
 from grounded.diagnosis.parts import Diagnosed
 from grounded.diagnosis.pictures import gap_figures
 from grounded.diagnosis.tables import instrument_lines
-from grounded.diagnosis.telling import told
+from grounded.diagnosis.telling import LINES, told
 from grounded.figures.figure import Figure
 from grounded.result import html_table
 
@@ -28,7 +28,8 @@ class Diagnosis(Diagnosed):
     def from_json(cls, document: Any) -> Self:
         """Read what `to_json` wrote; findings of other versions are left out."""
         found = super().from_json(document)
-        return replace(found, findings=tuple(one for one in found.findings if one.printable))
+        kept = (one for one in found.findings if one.printable and one.code not in LINES)
+        return replace(found, findings=tuple(kept))
 
     @property
     def sentence(self) -> str:
@@ -37,11 +38,12 @@ class Diagnosis(Diagnosed):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `diagnose --json`, with what its findings say in words."""
-        document, verdict = super().to_json(), self.verdict.to_json()
-        unknowable = [one.sentence for one in self.findings if one.code in UNKNOWABLE]
-        return {"verdict": verdict | {"sentence": self.sentence}} | {
-            key: value for key, value in document.items() if key != "verdict"
-        } | {"next_trial": self.next_trial, "unknowable": unknowable}  # fmt: skip
+        document, told_now = super().to_json(), (*told(self).lines, *self.findings)
+        document["verdict"]["sentence"] = self.sentence
+        document["findings"] = [one.to_json() for one in told_now]
+        document["next_trial"] = self.next_trial
+        document["unknowable"] = [one.sentence for one in told_now if one.code in UNKNOWABLE]
+        return document
 
     def figures(self) -> Sequence[Figure]:
         """Return figures: predictions before and after, the credit, where the gap is."""

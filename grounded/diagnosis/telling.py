@@ -19,6 +19,10 @@ from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import measured, number, percent
 
+LINES = frozenset(  # codes of the lines, which are made from the facts
+    f"gap.{name}"
+    for name in ("causes", "none", "unknown", "too_few", "errors", "left", "lacks", "where")
+)
 CAUSES = 2  # told in words; the table has all
 FINDINGS = 3  # told beside the lines; the others with --details
 LEAST_SHARE = 0.005  # of the gap: a channel below it is not told

@@ -38,6 +38,9 @@ def test_every_entry_prints(code, entry):
     assert len(said) <= LONGEST and not said.endswith(".") and "  " not in said
     assert not re.search(r"[{}]|\[\[|\]\]|\bs\^2 m\b", said)
     assert said.count("`") % 2 == 0 and said.count("(") == said.count(")")
+    conditions = dict.fromkeys(re.findall(r"\[\[!?(\w+)\?", text), True)
+    whole = filled(text, conditions | sample(text))
+    assert "  " not in whole and not re.search(r"\[\[|\]\]", whole), whole
     for hidden in entry.hides:
         assert any(fnmatchcase(other, hidden) for other, _ in ENTRIES), hidden
 

@@ -14,12 +14,13 @@ ENTRIES: dict[str, Entry] = {
         "[[left?; a gap remains beside this]]",
     ),
     "none": Entry(
-        "note", "the model explains these trials[[known? down to the noise]][[adopted? as adopted]]"
+        "note",
+        "the model explains these trials[[known?  down to the noise]][[adopted?  as adopted]]",
     ),
     "unknown": Entry(
         "note",
         "no known effect explains what the model leaves[[noise?, which may be noise]]"
-        "[[groups? if both groups get the same values]]",
+        "[[groups?  if both groups get the same values]]",
     ),
     "too_few": Entry("note", "no cause can be named from these trials"),
     "refused": Entry("warn", "the logs were refused: {why}"),
@@ -136,7 +137,7 @@ ENTRIES: dict[str, Entry] = {
     "next.adopt": Entry(
         "note",
         "no trial is needed: {own:yes=fit the model's parameters,no=adopt the claimed effects}"
-        "[[left? and diagnose again]]",
+        "[[left?  and diagnose again]]",
     ),
     "next.doubt": Entry(
         "note",
@@ -168,7 +169,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.confirm": Entry(
         "note",
-        "run another trial that shows {effect}[[, where {place}]][[repeats? in another motion]]: "
+        "run another trial that shows {effect}[[, where {place}]][[repeats?  in another motion]]: "
         "few do[[ ({trial} best)]]",
     ),
     "next.look": Entry(
@@ -184,7 +185,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.elsewhere": Entry(
         "note",
-        "run a trial[[ that spends more time where {place}]][[elsewhere? with other steps and "
+        "run a trial[[ that spends more time where {place}]][[elsewhere?  with other steps and "
         "sweeps of {inputs}]], to see what {state} lacks",
         '[[term? or multiply each term of the rate of {state} by a Param(1.0, "1", 0.0, 2.0) and '
         "diagnose again: what comes far from 1 is why]]",
@@ -203,7 +204,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.probe": Entry(
         "note",
-        "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {nats:.3g} "
+        "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {by:.3g} "
         "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
         "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
     ),
