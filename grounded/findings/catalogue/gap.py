@@ -208,11 +208,11 @@ ENTRIES: dict[str, Entry] = {
         "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
         "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
     ),
-    "next.unsafe": Entry(
+    "probe_unsafe": Entry(
         "note", "none of the probes that were tried stays inside [safety] and near the trials"
     ),
-    "next.no_run": Entry("note", "no run was complete: a probe varies the best candidate"),
-    "next.failed": Entry("warn", "no probe could be computed ({why})"),
+    "probe_no_run": Entry("note", "no run was complete: a probe varies the best candidate"),
+    "probe_failed": Entry("warn", "no probe could be computed ({why})"),
     "next.no_probe": Entry(
         "note",
         "no run inside the limits would tell [[{effect} from {others}]][[{value} better]]",

@@ -12,7 +12,7 @@ import numpy as np
 
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.parts import Estimate, Made, Ranked
+from grounded.diagnosis.parts import NEXT, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
 from grounded.findings import found as finding
@@ -117,8 +117,11 @@ def diagnose_in(
         if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
         why = str(error) or type(error).__name__
-        identity, step = "", finding("gap.next.failed", why=why)
-    found = found if step is None else found.asking(step, identity)
+        identity, step = "", finding("gap.probe_failed", why=why)
+    if step is not None and step.code.startswith(NEXT):
+        found = found.asking(step, identity)
+    elif step is not None:  # why there is no probe
+        found = replace(found, findings=(*found.findings, step))
     if undo := _in_vain(workspace, found):
         found = found.asking(undo, identity)
     ran = tuple(trial.id for trial in used + others if trial.candidate)
@@ -238,7 +241,7 @@ def _probe(
     best = now.incumbent
     ties = {*found.indistinguishable} - {*found.equivalent}
     if best is None:
-        return "", finding("gap.next.no_run") if write else None
+        return "", finding("gap.probe_no_run") if write else None
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
@@ -263,7 +266,7 @@ def _probe(
                 candidate = replace(candidate, id=workspace.next_id())
             facts = {**made.step.facts, "candidate": saved.id}
             return saved.id, replace(made.step, facts=facts)
-    return "", finding("gap.next.unsafe") if offer else None
+    return "", finding("gap.probe_unsafe") if offer else None
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
