@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded.findings import found as found_
@@ -20,19 +19,7 @@ from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
 from grounded_trials.logs.inspection.relations import rates_among
 from grounded_trials.logs.stated_units import bare_command, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
-from grounded_trials.starting.skeletons import (
-    BALANCE,
-    BOAT,
-    CAR,
-    CRANE,
-    DIFFERENTIAL,
-    PENDULUM,
-    ROVER,
-    Skeleton,
-    against_the_body,
-    arm,
-    drone,
-)
+from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
@@ -285,13 +272,12 @@ def _crane(log: LogReport, units: Units) -> Skeleton:
     """Return the crane skeleton with the log's command; unless it is a force, in V or unitless."""
     found = moving(log)
     sent = [name for name, one in found.items() if called_input(name, one.path)]
-    if len(sent) != 1 or sent[0] in CRANE.inputs:
-        return CRANE
+    plain = fixed("crane")
+    if len(sent) != 1 or sent[0] in plain.inputs:
+        return plain
     unit = "V" if _in_volts(sent[0], found[sent[0]].path, units) else "1"
-    gain = CRANE.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
-    before = [line.replace("a.force", f"a.{sent[0]}") for line in CRANE.before]
-    params = {**CRANE.params, "gain": gain}
-    return replace(CRANE, inputs={sent[0]: unit}, before=before, params=params)
+    gain = plain.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
+    return driven_by(plain, {"force": (sent[0], unit)}, gain=gain)
 
 
 def _headed(log: LogReport) -> bool:
@@ -342,16 +328,6 @@ def _balancing(log: LogReport) -> str:
 def _in_volts(name: str, path: str, units: Units) -> bool:
     """Return whether a command's unit is V, or its name contains "volt" and no unit is known."""
     return units.get(path, "V" if "volt" in name.lower() else "1").endswith("V")
-
-
-def _driven_by(command: str, volts: bool) -> Skeleton:
-    """Return the balancing robot's skeleton with the log's command, in volts or unitless."""
-    before = [line.replace("a.voltage", f"a.{command}") for line in BALANCE.before]
-    if volts:
-        return replace(BALANCE, inputs={command: "V"}, before=before)
-    unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
-    params = {**BALANCE.params, **unitless}
-    return replace(BALANCE, inputs={command: "1"}, before=before, params=params)
 
 
 def encoders(log: LogReport, joints: Joints) -> str:
@@ -417,7 +393,7 @@ def _car(log: LogReport, units: Units) -> Skeleton:
     part = any(factor_between(unit, "1") is not None for unit in said)
     throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
     unit = "rad" if angle or not (throttle or part) else "1"
-    plain = replace(CAR, inputs={**CAR.inputs, "steering": unit})
+    plain = driven_by(fixed("car"), {"steering": ("steering", unit)})
     return pushed_by(plain, "throttle", "1") if throttle else pushed(plain, sent_in(log), units)
 
 
@@ -441,20 +417,18 @@ def skeleton(
     if kind == "car" and not ackermann:
         return _car(log, units or {})
     if kind == "rover":
-        return pushed(ROVER, sent_in(log), units or {})
-    fixed = {one.kind: one for one in (CAR, ROVER, DIFFERENTIAL, BOAT, BALANCE, PENDULUM)}
-    if kind in ("differential", "boat") and (both := _both_sides(log)):
-        plain = fixed[kind]
-        named = dict(zip(plain.inputs, both, strict=True))
-        lines = [
-            re.sub(r"a\.(left|right)", lambda m: f"a.{named[m[1]]}", line) for line in plain.lines
-        ]
-        return replace(plain, inputs=dict.fromkeys(both, "1"), lines=lines)
+        return pushed(fixed(kind), sent_in(log), units or {})
+    if kind in ("differential", "boat"):
+        plain, both = fixed(kind), _both_sides(log)
+        return driven_by(plain, {old: (n, "1") for old, n in zip(plain.inputs, both, strict=False)})
     if kind == "crane":
         return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
-        plain = _driven_by(command, _in_volts(command, moving(log)[command].path, units or {}))
-        return against_the_body(plain) if encoders(log, joints) else plain
+        plain = fixed("balance_by_encoders" if encoders(log, joints) else kind)
+        if _in_volts(command, moving(log)[command].path, units or {}):
+            return driven_by(plain, {"voltage": (command, "V")})
+        unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
+        return driven_by(plain, {"voltage": (command, "1")}, **unitless)
     if kind == "drone":
         return _drone(log)
-    return fixed[kind] if kind in fixed else generic(log, inputs, units)
+    return generic(log, inputs, units) if kind == "generic" else fixed(kind)

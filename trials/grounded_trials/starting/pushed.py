@@ -18,7 +18,7 @@ from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, unit_in_name
-from grounded_trials.starting.skeletons import Skeleton
+from grounded_trials.starting.skeletons import Skeleton, driven_by
 
 SPEED = re.compile(r"speed|veloc|(^|[/._])vel([/._]|$)|cmd_vel|linear|geschw|vitesse")
 MOTOR = re.compile("throttle|duty|pwm|motor|volt|current|power|effort|torque|(^|[/._])(gas|esc)")
@@ -55,11 +55,8 @@ def pushed(plain: Skeleton, sent: Mapping[str, str], units: Mapping[str, str]) -
 
 def pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:
     """Return a skeleton with a command in place of `speed`; for its gain see `with_gain`."""
-    lines = [line.replace("a.speed", f"a.{command}") for line in plain.lines]
-    inputs = {command if name == "speed" else name: of for name, of in plain.inputs.items()}
     per = "m/s" if unit == "1" else f"m/s/({unit})" if " " in unit else f"m/s/{unit}"
-    params = {**plain.params, "gain": f'1.0, "{per}", 0.2, 5.0'}
-    return replace(plain, inputs={**inputs, command: unit}, lines=lines, params=params)
+    return driven_by(plain, {"speed": (command, unit)}, gain=f'1.0, "{per}", 0.2, 5.0')
 
 
 def with_gain(plain: Skeleton, found: Mapping[str, Guess], log: LogReport) -> Skeleton:
