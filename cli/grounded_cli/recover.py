@@ -46,7 +46,8 @@ def _document(found: Recovery) -> dict[str, Any]:
         "file": str(found.target),
         "messages": dict(found.messages),
         "lost_messages": dict(found.lost_messages),
-        "losses": list(found.losses),
+        "losses": [one.sentence for one in found.losses],
+        "findings": [one.to_json() for one in found.losses],
         "unverified": found.unverified,
         "duration_s": found.duration_s,
         "complete": found.complete,
@@ -63,7 +64,7 @@ def _document(found: Recovery) -> dict[str, Any]:
 
 def _tell(found: Recovery) -> None:
     for loss in found.losses:
-        say(field("lost", loss))
+        say(field("lost", loss.sentence))
     if found.complete:
         show(f"{found.source} is not damaged; {found.target} is a copy")
     saved = count(sum(found.messages.values()), "message")

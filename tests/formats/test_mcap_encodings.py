@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 from facts import holding
+from grounded_trials.formats.bad import BadMessage, BadPath, BadSchema
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import (
     Array,
-    BadMessage,
-    BadPath,
-    BadSchema,
     Dynamic,
     Node,
     Number,
@@ -181,7 +179,7 @@ def test_big_endian_and_xcdr2() -> None:
     with pytest.raises(BadMessage, match="variant of CDR") as odd:
         found([big, xcdr2], type, read, "/t.d")
     assert odd.value.message == 1
-    with pytest.raises(BadMessage, match=holding("4 bytes")):
+    with pytest.raises(BadMessage, match="header"):
         found([b"\0\1"], type, read, "/t.d")
 
 
@@ -275,14 +273,14 @@ def test_idl_definitions_are_the_same_types_as_ros_ones() -> None:
 def test_idl_definitions_that_can_not_be_read() -> None:
     for bad, says in (
         ("module a { union U switch(long) { case 1: long x; }; };", "union"),
-        ("struct M { Missing a; };", "uses 'Missing'"),
-        ("struct M { M a; };", "contains itself"),
-        ("struct M { @optional double a; };", "not plain CDR"),
-        ("struct M { double a[999999999]; };", "999999999 items"),
+        ("struct M { Missing a; };", "define 'Missing'"),
+        ("struct M { M a; };", "nested too deep"),
+        ("struct M { @optional double a; };", "@optional"),
+        ("struct M { double a[999999999]; };", "too many items: .999999999"),
         ("struct M { long double a; };", "long"),
-        ("struct N { long a; };", "no struct 'M'"),
+        ("struct N { long a; };", "define 'M'"),
         ("struct M {", "damaged"),
-        ("what", "where a definition should be"),
+        ("what", "is none at .what"),
     ):
         with pytest.raises(BadSchema, match=says):
             parse_idl(bad, "M")
@@ -326,13 +324,13 @@ def test_any_damaged_idl_is_told(seed: int) -> None:
 
 def test_ros_definitions_that_are_none() -> None:
     for text, says in (
-        ("Missing a", "uses 'Missing'"),
-        ("what is this?", "uses 'what'"),
-        ("???", "invalid line"),
-        ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "contains itself"),
-        ("float64[999999999] a", "999999999 items"),
-        (f"float64[{'9' * 5000}] a", "99999 items"),
-        ("int8 a\n" + "=" * 80 + "\nIDL: x/A\n", "expected 'MSG"),
+        ("Missing a", "define 'Missing'"),
+        ("what is this?", "define 'what'"),
+        ("???", "is none at"),
+        ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "nested too deep"),
+        ("float64[999999999] a", "too many items: .999999999"),
+        (f"float64[{'9' * 5000}] a", "too many items: .99999"),
+        ("int8 a\n" + "=" * 80 + "\nIDL: x/A\n", "is none at 'IDL"),
     ):
         with pytest.raises(BadSchema, match=says):
             parse_ros(text, "x/msg/M", ros1=False)
@@ -466,12 +464,12 @@ def test_protobuf_definitions_that_are_none() -> None:
 
     rng = np.random.default_rng(1)
     good, _ = random_proto(random.Random(3), 3)
-    with pytest.raises(BadSchema, match=r"no message .p\.Nothing"):
+    with pytest.raises(BadSchema, match=r"define .p\.Nothing"):
         parse_protobuf(good, "p.Nothing")
     for number, code in ((0, 1), (2**29, 1), (1, 10)):
         file = descriptor_pb2.FileDescriptorProto(name="a")
         file.message_type.add(name="M").field.add(name="f", number=number, type=code, label=1)
-        with pytest.raises(BadSchema, match="field 'f'"):
+        with pytest.raises(BadSchema, match="'f'"):
             parse_protobuf(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(), "M")
     for _ in range(500):
         bad = bytearray(good)
@@ -532,15 +530,15 @@ def test_paths_that_do_not_fit_name_what_would() -> None:
     for path, says in (
         ("/t.sped", "did you mean 'speed'"),
         ("/t.name", "ends at a string"),
-        ("/t", "add one of its fields: speed, name, list, q"),
-        ("/t.list", "ends at a list"),
+        ("/t", "add one of its fields, speed, name, list and q"),
+        ("/t.list", "not at a number"),
         ("/t.list.x", "select an item first"),
-        ("/t.speed.x", "which has no fields"),
-        ("/t.q[0]", "has no items"),
-        ("/t.q.@rpy.yaw", "needs a quaternion"),
-        ("/t.speed.@norm", "needs a vector"),
-        ('/t.list[:]{x=="a"}.x', "compares 'x', a float64"),
-        ("/t{name==1}.speed", "compares 'name', a string"),
+        ("/t.speed.x", "needs a message"),
+        ("/t.q[0]", "needs a list"),
+        ("/t.q.@rpy.yaw", "needs x, y, z and w"),
+        ("/t.speed.@norm", "needs numbers"),
+        ('/t.list[:]{x=="a"}.x', "x needs str"),
+        ("/t{name==1}.speed", "name needs float"),
     ):
         with pytest.raises(BadPath, match=says):
             bind(parse_path(path), type)

@@ -115,10 +115,10 @@ def test_agrees_with_the_mcap_package_on_every_undamaged_file() -> None:
     ("name", "what"),
     [
         ("zero_bytes.mcap", "empty"),
-        ("magic_only.mcap", "end is missing"),
-        ("cf_thrust_step1_cut_midchunk.mcap", "ends inside a chunk"),
+        ("magic_only.mcap", "ends inside"),
+        ("cf_thrust_step1_cut_midchunk.mcap", "a chunk is cut off: the file ends inside"),
         ("dart_fast_truncated60pct.mcap", "ends inside"),
-        ("dart_fast_no_footer.mcap", "ends inside|end is missing"),
+        ("dart_fast_no_footer.mcap", "ends inside"),
         ("dart_fast_bitrot_chunk3.mcap", "chunk is damaged: its checksum"),
     ],
 )
@@ -127,7 +127,7 @@ def test_damaged_files_are_refused(name: str, what: str) -> None:
     with pytest.raises(DamagedFile, match=what) as caught:
         plain(path.read_bytes())
     assert caught.value.offset <= path.stat().st_size
-    if "ends inside" in str(caught.value):  # not where the chunk begins, long before
+    if "is cut off" in str(caught.value):  # not where the chunk begins, long before
         assert f"(at byte {path.stat().st_size})" in str(caught.value)
 
 
@@ -201,10 +201,10 @@ def test_bombs_end_at_their_stated_size() -> None:
 
 def test_a_message_shorter_than_its_header() -> None:
     header = record(1, text("") + text(""))
-    with pytest.raises(DamagedFile, match=holding("message", "3 bytes")):
+    with pytest.raises(DamagedFile, match=holding("3 bytes")):
         plain(MAGIC + header + record(5, b"abc"))
     inner = record(5, b"abc")
-    with pytest.raises(DamagedFile, match=holding("message", "3 bytes")):
+    with pytest.raises(DamagedFile, match=holding("3 bytes")):
         plain(MAGIC + header + chunk(inner, "", inner))
 
 
@@ -233,7 +233,7 @@ def followed_one_by_one(buffer: bytes) -> tuple[list[int], int]:
         if opcode != mcap_walk.MESSAGE or length > len(buffer) - pos - 9:
             break
         if length < mcap_walk.MESSAGE_HEADER:
-            raise BadRecord("short")
+            raise BadRecord("record", what="short")
         positions.append(pos)
         pos += 9 + length
     return positions, pos

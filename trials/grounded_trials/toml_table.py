@@ -13,16 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.findings import found
 from grounded_trials.plain_file import open_file
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
-_WORDS = {
-    str: "a text",
-    bool: "true or false",
-    float: "a number",
-    int: "a whole number",
-    list: "a list in brackets",
-}
 _REQUIRED = object()
 
 
@@ -38,16 +32,31 @@ class Table:
         self._taken: set[str] = set()
         self.file, self.where = file, where
 
-    def error(self, key: str, text: str) -> GroundedError:
-        """Return an error about one key."""
-        name = f"[{self.where}] {key}" if self.where else key
-        return GroundedError(f"{self.file.name}: {name}: {text}")
+    def error(self, key: str, must: str, value: object = None) -> GroundedError:
+        """Return an error about one key.
+
+        Args:
+            key: of this table.
+            must: what its value must be: a word of the entry `file.value`.
+            value: what was found, None if the key is missing.
+        """
+        given = "" if value is None else str(value) if isinstance(value, float) else repr(value)
+        facts: dict[str, Any] = {"key": self._full(key), "must": must, "given": given}
+        return GroundedError(found("file.value", self.file.name, **facts))
+
+    def _full(self, key: str) -> str:
+        return f"[{self.where}] {key}" if self.where else key
+
+    def unknown(self, key: str, valid: Iterable[str], value: str = "") -> GroundedError:
+        """Return an error about a key, or the value of a key, that is none of the valid ones."""
+        name, hint = self._full(key), nearest(value or key, valid)
+        return GroundedError(found("file.key", self.file.name, key=name, value=value, hint=hint))
 
     def expect(self, *names: str) -> None:
         """Raise an error for a key that is not among `names`; called before any key is taken."""
         for key in self._values:
             if key not in names:
-                raise self.error(key, f"is not known here: {nearest(key, names)}")
+                raise self.unknown(key, names)
 
     def has(self, key: str) -> bool:
         """Return whether the key is present."""
@@ -63,7 +72,7 @@ class Table:
         self._known.add(key)
         if key not in self._values:
             if default is _REQUIRED:
-                raise self.error(key, f"is missing; it must be {_WORDS.get(kind, kind.__name__)}")
+                raise self.error(key, kind.__name__)
             return default
         self._taken.add(key)
         return self._checked(key, self._values[key], kind)
@@ -72,12 +81,12 @@ class Table:
         fits = isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             if abs(value) > 10**300:
-                raise self.error(key, "must be a finite number, found one of over 300 digits")
+                raise self.error(key, "finite", "over 300 digits")
             return float(value)
         if not fits:
-            raise self.error(key, f"must be {_WORDS.get(kind, kind.__name__)}, found {value!r}")
+            raise self.error(key, kind.__name__, value)
         if kind is float and not math.isfinite(value):
-            raise self.error(key, f"must be a finite number, found {value}")
+            raise self.error(key, "finite", value)
         return value
 
     def choice(self, key: str, options: Iterable[str], default: Any = _REQUIRED) -> str:
@@ -85,7 +94,7 @@ class Table:
         value: str = self.take(key, str, default)
         names = list(options)
         if value not in names:
-            raise self.error(key, f"'{value}' is not one of the choices: {nearest(value, names)}")
+            raise self.unknown(key, names, value)
         return value
 
     def sub(self, key: str) -> Table:
@@ -94,15 +103,15 @@ class Table:
         self._taken.add(key)
         value = self._values.get(key, {})
         if not isinstance(value, dict):
-            raise self.error(key, f"must be a table, found {value!r}")
+            raise self.error(key, "dict", value)
         return Table(value, self.file, f"{self.where}.{key}" if self.where else key)
 
     def numbers(self, key: str, names: Iterable[str]) -> dict[str, float]:
         """Return the table name -> number under a key; its names must be among `names`."""
         table, valid = self.sub(key), list(names)
-        found = {name: table.take(name, float) for name in valid if table.has(name)}
+        values = {name: table.take(name, float) for name in valid if table.has(name)}
         table.finish(valid)
-        return found
+        return values
 
     def all_numbers(self) -> dict[str, float]:
         """Return this table as name -> number, with any names."""
@@ -110,17 +119,17 @@ class Table:
 
     def pairs(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:
         """Return this table as name -> (low, high); its names must be among `names`."""
-        valid, found = list(names), {}
+        valid, pairs = list(names), {}
         for name in valid:
             if self.has(name):
                 value = self._values[name]
                 self._taken.add(name)
                 if not isinstance(value, list) or len(value) != 2:
-                    raise self.error(name, f"must be [low, high], found {value!r}")
+                    raise self.error(name, "pair", value)
                 low, high = (self._checked(name, v, float) for v in value)
-                found[name] = (low, high)
+                pairs[name] = (low, high)
         self.finish(valid)
-        return found
+        return pairs
 
     def names(self) -> list[str]:
         """Return all keys."""
@@ -130,7 +139,7 @@ class Table:
         """Raise an error for a key that was not taken; suggests one of the `valid` names."""
         for key in self._values.keys() - self._taken:
             known = self._known if valid is None else valid
-            raise self.error(key, f"is not known here: {nearest(key, sorted(known))}")
+            raise self.unknown(key, sorted(known))
 
 
 def read_toml(path: Path) -> Table:
@@ -147,28 +156,21 @@ def read_toml(path: Path) -> Table:
             text = stream.read(SIZE_LIMIT + 1).decode("utf-8-sig")
     except FileNotFoundError:
         near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
-        if near:
-            raise GroundedError(
-                f"{path} does not exist: this is not a workspace; name one, such as {near[0]} (-C "
-                f"{near[0]}, in Python Workspace({near[0]!r}))"
-            ) from None
-        raise GroundedError(
-            f"{path} does not exist: this is not a workspace; name its folder (-C DIR, in Python "
-            "Workspace(DIR)), or make one",
-            NextCommand("init", ("DIR", "--example", "car-turn")),
-        ) from None
+        then = None if near else NextCommand("init", ("DIR", "--example", "car-turn"))
+        here = near[0] if near else ""
+        raise GroundedError(found("file.no_workspace", str(path), near=here, then=then)) from None
     except NotADirectoryError:
-        raise GroundedError(
-            f"{path.parent} is a file: -C takes the folder that holds grounded.toml"
-        ) from None
+        raise GroundedError(found("file.no_folder", str(path.parent))) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise GroundedError(f"{path} can't be read: {error}") from None
+        raise GroundedError(found("file.unreadable", str(path), why=str(error))) from None
     try:
         if len(text) > SIZE_LIMIT:
-            raise ValueError(f"it has more than {SIZE_LIMIT} bytes")
+            raise ValueError(f"> {SIZE_LIMIT} bytes")
         return Table(tomllib.loads(text), path)
     except (ValueError, RecursionError) as error:
-        raise GroundedError(f"{path.name} is not valid TOML: {error}") from None
+        raise GroundedError(
+            found("file.unreadable", path.name, why=str(error), kind="TOML file")
+        ) from None
 
 
 def key(name: str) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import found
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 
 SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0\n"  # how the files begin
@@ -73,9 +74,7 @@ def sqlite_records(path: Path) -> Iterator[Record]:
 def _tables(bag: Any, path: Path) -> Iterator[Record]:
     tables = {name for (name,) in bag.execute("SELECT name FROM sqlite_master WHERE type='table'")}
     if not {"topics", "messages"} <= tables:
-        raise GroundedError(
-            f"{path} is an SQLite file without the tables 'topics' and 'messages' of a ROS 2 bag"
-        )
+        raise GroundedError(found("file.no_bag", str(path)))
     yield Header("ros2", "rosbag2 sqlite3")
     known = _definitions(bag) if "message_definitions" in tables else {}
     topics = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
@@ -103,7 +102,7 @@ def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]
     query = "SELECT topic_id, timestamp, data FROM messages"
     for topic, stamp, data in bag.execute(query):
         if topic not in channels:
-            raise GroundedError(f"{path}: a message belongs to topic {topic}, which is not listed")
+            raise GroundedError(found("file.no_channel", str(path), channel=topic))
         yield channels[topic], stamp, data
 
 

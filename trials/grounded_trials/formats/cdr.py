@@ -15,11 +15,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.bad import BadMessage, BadPath
 from grounded_trials.formats.mcap_records import windows
 from grounded_trials.formats.messages import (
     Array,
-    BadMessage,
-    BadPath,
     Bools,
     Field,
     Floats,
@@ -114,7 +113,7 @@ class _CdrNode(Node):
     def _check(self, stop: Ints) -> None:
         over = (stop > self.end) | (self.pos < self.base)
         if over.any():
-            raise BadMessage(self.rows[over][0], f"it ends inside a {self.type}")
+            raise BadMessage(self.rows[over][0], "message_ends", inside=str(self.type))
 
     def _counts(self) -> tuple[Ints, _CdrNode]:
         """Return the item counts of lists or texts, and the cursors at the first items."""
@@ -139,7 +138,7 @@ class _CdrNode(Node):
         counts, body = node._counts()
         if isinstance(part, Text):
             if part.unit == 0:
-                raise BadPath("it comes after a wstring, whose encoding is not standardised")
+                raise BadPath("after_wstring")
             return body.pos + counts
         sizes = _sizes(part.item, self.coding)
         if sizes is not None:
@@ -180,7 +179,7 @@ class _Table:
 
     def __init__(self, once: tuple[int, ...]) -> None:
         if max(once) > SIZE_LIMIT:
-            raise BadPath(f"its type is larger than {SIZE_LIMIT} bytes")
+            raise BadPath("type_large", limit=SIZE_LIMIT)
         self.once = np.array(once, dtype=np.int64)
         self.powers = [self.once]
 
@@ -252,22 +251,17 @@ def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
     """
     short = end - start < 4
     if short.any():
-        raise BadMessage(int(np.argmax(short)), "it is shorter than its header of 4 bytes")
+        raise BadMessage(int(np.argmax(short)), "message_ends", inside="header")
     octets = np.frombuffer(buffer, dtype=np.uint8)
     kinds = octets[start + 1]
     if len(kinds):
         other = kinds != kinds[0]
         if other.any():
-            raise BadMessage(int(np.argmax(other)), "its variant of CDR differs from the others")
+            raise BadMessage(int(np.argmax(other)), "message_variant")
         if buffer[start[0] : start[0] + 4] == ZSTD:
-            raise BadMessage(
-                0,
-                "it is compressed individually; use `ros2 bag convert` with compression_mode none",
-            )
+            raise BadMessage(0, "message_variant")
         if int(kinds[0]) not in _KINDS or octets[start].any():
-            raise BadMessage(
-                0, f"its variant of CDR, {int(kinds[0])}, can't be read (only plain CDR can)"
-            )
+            raise BadMessage(0, "message_variant", variant=int(kinds[0]))
     coding = _KINDS[int(kinds[0])] if len(kinds) else _KINDS[1]
     base = start + 4
     return _CdrNode(type, np.arange(len(start)), base, base, end, buffer, coding)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from grounded.errors import GroundedError
+from grounded.findings import found
 
 C = TypeVar("C")
 
@@ -25,15 +26,12 @@ def columns_by_name(columns: Iterable[tuple[str, str, C]], path: Path) -> dict[s
     Raises:
         GroundedError: if two have the same name.
     """
-    found: dict[str, C] = {}
+    by_name: dict[str, C] = {}
     written: dict[str, str] = {}
     for name, cell, column in columns:
-        if name in found:
-            both = f"'{written[name]}' and '{cell}'" if cell != written[name] else f"'{cell}'"
-            raise GroundedError(
-                f"{path}: two columns have the name '{name}' ({both}), so it is unclear which one "
-                "is meant: rename or delete one of them"
-            )
+        if name in by_name:
+            both = tuple(dict.fromkeys((written[name], cell)))
+            raise GroundedError(found("file.column_twice", str(path), name=name, both=both))
         if name:
-            found[name], written[name] = column, cell
-    return found
+            by_name[name], written[name] = column, cell
+    return by_name

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.bad import BadRecord
+
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
@@ -133,10 +135,6 @@ def batch(buffer: bytes, positions: list[int]) -> Messages:
     )
 
 
-class BadRecord(Exception):
-    """A record or chunk can't be read; the text says why, and the caller adds where."""
-
-
 class Fields:
     """Parses a record's content from left to right."""
 
@@ -147,7 +145,7 @@ class Fields:
         """Return the next `count` bytes."""
         end = self.pos + count
         if end > len(self.content):
-            raise BadRecord("it is too short for its contents")
+            raise BadRecord("record", what="short")
         piece = bytes(self.content[self.pos : end])
         self.pos = end
         return piece
@@ -160,8 +158,8 @@ class Fields:
         """Return the next text."""
         try:
             return self.skip(self.uint(32)).decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise BadRecord(str(error)) from None
+        except UnicodeDecodeError:
+            raise BadRecord("record", what="text") from None
 
     def blob(self) -> bytes:
         """Return the next bytes, which follow their length."""
@@ -188,7 +186,7 @@ def _attachment(f: Fields) -> Attachment:
     end = f.pos
     stated = f.uint(32)
     if stated and zlib.crc32(f.content[:end]) != stated:
-        raise BadRecord("its checksum does not match its content")
+        raise BadRecord("record", what="checksum")
     return attachment
 
 
@@ -216,19 +214,19 @@ def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[
         name, start = bytes(content[32 : 32 + length]), 40 + length
         stored = _U64.unpack_from(content, 32 + length)[0]
     except struct.error:
-        raise BadRecord("it is too short for its contents") from None
+        raise BadRecord("record", what="short") from None
     if start + stored > len(content):
-        raise BadRecord("it is too short for its contents")
+        raise BadRecord("record", what="short")
     if name and not packed:
-        raise BadRecord("it is compressed, which grounded's own files never are")
+        raise BadRecord("record", what="packed")
     inside = bytes(content[start : start + stored])
     data, wrong = decompress(name.decode("utf-8", "replace"), inside, size)
     if wrong:
-        raise BadRecord(f"it can't be decompressed ({wrong})")
+        raise BadRecord("record", what="compression", why=wrong)
     if len(data) != size:
-        raise BadRecord(f"it holds {len(data)} bytes, but states {size}")
+        raise BadRecord("record", what="size")
     if crc and zlib.crc32(data) != crc:
-        raise BadRecord("its checksum does not match its content")
+        raise BadRecord("record", what="checksum")
     return data, bool(crc)
 
 
@@ -244,7 +242,7 @@ def decompress(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
         return data, ""
     known = {"zstd": _zstd, "lz4": _lz4}
     if compression not in known:
-        return b"", f"its compression '{compression[:40]}' is unknown; expected zstd or lz4"
+        return b"", f"'{compression[:40]}', not zstd or lz4"
     parts: list[bytes] = []
     have, wrong = 0, ""
     try:

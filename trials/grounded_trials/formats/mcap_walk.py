@@ -18,11 +18,13 @@ import io
 import zlib
 from collections.abc import Iterator
 from struct import Struct
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import found
+from grounded_trials.formats.bad import BadRecord
 from grounded_trials.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -32,7 +34,6 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_HEADER,
     PARSERS,
     SCHEMA,
-    BadRecord,
     Channel,
     End,
     Fields,
@@ -58,13 +59,25 @@ _U32 = Struct("<I")
 
 
 class DamagedFile(GroundedError):
-    """A file that violates the MCAP format; `offset` is where that was noticed [bytes]."""
+    """A file that violates the MCAP format.
 
-    def __init__(self, name: str, offset: int, found: str, advice: str | None = None) -> None:
-        self.found, self.offset = found, offset
-        then = NextCommand("recover", (name,)) if advice is None else None
-        advice = advice or "`recover` saves what can be saved"
-        super().__init__(f"{name}: {found} (at byte {offset}); {advice}", then)
+    Args:
+        name: of the file.
+        offset: where that was noticed [bytes].
+        what: what is wrong there: `file.mcap` says it in words.
+        where: the part of the file.
+        why: the cause, if known.
+        lost: whether nothing can be saved.
+    """
+
+    def __init__(
+        self, name: str, offset: int, what: str, where: str = "", why: str = "", lost: bool = False
+    ) -> None:
+        self.offset, self.what = offset, what
+        facts: dict[str, Any] = {"what": what, "where": where, "why": why}
+        then = None if lost else NextCommand("recover", (name,))
+        code = "file.mcap_lost" if lost else "file.mcap"
+        super().__init__(found(code, name, then=then, byte=offset, **facts))
 
 
 def read_records(source: BinaryIO | bytes, name: str, *, packed: bool = True) -> Iterator[Record]:
@@ -104,16 +117,15 @@ class _Walk:
     def offset(self) -> int:
         return self.base + self.pos
 
-    def damaged(self, found: str, offset: int | None = None) -> DamagedFile:
-        return DamagedFile(self.name, self.offset if offset is None else offset, found)
+    def damaged(
+        self, what: str, where: str = "", why: str = "", offset: int | None = None
+    ) -> DamagedFile:
+        at = self.offset if offset is None else offset
+        return DamagedFile(self.name, at, what, where, why)
 
     def cut_off(self, what: str) -> DamagedFile:
         """Return the error for a file that ends too early: there is nothing to save before data."""
-        if self.messages:
-            return self.damaged(f"the file ends inside {what}", self.size)
-        found = f"it holds no message: the file ends inside {what}"
-        advice = "did the recorder, or the program that it recorded, stop at once? Record again"
-        return DamagedFile(self.name, self.size, found, advice)
+        return DamagedFile(self.name, self.size, "cut", what, lost=not self.messages)
 
     def fold(self) -> int:
         """Return the CRC of everything used so far."""
@@ -142,7 +154,7 @@ class _Walk:
     def records(self) -> Iterator[Record]:
         self._magic()
         while True:
-            self.need(9, "a record's head; its end is missing")
+            self.need(9, "a record's head")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
             self.messages |= opcode in (CHUNK, MESSAGE)
             self.need(9 + length, _NAMES.get(opcode, f"a record of type {opcode}"))
@@ -169,16 +181,11 @@ class _Walk:
                 yield from self._data_record(opcode, content, at)
 
     def _magic(self) -> None:
-        if self.size == 0:
-            raise DamagedFile(self.name, 0, "the file is empty", "nothing can be saved")
         head = self.buffer[:8] or self.stream.read(8)
         self.stream.seek(0)
         if head != MAGIC:
-            advice = "give a log in the MCAP format (`mcap convert` converts ROS 1 bags)"
-            found = "this is not an MCAP file"
-            if MAGIC.startswith(head):
-                found, advice = "the file ends inside its first 8 bytes", "nothing can be saved"
-            raise DamagedFile(self.name, 0, found, advice)
+            what = "empty" if not head else "cut" if MAGIC.startswith(head) else "other"
+            raise DamagedFile(self.name, 0, what, "its first 8 bytes", lost=True)
         self.need(8, "its first 8 bytes")
         self.pos += 8
 
@@ -187,12 +194,12 @@ class _Walk:
         try:
             positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
         except BadRecord as error:
-            raise self.damaged(str(error)) from None
+            raise self.damaged("record", "a message", str(error)) from None
         return self._in_calendar(batch(self.buffer, positions))
 
     def _in_calendar(self, messages: Messages) -> Messages:
         if len(messages) and messages.log_times.min() < 0:
-            raise self.damaged("a message claims to be logged after the year 2262")
+            raise self.damaged("time", "a message")
         return messages
 
     def _together(self) -> Iterator[Messages]:
@@ -224,7 +231,7 @@ class _Walk:
         if isinstance(record, Schema | Channel):
             known = self.defined.setdefault((type(record), record.id), record)
             if known != record:
-                raise BadRecord(again(known, record))
+                raise again(known, record)
         return record
 
     def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
@@ -235,40 +242,40 @@ class _Walk:
                 yield self._defined(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
-            raise self.damaged(f"{what} is damaged: {error}", at) from None
+            raise self.damaged("record", what, str(error), at) from None
 
     def _data_end(self, content: memoryview) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
         if stated and stated != self.fold():
-            raise self.damaged("the checksum of the data section does not match its content")
+            raise self.damaged("checksum", "the data section")
         self.data_crc = bool(stated)
         start = self.pos + 9 + len(content)
         self.crc, self.crc_pos = 0, start
 
     def _footer(self, content: memoryview) -> None:
         if self.data_crc is None:
-            raise self.damaged("the footer comes before the end of the data")
+            raise self.damaged("record", "the footer")
         if len(content) < 20:
-            raise self.damaged("the footer is too short")
+            raise self.damaged("record", "the footer")
         begin = self.pos
         self.pos += 9 + 16
         stated = _U32.unpack_from(content, 16)[0]
         if stated and stated != self.fold():
-            raise self.damaged("the checksum of the summary does not match its content")
+            raise self.damaged("checksum", "the summary")
         self.pos = begin + 9 + len(content)
         self.need(8, "its last 8 bytes")
         if self.buffer[self.pos : self.pos + 8] != MAGIC:
-            raise self.damaged("the file does not end as an MCAP file does")
+            raise self.damaged("record", "its end")
         self.pos += 8
         if self.offset != self.size:
-            raise self.damaged(f"{self.size - self.offset} bytes follow after the end of the log")
+            raise self.damaged("record", "its end", f"{self.size - self.offset} bytes more")
 
 
-def again(known: Schema | Channel, other: Schema | Channel) -> str:
-    """Return a message on a second definition with the id of a first one."""
-    what = type(known).__name__.lower()
+def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:
+    """Return the error for a second definition with the id of a first one."""
     names = [r.topic if isinstance(r, Channel) else r.name for r in (known, other)]
-    return f"{what} {known.id} is '{names[0][:80]}' and defined again as '{names[1][:80]}'"
+    what, (one, two) = f"{type(known).__name__.lower()} {known.id}", (n[:80] for n in names)
+    return BadRecord("defined_again", what=what, first=one, second=two)
 
 
 def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
@@ -304,7 +311,7 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
         if length > end - pos - 9:
             if cut:
                 break
-            raise BadRecord("it ends inside a record")
+            raise BadRecord("record", what="short")
         if opcode == MESSAGE:
             positions, pos = message_positions(data, pos, end)
             yield positions
@@ -329,7 +336,7 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         if opcode != MESSAGE or length > end - pos - 9:
             break
         if length < MESSAGE_HEADER:
-            raise BadRecord(f"a message claims {length} bytes; it needs at least {MESSAGE_HEADER}")
+            raise BadRecord("message_ends", inside=f"header of {length} bytes")
         append(pos)
         pos += 9 + length
         if len(positions) == look:

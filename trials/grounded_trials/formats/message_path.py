@@ -22,6 +22,7 @@ from functools import lru_cache
 from typing import NoReturn
 
 from grounded.errors import GroundedError, nearest
+from grounded.findings import found
 
 _TRIGONOMETRY = ("sin", "cos", "tan", "asin", "acos", "atan")
 _ROUNDING = ("abs", "negative", "sign", "ceil", "floor", "round")
@@ -32,13 +33,13 @@ AXES = ("x", "y", "z")
 WORLD = "world_velocity"  # an Odometry's velocity, turned from the robot's axes into its pose's
 LENGTH_LIMIT = 1000  # characters in a path
 
-_REFUSED = {
-    "delta": "differences amplify noise; measure the state or let [estimate] smooth it",
-    "derivative": "differences amplify noise; measure the state or let [estimate] smooth it",
-    "timedelta": "times between messages are not a signal",
-    "quat": "it gives four numbers; use a field of the orientation",
-    "rpy": "name the angle: .@rpy.roll, .@rpy.pitch or .@rpy.yaw",
-    WORLD: "name the axis: .@world_velocity.x, .@world_velocity.y or .@world_velocity.z",
+_INSTEAD = {  # of functions that can't be used: what can
+    "delta": "a measured or estimated state",
+    "derivative": "a measured or estimated state",
+    "timedelta": "a signal",
+    "quat": "a field of the orientation",
+    "rpy": ".@rpy.roll, .@rpy.pitch or .@rpy.yaw",
+    WORLD: f".@{WORLD}.x, .@{WORLD}.y or .@{WORLD}.z",
 }
 _PARTS = {"rpy": ANGLES, WORLD: AXES}  # functions that give several numbers, and their names
 
@@ -132,9 +133,10 @@ class _Parser:
 
     def path(self) -> MessagePath:
         if not isinstance(self.text, str) or not self.text.strip():
-            raise GroundedError("a message path is empty; expected the form /topic.field")
+            self.fail("/topic.field")
         if len(self.text) > LENGTH_LIMIT:
-            raise GroundedError(f"a message path has more than {LENGTH_LIMIT} characters")
+            self.pos = LENGTH_LIMIT
+            self.fail("its end")
         topic = self.name(_TOPIC, "a topic")
         steps: list[Step] = []
         functions: list[Function] = []
@@ -142,7 +144,7 @@ class _Parser:
             if self.text.startswith(".@", self.pos):
                 functions.append(self.function())
             elif functions:
-                self.fail("expected a function or the end, since functions come last")
+                self.fail("a function or the end")
             else:
                 steps.extend(self.step())
         return MessagePath(self.text, topic, tuple(steps), tuple(functions))
@@ -156,14 +158,14 @@ class _Parser:
             return [self.slice()]
         if mark == "{":
             return list(self.filters())
-        self.fail("expected '.field', '[index]', '{filter}' or '.@function'")
+        self.fail("'.field', '[index]', '{filter}' or '.@function'")
 
     def slice(self) -> Slice:
         self.pos += 1
         start = self.integer()
         if self.take("]"):
             if start is None:
-                self.fail("expected an index such as [0], or [:] for all items")
+                self.fail("an index or ':'")
             return Slice(start, start)
         self.expect(":", "':' or ']'")
         stop = self.integer()
@@ -172,20 +174,20 @@ class _Parser:
 
     def integer(self) -> int | None:
         if self.peek() == "$":
-            self.fail("variables such as $name are not supported; write the number")
-        found = _INTEGER.match(self.text, self.pos)
-        if not found:
+            self.fail("a number")
+        seen = _INTEGER.match(self.text, self.pos)
+        if not seen:
             return None
-        self.pos = found.end()
-        return int(found[0])
+        self.pos = seen.end()
+        return int(seen[0])
 
     def filters(self) -> list[Filter]:
         self.pos += 1
-        found = [self.filter()]
+        seen = [self.filter()]
         while self.take("&&"):
-            found.append(self.filter())
+            seen.append(self.filter())
         self.expect("}")
-        return found
+        return seen
 
     def filter(self) -> Filter:
         self.blank()
@@ -193,12 +195,12 @@ class _Parser:
         while self.take("."):
             names.append(self.match(_NAME, "a field's name"))
         self.blank()
-        operator = self.match(_OPERATOR, "one of == != < <= > >=")
+        operator = self.match(_OPERATOR, "== != < <= > or >=")
         self.blank()
         value = self.value()
         self.blank()
         if isinstance(value, str) and operator not in ("==", "!="):
-            self.fail("a text can only be compared with == and !=")
+            self.fail("== or != before a text")
         return Filter(tuple(names), operator, value)
 
     def value(self) -> float | str:
@@ -207,7 +209,7 @@ class _Parser:
         for word, value in (("true", 1.0), ("false", 0.0)):
             if self.take(word):
                 return value
-        return float(self.match(_NUMBER, "a number, a text in quotes, true or false"))
+        return float(self.match(_NUMBER, "a value"))
 
     def function(self) -> Function:
         at = self.pos
@@ -217,32 +219,33 @@ class _Parser:
             parts = _PARTS[name]
             part = self.match(_WORD, f"{', '.join(parts[:-1])} or {parts[-1]}")
             if part not in parts:
-                self.fail(f"'@{name}' has no '{part}': {nearest(part, parts)}")
+                self.fail(f"{' or '.join(parts)}, not '{part}'")
             return Function(part)
-        if name in _REFUSED:
+        if name in _INSTEAD:
             self.pos = at
-            self.fail(f"'@{name}' can't be used: {_REFUSED[name]}")
+            self.fail(f"{_INSTEAD[name]}, not '@{name}'")
         if name in BINARY:
             return Function(name, self.argument(name))
         if name != "norm" and name not in UNARY:
             self.pos = at
-            self.fail(f"no function '@{name}': {nearest(name, ['norm', *_PARTS, *UNARY, *BINARY])}")
+            known = nearest(name, ["norm", *_PARTS, *UNARY, *BINARY])
+            self.fail(f"a function, not '@{name}': {known}")
         return Function(name)
 
     def argument(self, name: str) -> float:
         if not self.take("("):
-            self.fail(f"'@{name}' needs a number, such as @{name}(2)")
+            self.fail(f"@{name}(2)")
         value = float(self.match(_NUMBER, "a number"))
         self.expect(")")
         if not math.isfinite(value) or (name == "div" and value == 0):
-            self.fail(f"'@{name}' needs a finite number, and no division by 0")
+            self.fail("a finite number" + ", not 0" * (name == "div"))
         return value
 
     def quoted(self) -> str:
         mark = self.peek()
         end = self.text.find(mark, self.pos + 1)
         if end < 0:
-            self.fail(f"the text that begins with {mark} has no closing quote")
+            self.fail(f"a closing {mark}")
         value = self.text[self.pos + 1 : end]
         self.pos = end + 1
         return value
@@ -252,7 +255,7 @@ class _Parser:
             return self.match(pattern, what)
         name = self.quoted()
         if not name:
-            self.fail("a name in quotes is empty")
+            self.fail("a name")
         return name
 
     def peek(self) -> str:
@@ -266,18 +269,19 @@ class _Parser:
 
     def expect(self, mark: str, what: str = "") -> None:
         if not self.take(mark):
-            self.fail(f"expected {what or repr(mark)}")
+            self.fail(what or repr(mark))
 
     def blank(self) -> None:
-        self.match(_BLANK, "a blank or none")
+        self.match(_BLANK, "a blank")
 
     def match(self, pattern: re.Pattern[str], what: str) -> str:
-        found = pattern.match(self.text, self.pos)
-        if not found:
-            self.fail(f"expected {what}")
-        self.pos = found.end()
-        return found[0]
+        seen = pattern.match(self.text, self.pos)
+        if not seen:
+            self.fail(what)
+        self.pos = seen.end()
+        return seen[0]
 
-    def fail(self, problem: str) -> NoReturn:
-        where = "its end" if self.pos >= len(self.text) else f"character {self.pos + 1}"
-        raise GroundedError(f"message path '{self.text}', {where}: {problem}")
+    def fail(self, expected: str) -> NoReturn:
+        at = self.pos + 1 if self.pos < len(self.text) else 0
+        shown = str(self.text)[: LENGTH_LIMIT // 10]
+        raise GroundedError(found("file.path", path=shown, at=at, expected=expected))

@@ -18,6 +18,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.bad import BadMessage, BadPath
+
 
 @dataclass(frozen=True)
 class Number:
@@ -110,22 +112,6 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
-class BadSchema(Exception):
-    """A definition that can't be used; the text says why."""
-
-
-class BadMessage(Exception):
-    """A message's bytes don't match its schema; `message` is its index in the batch."""
-
-    def __init__(self, message: int, found: str) -> None:
-        self.message = int(message)
-        super().__init__(found)
-
-
-class BadPath(Exception):
-    """A path does not fit the message type; the text says where, and what would fit."""
-
-
 @dataclass(frozen=True, eq=False)
 class Node:
     """One value of `type` in each row; rows are sorted by message."""
@@ -215,7 +201,7 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
         try:
             objects.append(json.loads(buffer[a:b]))
         except (ValueError, RecursionError) as error:
-            raise BadMessage(i, f"it is not JSON: {error}") from None
+            raise BadMessage(i, "json", why=str(error)) from None
     return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
 
 
@@ -255,7 +241,7 @@ class _JsonNode(Node):
                 values[i] = _as_float(o)
             else:
                 what = {"dict": "an object", "list": "a list"}.get(type(o).__name__, "a text")
-                raise BadPath(f"it ends at {what} in message {self.rows[i]}, not at a number")
+                raise BadPath("path_ends", type=f"{what} in message {self.rows[i]}")
         return values
 
     def equals(self, text: str) -> Bools:

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import nearest
-from grounded.result import listed
+from grounded.errors import nearest, type_of
 from grounded.units import in_another_unit
+from grounded_trials.formats.bad import BadMessage, BadPath
 from grounded_trials.formats.message_path import (
     ANGLES,
     AXES,
@@ -34,8 +34,6 @@ from grounded_trials.formats.message_path import (
 )
 from grounded_trials.formats.messages import (
     Array,
-    BadMessage,
-    BadPath,
     Bools,
     Dynamic,
     Floats,
@@ -96,7 +94,7 @@ def _into(type: Type, step: Step) -> Type:
         return type
     if isinstance(step, Slice):
         if not isinstance(type, Array):
-            raise BadPath(f"a {type} has no items")
+            raise BadPath("path_step", step="[...]", needs="a list", type=str(type))
         return type.item
     names = (step.name,) if isinstance(step, Field) else step.path
     inner: Type = type
@@ -106,41 +104,40 @@ def _into(type: Type, step: Step) -> Type:
         return inner
     wanted = Text if isinstance(step.value, str) else Number
     if not isinstance(inner, wanted):
-        raise BadPath(f"the filter compares '{'.'.join(names)}', a {inner}, with {step.value!r}")
+        raise BadPath("path_step", step=".".join(names), needs=type_of(step.value), type=str(inner))
     return type
 
 
 def _field(type: Type, name: str) -> Type:
     if isinstance(type, Array):
-        raise BadPath(f"'{name}' follows a list; select an item first, as in [0] or [:]")
+        raise BadPath("path_list", name=name)
     if not isinstance(type, Struct):
-        raise BadPath(f"'{name}' follows a {type}, which has no fields")
+        raise BadPath("path_step", step=name, needs="a message", type=str(type))
     if name not in type.by_name:
         raise NoField(type, name)
     return type.by_name[name].type
 
 
 class NoField(BadPath):
-    """A path names a field that its type does not have."""
+    """A path names a field that its type does not have.
 
-    def __init__(self, type: Struct, name: str) -> None:
-        super().__init__(_without(type, name, ()))
+    Args:
+        type: the type of the message.
+        name: the field.
+        taken: fields that other signals are read from, which are not suggested.
+    """
+
+    def __init__(self, type: Struct, name: str, taken: Collection[str] = ()) -> None:
         self.type, self.name = type, name
+        left = [one for one in type.by_name if one not in taken and one != "header"]
+        alike = in_another_unit(name, left)
+        hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left) if left else ""
+        read = tuple(one for one in type.by_name if one in taken)
+        super().__init__("path_field", type=str(type), name=name, hint=hint, read=read)
 
-    def beside(self, taken: Collection[str]) -> str:
-        """Return the message without a suggestion of fields that other signals are read from."""
-        return _without(self.type, self.name, taken)
-
-
-def _without(type: Struct, name: str, taken: Collection[str]) -> str:
-    left = [one for one in type.by_name if one not in taken and one != "header"]
-    read = [one for one in type.by_name if one in taken]
-    alike = in_another_unit(name, left)
-    hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left)
-    if read:
-        are = f"{listed(read)} {'is' if len(read) == 1 else 'are'} read already"
-        hint = f"{hint}; {are}" if left else are
-    return f"{type} has no field '{name}': {hint}"
+    def beside(self, taken: Collection[str]) -> NoField:
+        """Return it without a suggestion of fields that other signals are read from."""
+        return NoField(self.type, self.name, taken)
 
 
 def _check_end(type: Type, path: MessagePath) -> None:
@@ -150,23 +147,21 @@ def _check_end(type: Type, path: MessagePath) -> None:
     if name in ANGLES:
         fits = isinstance(type, Struct) and all(_is_number(type, part) for part in QUATERNION)
         if not fits:
-            raise BadPath(f"@rpy needs a quaternion (x, y, z, w), found {type}")
+            raise BadPath("path_step", step="@rpy", needs="x, y, z and w", type=str(type))
     elif name in AXES:
         if not _is_odometry(type):
-            raise BadPath(
-                f"@{WORLD} needs a message with {'.'.join(TURNED)} and {'.'.join(MOVING)}, such as "
-                f"an Odometry, found {type}"
-            )
+            both = f"{'.'.join(TURNED)} and {'.'.join(MOVING)}"
+            raise BadPath("path_step", step=f"@{WORLD}", needs=both, type=str(type))
     elif name == "norm":
         fits = isinstance(type, Array) and isinstance(type.item, Number)
         if not fits and not (isinstance(type, Struct) and _numbers_of(type)):
-            raise BadPath(f"@norm needs a vector or a list of numbers, found {type}")
+            raise BadPath("path_step", step="@norm", needs="numbers", type=str(type))
     elif isinstance(type, Struct):
-        raise BadPath(f"it ends at a {type}; add one of its fields: {', '.join(type.by_name)}")
+        raise BadPath("path_ends", type=str(type), fields=tuple(type.by_name))
     elif isinstance(type, Array):
-        raise BadPath(f"it ends at a list, {type}; select an item, as in [0]")
+        raise BadPath("path_ends", type=str(type), fields=("[0]", "[:]"))
     elif not isinstance(type, Number):
-        raise BadPath(f"it ends at a {type}, not at a number")
+        raise BadPath("path_ends", type=str(type))
 
 
 def _is_odometry(type: Type) -> bool:
@@ -242,7 +237,8 @@ def _numbered(node: Node) -> Iterator[Node]:
     try:
         yield node.numbered(np.arange(len(node.rows)))
     except BadMessage as error:
-        raise BadMessage(node.rows[error.message], str(error)) from None
+        error.message = int(node.rows[error.message])
+        raise
 
 
 def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
@@ -281,8 +277,7 @@ def read_stamp(node: Node) -> tuple[Ints, Ints]:
     outside = ~((np.abs(whole) <= CALENDAR_S) & (np.abs(part) < 2**32))
     if outside.any():
         k = int(np.argmax(outside))
-        when = f"{whole[k]:g} s and {part[k]:g} ns"
-        raise BadMessage(seconds.rows[k], f"its stamp, {when}, is out of range")
+        raise BadMessage(seconds.rows[k], "stamp", stamp=f"{whole[k]:g} s {part[k]:g} ns")
     return seconds.rows, whole.astype(np.int64) * 10**9 + part.astype(np.int64)
 
 

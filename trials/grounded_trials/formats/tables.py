@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, needs
+from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 from grounded_trials.formats.messages import Floats
@@ -56,10 +57,7 @@ def npz_records(path: Path) -> Iterator[Record]:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     if arrays.keys() >= CANDIDATE:
-        raise GroundedError(
-            f"{path} is an exported candidate, {arrays['candidate']}: the policy to run, not a log "
-            "of its run. Pass the log that the robot's program wrote"
-        )
+        raise GroundedError(found("file.exported", str(path), candidate=str(arrays["candidate"])))
     yield from table_records(_npz_tables(arrays, path), "npz", path)
 
 
@@ -143,9 +141,7 @@ def table_records(tables: Mapping[str, Columns], kind: str, path: Path) -> Itera
         GroundedError: if there is no table, or no column of times.
     """
     if not tables:
-        raise GroundedError(
-            f"{path} has no column of times: add an array 't' (seconds), as long as the others"
-        )
+        raise GroundedError(found("file.no_times", str(path)))
     yield Header("", kind)
     packed = []
     for i, (topic, columns) in enumerate(tables.items()):
@@ -205,25 +201,16 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     if not unit:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
     if lost := len(values) - len(finite):
-        raise GroundedError(
-            f"{path}: '{name}' is not a number in {lost} of {len(values)} rows: delete those rows, "
-            "or, if these are not the times, name their column 't'"
-        )
+        raise GroundedError(found("file.times", str(path), name=name, lost=lost))
     if top * UNITS[unit] > LATEST:
-        raise GroundedError(
-            f"{path}: '{name}' goes up to {top:g}, which is out of range in {unit}: end its name "
-            "with its unit, _ms, _us or _ns"
-        )
+        raise GroundedError(found("file.times", str(path), name=name, top=top, unit=unit))
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
 
 
 def _time_of(names: Sequence[str], path: Path) -> str:
     if name := time_among(names):
         return name
-    raise GroundedError(
-        f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
-        "'t_ms', 't_us' or 't_ns' in their units ('time', 'stamp', 'clock', 'elapsed' also work)"
-    )
+    raise GroundedError(found("file.no_times", str(path), names=tuple(names[:8])))
 
 
 def time_among(names: Sequence[str]) -> str:

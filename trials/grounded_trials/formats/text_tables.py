@@ -24,6 +24,7 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
@@ -72,7 +73,7 @@ def csv_records(path: Path) -> Iterator[Record]:
         except ValueError:
             values, stamps = _with_texts(_rows(stream, head, cut), head, times, path)
     if not values.size:
-        raise GroundedError(f"{path} has no rows below line {head.line} with the column names")
+        raise GroundedError(found("file.no_rows", str(path), line=head.line))
     named = zip(head.names, head.cells, values.T, strict=True)
     columns: dict[str, Any] = columns_by_name(named, path)
     if stamps is not None:
@@ -118,37 +119,21 @@ def _states_time_unit(path: Path) -> bool:
     return bool(SECONDS.search(head.cells[at].lower())) or ":" in "".join(row[at : at + 1])
 
 
-def table_remarks(path: Path) -> list[str]:
-    """Return what is odd in a text table, as sentences.
-
-    The last row may be incomplete; it is left out. The last column may be empty in every row, so
-    that one name may be too many.
-    """
+def table_remarks(path: Path) -> list[Finding]:
+    """Return what is odd in a text table: an incomplete last row, a last column without numbers."""
     return _of_text(path, _table_remarks) or []
 
 
-def _table_remarks(path: Path) -> list[str]:
+def _table_remarks(path: Path) -> list[Finding]:
     with _opened(path) as stream:
         head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
         cut, empty = _cut_in(stream, head), _empty_last(stream, head)
-    found = []
+    odd, name = [], str(path)
     if empty:
-        found.append(
-            f"'{head.cells[-1]}', its last column, is empty in every row: if line {head.line} has "
-            "one name more than the rows have numbers, the numbers are read one column too far to "
-            "the left; delete that name there"
-        )
-    if cut is not None and not cut.text:
-        found.append(
-            f"from line {cut.line} on it holds only zero bytes, as after a power loss: what was "
-            "recorded after that is lost"
-        )
-    elif cut is not None:
-        found.append(
-            f"its last row, line {cut.line} ({cut.text[:80]!r}), is incomplete and is left out: "
-            "everything after that is lost"
-        )
-    return found
+        odd.append(found("file.last_column", name, name=head.cells[-1], line=head.line))
+    if cut is not None:
+        odd.append(found("file.cut", name, line=cut.line, text=cut.text[:80]))
+    return odd
 
 
 def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
@@ -165,11 +150,12 @@ def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
             if any(cells[len(head.names) :]):
                 raise _misfit(path, number, cells, head)
     if "" in head.names and _empty_last(stream, head):
-        raise GroundedError(
-            f"{path}, line {head.line}: '{head.cells[-1]}' is empty in every row, while column "
-            f"{head.names.index('') + 1} has numbers but no name, so the names seem to be one "
-            "column too far to the right: correct that line"
-        )
+        facts: dict[str, Any] = {
+            "line": head.line,
+            "name": head.cells[-1],
+            "column": head.names.index("") + 1,
+        }
+        raise GroundedError(found("file.names_moved", str(path), **facts))
 
 
 def _empty_last(stream: TextIO, head: _Head) -> bool:
@@ -182,15 +168,16 @@ def _empty_last(stream: TextIO, head: _Head) -> bool:
 def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
     """Return the error for a row with a wrong number of cells, saying what may be its cause."""
     names, has = len(head.names), len(cells)
-    text = f"{path}, line {line} has {has} cells, but line {head.line} names {names}"
     twice = head.mark == "," and names < has <= 2 * names
-    if twice and all("." not in cell and _share([cell]) == 1 for cell in cells):
-        return GroundedError(
-            f"{text} columns: the decimal sign seems to be a comma, as the separator is, so a row "
-            "can be read in several ways. Export the table again with a point as decimal sign, or "
-            "with semicolons or tabs between the columns"
-        )
-    return GroundedError(text)
+    comma = twice and all("." not in cell and _share([cell]) == 1 for cell in cells)
+    facts: dict[str, Any] = {
+        "line": line,
+        "has": has,
+        "head": head.line,
+        "names": names,
+        "comma": int(comma),
+    }
+    return GroundedError(found("file.row", str(path), **facts))
 
 
 @dataclass(frozen=True)
@@ -273,10 +260,7 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     mark = next((m for m in "\t;," if m in lines[0]), ",")
     cells = _cells(lines[0], mark)
     if not any(map(column_name, cells)) or _share(cells) == 1:
-        raise GroundedError(
-            f"{path} begins with {lines[0][:40].strip()!r}; expected a line with column names "
-            "above the rows, one of them 't' (time in seconds), such as 't,x,v'"
-        )
+        raise GroundedError(found("file.no_names", str(path), line=lines[0][:40].strip()))
     return _named(lines, 0, mark)
 
 
@@ -320,22 +304,19 @@ def _times_among(head: _Head, lines: Sequence[str], path: Path) -> str:
     Raises:
         GroundedError: if there is none, suggesting a column whose values increase.
     """
-    found = time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
-    if found:
-        return found
+    named = time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
+    if named:
+        return named
     rows = [_cells(row, head.mark) for row in lines[head.rows :] if row.strip()]
     rising = [n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows])]
-    maybe = f"'{rising[0]}' increases in every row: if that is the time, name it" if rising else ""
-    raise GroundedError(
-        f"{path} has no column of times among {', '.join(filter(None, head.names[:8]))} (line "
-        f"{head.line}). {maybe or 'Name one'} 't' (seconds), or 't_ms', 't_us' or 't_ns' in their "
-        "units ('time', 'stamp', 'clock', 'Zeit', 'temps', 'tiempo' also work)"
-    )
+    names = tuple(filter(None, head.names[:8]))
+    rises = rising[0] if rising else ""
+    raise GroundedError(found("file.no_times", str(path), names=names, rises=rises))
 
 
 def _rises(cells: Sequence[Sequence[str]]) -> bool:
-    found = [_number(cell[0].replace(",", ".", 1)) for cell in cells if cell]
-    return len(found) > 2 and bool(np.all(np.diff(found) > 0))
+    values = [_number(cell[0].replace(",", ".", 1)) for cell in cells if cell]
+    return len(values) > 2 and bool(np.all(np.diff(values) > 0))
 
 
 def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
@@ -363,22 +344,19 @@ def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tu
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:
     """Convert texts to times [ns]: since 1970 with a date (UTC without a zone), else of the day."""
-    found, days = list[datetime](), timedelta()
+    moments, days = list[datetime](), timedelta()
     for line, text, date in texts:
         moment = _moment(f"{date.strip()} {text.strip()}".strip()) or _moment(text)
         if moment is None:
             raise GroundedError(
-                f"{path}, line {line}: '{name}' is {text.strip()!r}, which is not a time. Expected "
-                "a number (in seconds, or in the unit at the end of the name, _ms, _us or _ns), "
-                "2026-11-21 10:05:00.250, 21.11.2026 10:05:00.250 or 10:05:00.250, with the date "
-                "in a column 'Date' or without one"
+                found("file.no_time", str(path), line=line, name=name, text=text.strip())
             )
-        if found and moment + days < found[-1] - timedelta(hours=12) and moment.year == 1970:
+        if moments and moment + days < moments[-1] - timedelta(hours=12) and moment.year == 1970:
             days += timedelta(days=1)  # past midnight, without a date
-        found.append(moment + days)
+        moments.append(moment + days)
     micro = timedelta(microseconds=1)
     start = datetime(1970, 1, 1, tzinfo=UTC)
-    return np.array([(moment - start) // micro for moment in found], dtype=np.int64) * 1000
+    return np.array([(moment - start) // micro for moment in moments], dtype=np.int64) * 1000
 
 
 def _moment(text: str) -> datetime | None:

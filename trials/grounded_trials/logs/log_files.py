@@ -17,7 +17,7 @@ from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 from zipfile import BadZipFile, ZipFile
 
 from grounded.errors import GroundedError
-from grounded.result import listed
+from grounded.findings import found
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.plain_file import open_file, read_file
@@ -34,10 +34,6 @@ _LISTED = re.compile(
     r"^[ \t]*-[ \t]+(?:path:[ \t]*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?[ \t\r]*$",
     re.MULTILINE,
 )
-_REMEDIES = {
-    "ROS 2 bag": "; if it is damaged, `sqlite3 FILE .recover` saves what can be saved",
-    "ROS 1 bag": "; if it was not closed, `rosbag reindex` repairs it",
-}
 _NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
 _DIGITS = re.compile(r"(\d+)")
 
@@ -59,9 +55,9 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
         files.extend(_bag(path) if path.is_dir() else [path])
     for path in files:
         if not path.exists():
-            raise GroundedError(f"{path} does not exist{_nearby(path)}")
+            raise _missing(path)
     if not files:
-        raise GroundedError("no log was given")
+        raise GroundedError(found("file.missing", "a log"))
     return tuple(files)
 
 
@@ -69,45 +65,43 @@ def _bag(folder: Path) -> list[Path]:
     listing = folder / "metadata.yaml"
     try:
         text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
-        found = [[p for p in folder.iterdir() if p.name.endswith(kind)] for kind in BAGS]
+        bags = [[p for p in folder.iterdir() if p.name.endswith(kind)] for kind in BAGS]
     except (OSError, UnicodeDecodeError) as error:
-        raise GroundedError(f"{folder} can't be read as a bag: {error}") from None
+        raise _unreadable(folder, str(error), "bag") from None
     names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
     if names:  # names only: a listing can't lead out of its folder
         missing = [name for name in names if not (folder / name).exists()]
         if missing:
-            raise GroundedError(
-                f"{listing} lists {missing[0]}, which is not in the folder; "
-                "give the files that are there one by one"
-            )
+            raise GroundedError(found("file.listed", str(listing), name=missing[0]))
         return [folder / name for name in names]
-    inside = next((paths for paths in found if paths), [])
+    inside = next((paths for paths in bags if paths), [])
     if not inside:
-        raise GroundedError(f"{folder} holds no *.mcap or *.db3 file{_advice(folder)}")
+        raise _no_log_in(folder)
     return sorted(inside, key=lambda path: _natural(path.name))
 
 
-def _nearby(path: Path) -> str:
-    """Return advice on a file that does not exist, to append to the message."""
+def _missing(path: Path) -> GroundedError:
+    """Return the error for a file that does not exist, with the logs that it may stand for."""
     from difflib import get_close_matches
 
     if not path.parent.is_dir():
-        return f", nor does its folder {path.parent}: give a path relative to the current folder"
+        return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
     there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not _is_candidate(p)]
     logs = sorted(there, key=lambda p: -_written(p))
-    if logs:
-        plain = _DIGITS.sub("0", path.stem.lower())
-        named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike
-        close = get_close_matches(path.stem.lower(), named, n=1)
-        close += [stem for stem in named if _DIGITS.sub("0", stem) == plain]  # another number
-        if close:
-            return f": did you mean '{named[close[0]]}'?"
-        if len(logs) <= NEWEST:
-            return f"; the folder has {listed(p.name for p in logs)}"
-        newest = listed([p.name for p in logs[:NEWEST]])
-        return f": the newest of the {len(logs)} logs in its folder are {newest}"
-    return ": give the path of a log or of a bag's folder, relative to the current folder"
+    plain = _DIGITS.sub("0", path.stem.lower())
+    named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike
+    close = get_close_matches(path.stem.lower(), named, n=1)
+    close += [stem for stem in named if _DIGITS.sub("0", stem) == plain]  # another number
+    near = named[close[0]] if close else ""
+    newest = () if close else tuple(p.name for p in logs[:NEWEST])
+    return GroundedError(
+        found("file.missing", str(path), near=near, newest=newest, logs=len(logs) * (not close))
+    )
+
+
+def _unreadable(path: Path, why: str, kind: str = "") -> GroundedError:
+    return GroundedError(found("file.unreadable", str(path), why=why, kind=kind))
 
 
 def _is_candidate(path: Path) -> bool:
@@ -132,17 +126,13 @@ def _written(path: Path) -> float:
         return 0.0
 
 
-def _advice(folder: Path) -> str:
-    if (folder / "grounded.toml").is_file():
-        return "; it is a workspace: give the log in it, or the log's folder"
+def _no_log_in(folder: Path) -> GroundedError:
     tables = sorted(path.name for path in folder.iterdir() if path.name.endswith(".csv"))
-    if len(tables) > 1:
-        return (
-            f": give the log itself. If {listed(tables[:3])} are one run, put them into one .npz, "
-            "each as an array NAME with its times NAME_t and its columns NAME_names; for the code "
-            'see docs/log-reference.md, "Two tables, two clocks"'
-        )
-    return ": give the log itself"
+    several = tuple(tables[:NEWEST]) if len(tables) > 1 else ()
+    workspace = int((folder / "grounded.toml").is_file())
+    return GroundedError(
+        found("file.no_log_inside", str(folder), tables=several * (not workspace), own=workspace)
+    )
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -159,19 +149,16 @@ def open_log(path: Path) -> BinaryIO:
     try:
         return open_file(path)
     except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist{_nearby(path)}") from None
+        raise _missing(path) from None
     except IsADirectoryError:
-        raise GroundedError(f"{path} is a folder: give a file in it") from None
+        raise GroundedError(found("file.folder", str(path))) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+        raise _unreadable(path, str(error.strerror)) from None
 
 
 def empty(path: Path) -> GroundedError:
     """Return the error for a log without a single byte."""
-    return GroundedError(
-        f"{path} is empty (0 bytes): the recorder wrote nothing, or the copy is unfinished; copy "
-        "it again, or record again"
-    )
+    return GroundedError(found("file.empty", str(path)))
 
 
 def log_records(path: Path) -> Iterator[Record]:
@@ -203,25 +190,21 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
         tables.ULOG: ("PX4 log", tables.ulog_records),
         tables.ZIP: ("NumPy archive", tables.npz_records),
     }
-    found = next((one for magic, one in begins.items() if head.startswith(magic)), None)
+    reader = next((one for magic, one in begins.items() if head.startswith(magic)), None)
     if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
-        found = "MCAP log", lambda path: read_records(stream, str(path))
-    elif found is None and path.suffix in (".csv", ".tsv", ".txt"):
-        found = "table", text_tables.csv_records
-    if found is None:
-        raise GroundedError(
-            f"{path} is not a log: it begins with {head[:8]!r}; expected MCAP, ROS 2 .db3, ROS 1 "
-            ".bag, .csv, .npz or PX4 .ulg"
-        )
-    kind, read = found
+        reader = "MCAP log", lambda path: read_records(stream, str(path))
+    elif reader is None and path.suffix in (".csv", ".tsv", ".txt"):
+        reader = "table", text_tables.csv_records
+    if reader is None:
+        raise GroundedError(found("file.no_log", str(path), head=repr(head[:8])))
+    kind, read = reader
     try:
         yield from map(_plain, read(path))
     except GroundedError:
         raise
     except Exception as error:  # a decoder raises whatever a damaged file leads to
         why = f"{type(error).__name__}: {error}"
-        remedy = _REMEDIES.get(kind, "")
-        raise GroundedError(f"{path} can't be read as a {kind}: {why[:500]}{remedy}") from error
+        raise _unreadable(path, why[:500], kind) from error
 
 
 def _plain(record: Record) -> Record:
@@ -247,7 +230,7 @@ def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
         with target.open("wb") as out:
             decoder.copy_stream(stream, out)
     except (zstandard.ZstdError, OSError) as error:
-        raise GroundedError(f"{path} can't be decompressed: {error}") from error
+        raise _unreadable(path, str(error), "zstd file") from error
 
 
 def read_apart(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from grounded.errors import GroundedError
-from grounded.result import listed
+from grounded.findings import found
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import LATEST
@@ -62,9 +62,9 @@ def _signal(table: Table, clock: str) -> SignalSpec:
     )
     table.finish()
     if spec.max_age_s is not None and spec.max_age_s <= 0:
-        raise table.error("max_age_s", f"must be positive, found {spec.max_age_s:g}")
+        raise table.error("max_age_s", "positive", spec.max_age_s)
     if spec.scale == 0:
-        raise table.error("scale", "must not be 0: the signal would always be 0")
+        raise table.error("scale", "nonzero", spec.scale)
     return spec
 
 
@@ -72,7 +72,7 @@ def _time(table: Table, key: str) -> float:
     """Return a time [s], of a log's clock at the most: later ones have no whole nanoseconds."""
     value: float = table.take(key, float)
     if abs(value) > LATEST_S:
-        raise table.error(key, f"must be a time within {LATEST_S:g} s, found {value:g}")
+        raise table.error(key, "time", value)
     return value
 
 
@@ -82,7 +82,7 @@ def _path(table: Table) -> str:
     try:
         parse_path(path)
     except GroundedError as error:
-        raise table.error("path", str(error)) from None
+        raise table.error("path", "path", str(error)) from None
     return path
 
 
@@ -91,7 +91,7 @@ def _span(table: Table) -> Span:
     end = _end(table, "end")
     table.finish()
     if end == "first-input":
-        raise table.error("end", "must be a time in seconds or { path = ..., above = ... }")
+        raise table.error("end", "crossing", end)
     return Span(start="first-input" if start is None else start, end=cast("Any", end))
 
 
@@ -106,16 +106,16 @@ def _end(table: Table, key: str) -> Any:
     if not isinstance(value, dict):
         return _time(table, key)
     crossing = table.sub(key)
-    found = Crossing(
+    given = Crossing(
         path=_path(crossing),
         above=crossing.take("above", float) if crossing.has("above") else None,
         below=crossing.take("below", float) if crossing.has("below") else None,
         clock=cast(Clock, crossing.choice("clock", CLOCKS, "log")),
     )
     crossing.finish()
-    if (found.above is None) == (found.below is None):
-        raise table.error(key, "needs exactly one of above = ... and below = ...")
-    return found
+    if (given.above is None) == (given.below is None):
+        raise table.error(key, "crossing", value)
+    return given
 
 
 @dataclass(frozen=True)
@@ -181,18 +181,13 @@ def mapped_signals(
         GroundedError: see `signals.read_signals`.
     """
     if missing := ["state"] * (not states) + ["input"] * (not inputs):
-        raise GroundedError(
-            f"[log] maps no {' and no '.join(missing)}; a trial needs at least one of each: add "
-            f"{listed(f'[log.{one}.NAME]' for one in missing)} with its path"
-        )
+        raise GroundedError(found("file.unmapped", kinds=tuple(missing)))
     paths_of = {mapping.states[name].path: name for name in states}
     same = [name for name in inputs if mapping.inputs[name].path in paths_of]
     if same:
         path = mapping.inputs[same[0]].path
         raise GroundedError(
-            f"[log] maps the input {same[0]} and the state {paths_of[path]} to the same number, "
-            f"{path}: a measured state is not its command. Set path in [log.input.{same[0]}] to "
-            "what was sent to the robot"
+            found("file.mapped_twice", same[0], input=same[0], state=paths_of[path], path=path)
         )
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}

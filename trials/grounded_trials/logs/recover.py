@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -32,7 +33,6 @@ from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
 from grounded_trials.within import within
-from grounded_trials.wording import count
 
 MOST_LOSSES = 50  # number of losses listed
 HEAD = 2**20  # [bytes] at the beginning of a log, in which its first chunk begins
@@ -47,7 +47,7 @@ class Recovery:
     target: Path
     messages: Mapping[str, int]  # saved, by topic
     lost_messages: Mapping[str, int]  # known to be lost, by topic
-    losses: tuple[str, ...]  # sentences; empty if the file was not damaged
+    losses: tuple[Finding, ...]  # empty if the file was not damaged
     unverified: int  # saved messages without a valid checksum
     duration_s: float  # from the first to the last saved message
     format: str = ""  # TRIAL or CANDIDATE if grounded wrote the file, else ""
@@ -75,11 +75,11 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     """
     source, target = Path(source), Path(target)
     if target.exists():
-        raise GroundedError(f"{target} exists already; choose another file name")
+        raise GroundedError(found("file.exists", str(target)))
     if target.suffix.lower() != ".mcap":
-        raise GroundedError(f"{target} does not end in .mcap, the format that is written: add it")
+        raise GroundedError(found("file.unwritable", str(target), why="it needs the ending .mcap"))
     if not target.parent.is_dir():
-        raise GroundedError(f"{target} can't be written: its folder does not exist; create it")
+        raise GroundedError(found("file.unwritable", str(target), folder=str(target.parent)))
     with open_log(source) as stream:
         size = stream.seek(0, 2)
     if not size:
@@ -104,35 +104,33 @@ def _recover(source: Path, target: Path) -> Recovery:
                 copy.finish()
             sync_folder(target.parent)
         except OSError as error:
-            raise GroundedError(f"{target} can't be written: {error.strerror}") from error
+            raise GroundedError(
+                found("file.unwritable", str(target), why=str(error.strerror))
+            ) from error
     if not copy.anything:
-        why = salvage.losses[0] if salvage.losses else "it is a log without messages"
-        raise GroundedError(
-            f"{source}: nothing can be saved: {why}; expected an MCAP log, intact or damaged; look "
-            "for another copy of the recording"
-        )
+        why = salvage.losses[0].sentence if salvage.losses else ""
+        raise GroundedError(found("file.nothing_saved", str(source), why=why))
     losses = salvage.losses[:MOST_LOSSES]
     if more := len(salvage.losses) - len(losses):
-        losses.append(f"{more} more losses of these kinds")
+        losses.append(found("file.lost", more=more))
     if copy.homeless:
-        these = count(copy.homeless, "message")
-        losses.append(f"{these} of topics whose name and type are lost")
+        losses.append(found("file.lost", messages=copy.homeless))
     losses += copy.without(salvage.dropped)
     lost = Counter({copy.topic(c): n for c, n in salvage.lost_messages.items()})
-    found = Recovery(
+    saved = Recovery(
         source, target, copy.counts, lost, tuple(losses), salvage.unverified, copy.duration_s
     )
-    return _own(found, copy)
+    return _own(saved, copy)
 
 
-def _own(found: Recovery, copy: _Copy) -> Recovery:
+def _own(saved: Recovery, copy: _Copy) -> Recovery:
     """Add what was saved of a file written by grounded, in steps."""
     kind = copy.meta.get("format", "")
     if kind != TRIAL:
-        return replace(found, format=kind)
-    states, inputs = (found.messages.get(topic, 0) for topic in ("/state", "/input"))
+        return replace(saved, format=kind)
+    states, inputs = (saved.messages.get(topic, 0) for topic in ("/state", "/input"))
     return replace(
-        found,
+        saved,
         format=kind,
         candidate=copy.meta.get("candidate", ""),
         steps=max(0, min(states - 1, inputs)),
@@ -234,7 +232,7 @@ class _Copy:
         """Time from the first to the last saved message [s]."""
         return 0.0 if self.span is None else (self.span[1] - self.span[0]) * 1e-9
 
-    def without(self, dropped: Sequence[tuple[int, int]]) -> list[str]:
+    def without(self, dropped: Sequence[tuple[int, int]]) -> list[Finding]:
         """Return the time spans of dropped chunks, if plausible: these may be damaged as well."""
         if self.span is None:
             return []
@@ -243,8 +241,7 @@ class _Copy:
         sane = [(a, b) for a, b in dropped if first - room <= a <= b <= last + room]
         first = min([first, *(a for a, _ in sane)])
         return [
-            f"second {(a - first) * 1e-9:.2f} to {(b - first) * 1e-9:.2f} of the log"
-            for a, b in sane
+            found("file.lost", start=(a - first) * 1e-9, end=(b - first) * 1e-9) for a, b in sane
         ]
 
     def finish(self) -> None:

@@ -17,11 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.command_steps import (
     first_step,
@@ -33,11 +34,11 @@ from grounded_trials.logs.samples import REGULAR, Samples, check_overlap, tidy
 from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
+    findings_of,
     outliers,
     report_of,
     staircases,
     vanished,
-    warnings_of,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
 
@@ -96,7 +97,7 @@ class Gridded:
     row_s: float  # interval of rows that repeat commands, by which these may be logged late [s]
     early: Callable[[], float]  # by which responses may begin early between two samples [s]
     last_ns: int  # last sample of the state whose samples end first, on the same clock [ns]
-    told: Callable[[], tuple[tuple[SignalReport, ...], tuple[str, ...]]]  # reports and warnings
+    told: Callable[[], tuple[tuple[SignalReport, ...], tuple[Finding, ...]]]  # of its signals
 
     @property
     def reports(self) -> tuple[SignalReport, ...]:
@@ -104,9 +105,14 @@ class Gridded:
         return self._told[0]
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def findings(self) -> tuple[Finding, ...]:
         """What is odd about the samples."""
         return self._told[1]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as sentences."""
+        return tuple(one.sentence for one in self.findings)
 
     @cached_property
     def interpolated_s(self) -> float:
@@ -114,7 +120,7 @@ class Gridded:
         return self.early()
 
     @cached_property
-    def _told(self) -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
+    def _told(self) -> tuple[tuple[SignalReport, ...], tuple[Finding, ...]]:
         return self.told()  # on request: a run is sought in many spans of a log
 
 
@@ -189,7 +195,7 @@ def to_grid(
     }
     columns = [sampled[how[name]](whole[name], at, dt, start) for name, at in times.items()]
 
-    def told() -> tuple[tuple[SignalReport, ...], tuple[str, ...]]:
+    def told() -> tuple[tuple[SignalReport, ...], tuple[Finding, ...]]:
         reports = tuple(
             report_of(samples[name], series[name], column, at, start)
             for (name, at), column in zip(times.items(), columns, strict=True)
@@ -198,7 +204,7 @@ def to_grid(
         odd = outliers(tracked, start, int(grid[-1]))
         cut = stop == until and (steps is None or count < steps) and span.end is None
         gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
-        return reports, (*warnings_of(reports, late), *stairs, *odd, *gone)
+        return reports, (*findings_of(reports, late), *stairs, *odd, *gone)
 
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:
@@ -311,36 +317,23 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
     if not beyond.any():
         limits = {"above": crossing.above, "below": crossing.below}
         wanted = " and ".join(f"{k} {v}" for k, v in limits.items() if v is not None)
-        raise GroundedError(
-            f"[log.span] {which}: {crossing.path} is never {wanted} in this log; its values range "
-            f"from {y.min():g} to {y.max():g}"
-        )
+        facts: dict[str, Any] = {"low": float(y.min()), "high": float(y.max())}
+        raise GroundedError(found("file.never", which, path=crossing.path, wanted=wanted, **facts))
     return int(t[np.argmax(beyond)])
 
 
-def stamped_otherwise(samples: Iterable[Samples], dt: float) -> str:
-    """Return a hint if the times seem to be in another unit, by the interval of the samples."""
+def stamped_otherwise(samples: Iterable[Samples], dt: float) -> float:
+    """Return the interval of samples [s] whose times seem to be in another unit; else 0."""
     many = [one for one in samples if len(one.t) >= MANY]
     every = max((one.interval for one in many), default=0.0)
-    for factor in UNITS_OF_TIME:
-        if STEPS_APART[0] * dt <= factor * every <= STEPS_APART[1] * dt:
-            return (
-                f". Its samples are {every:.3g} s apart; times {factor:g} they would be "
-                f"{factor * every:.3g} s: are its times in another unit than their column says "
-                "(seconds under t_ms)?"
-            )
-    return ""
+    low, high = (apart * dt for apart in STEPS_APART)
+    return every if any(low <= factor * every <= high for factor in UNITS_OF_TIME) else 0.0
 
 
-def _steps(start: int, stop: int, dt: float, most: int | None, origin: int, hint: str) -> int:
+def _steps(start: int, stop: int, dt: float, most: int | None, origin: int, every: float) -> int:
     count = int(np.floor((stop - start) / (dt * 1e9) + 1e-6))
     if not 1 <= count <= STEP_LIMIT:
-        raise GroundedError(
-            f"the trial would have {max(count, 0)} steps of {dt} s: it starts {_s(start, origin)} "
-            f"and ends {_s(stop, origin)} after the log's first sample{hint or '; see [log.span]'}"
-        )
+        ends: dict[str, Any] = {"start": (start - origin) * 1e-9, "stop": (stop - origin) * 1e-9}
+        facts: dict[str, Any] = {"steps": max(count, 0), "dt": dt, "every": every}
+        raise GroundedError(found("file.steps", **facts, **ends))
     return count if most is None else min(count, most)
-
-
-def _s(time: int, origin: int) -> str:
-    return f"{(time - origin) * 1e-9:.3f} s"

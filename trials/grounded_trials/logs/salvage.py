@@ -15,6 +15,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from grounded.findings import Finding, found
+from grounded_trials.formats.bad import BadRecord
 from grounded_trials.formats.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -25,7 +27,6 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_INDEX,
     METADATA,
     PARSERS,
-    BadRecord,
     Channel,
     Fields,
     Messages,
@@ -64,7 +65,7 @@ class Salvage:
     def __init__(self, stream: BinaryIO, name: str) -> None:
         self.stream, self.name = stream, name
         self.size = stream.seek(0, 2)
-        self.losses: list[str] = []
+        self.losses: list[Finding] = []
         self.lost_messages: Counter[int] = Counter()
         self.dropped: list[tuple[int, int]] = []
         self.unverified = 0
@@ -89,9 +90,7 @@ class Salvage:
                 if after is None:
                     yield from self._cut(pos)
                     return
-                self.losses.append(
-                    f"{after - pos} bytes from byte {pos} on can't be read: their content is lost"
-                )
+                self.losses.append(found("file.lost", bytes=after - pos, byte=pos))
                 pos = after
                 continue
             opcode, content = self._read(pos, end)
@@ -112,16 +111,14 @@ class Salvage:
         yield from self._flush()
         self.losses.append(self._ends_early())
 
-    def _ends_early(self) -> str:
-        if self._ended:
-            return "the index at the end of the file is missing; all messages are before it"
-        return f"the file is cut off at byte {self.size}: what came after that is lost"
+    def _ends_early(self) -> Finding:
+        return found("file.cut_at", byte=self.size, index=int(self._ended))
 
     def _first(self) -> int | None:
         if read_at(self.stream, 0, 8) == MAGIC:
             self._crc = zlib.crc32(MAGIC)
             return len(MAGIC)
-        self.losses.append("the beginning of the file is not that of an MCAP file")
+        self.losses.append(found("file.lost", part="its beginning"))
         return next_chain(self.stream, self.size, 0)
 
     def _read(self, pos: int, end: int) -> tuple[int, bytes]:
@@ -141,7 +138,7 @@ class Salvage:
                 yield from self._sound(record)
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
-            self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
+            self.losses.append(found("file.lost", part=what, byte=pos, why=str(error)))
             if opcode == CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
@@ -157,7 +154,7 @@ class Salvage:
         if isinstance(record, Schema | Channel):
             known = self._defined.setdefault((type(record), record.id), record)
             if known != record:
-                self.losses.append(f"{again(known, record)}: messages that use it are left out")
+                self.losses.append(again(known, record).finding)
                 self._doubtful |= {
                     c.id
                     for c in self._defined.values()
@@ -167,7 +164,7 @@ class Salvage:
         elif isinstance(record, Messages):
             good = (record.log_times >= 0) & ~np.isin(record.channels, list(self._doubtful))
             if not good.all():
-                self.losses.append(f"{int((~good).sum())} messages of an unknown channel or time")
+                self.losses.append(found("file.lost", messages=int((~good).sum())))
                 record = record.take(good)
         yield record
 
@@ -188,11 +185,7 @@ class Salvage:
         stated = int.from_bytes(record[9:13], "little")
         wrong = bool(stated) and stated != self._crc
         if wrong and not self.losses and (self._outside or self._tables):
-            these = f"its {self._outside} messages" if self._outside else "its metadata"
-            self.losses.append(
-                f"the checksum of the file does not match: some number in {these} may be wrong, "
-                "and it can't be located"
-            )
+            self.losses.append(found("file.unverified", messages=self._outside))
         if self.losses or not stated:
             self.unverified += self._outside
         self._outside, self._ended = 0, True
@@ -241,7 +234,7 @@ class Salvage:
 
     def _tail(self, end: int) -> None:
         if read_at(self.stream, end, 9) != MAGIC:
-            self.losses.append("the file does not end as an MCAP file does")
+            self.losses.append(found("file.lost", part="its end"))
 
 
 def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.result import listed
+from grounded.findings import found
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
@@ -86,16 +87,10 @@ class Samples:
             dt: control step [s].
         """
         if len(self.t) < 2:
-            raise _unusable(
-                self.name, self.spec, 'one sample can\'t be interpolated; set resample = "hold"'
-            )
+            raise _unusable(self.name, self.spec, "one")
         if self.interval > SPARSE * dt and self.spec.max_age_s is None:
-            raise _unusable(
-                self.name,
-                self.spec,
-                f"it comes every {self.interval:.3g} s, a control step is {dt:.3g} s. If its times "
-                "are milliseconds, name the table's column t_ms; if it is so slow, set max_age_s",
-            )
+            facts: dict[str, Any] = {"path": self.spec.path, "every": self.interval, "dt": dt}
+            raise GroundedError(found("file.sparse", self.name, **facts))
 
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
         """Interpolate values at times [ns]; up to half an interval beyond the ends is allowed.
@@ -128,11 +123,7 @@ class Samples:
         """
         i = np.searchsorted(self.t, at, "right") - 1
         if (i < 0).any():
-            first = (self.t[0] - origin) * 1e-9
-            raise GroundedError(
-                f"'{self.name}' ({self.spec.path}) has no sample before {first:.3f} s; "
-                "start the span later"
-            )
+            raise self._outside(origin)
         limit = np.inf if self.spec.max_age_s is None else self.spec.max_age_s
         age = (at - self.t[i]) * 1e-9
         lost = np.searchsorted(self.lost, at, "right") > np.searchsorted(self.lost, self.t[i])
@@ -207,22 +198,26 @@ class Samples:
         beyond = np.maximum(t0 - at, at - t1) * 1e-9 > self.slack(dt)
         if beyond.any():
             k = int(np.argmax(beyond))
-            raise GroundedError(
-                f"'{self.name}' ({self.spec.path}) is not known at {(at[k] - origin) * 1e-9:.3f} s:"
-                f" its samples range from {(self.t[0] - origin) * 1e-9:.3f} s "
-                f"to {(self.t[-1] - origin) * 1e-9:.3f} s"
-            )
+            raise self._outside(origin, int(at[k]))
 
     def slack(self, dt: float) -> float:
         """Return how far beyond the first and last sample a value is extrapolated [s]."""
         return 0.5 * min(self.interval, dt)
 
+    def _outside(self, origin: int, at: int | None = None) -> GroundedError:
+        ends = {k: (self.t[i] - origin) * 1e-9 for k, i in (("first", 0), ("last", -1))}
+        when = float(ends["first"]) if at is None else (at - origin) * 1e-9
+        path = self.spec.path
+        return GroundedError(found("file.outside", self.name, path=path, at=when, **ends))
+
     def _refuse(self, t0: int, t1: int, limit: float, origin: int) -> None:
-        raise GroundedError(
-            f"'{self.name}' ({self.spec.path}) has a gap of {(t1 - t0) * 1e-9:.3f} s from "
-            f"{(t0 - origin) * 1e-9:.3f} s to {(t1 - origin) * 1e-9:.3f} s after the start, more "
-            f"than {limit:.3f} s; end the span before it, or set max_age_s to interpolate over it"
-        )
+        facts: dict[str, Any] = {
+            "start": (t0 - origin) * 1e-9,
+            "end": (t1 - origin) * 1e-9,
+            "limit": limit,
+        }
+        gap, path = (t1 - t0) * 1e-9, self.spec.path
+        raise GroundedError(found("file.gap", self.name, path=path, gap=gap, **facts))
 
 
 def _by_chance(count: int) -> float:
@@ -260,7 +255,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     spec, t = series.spec, series.t
     finite = np.isfinite(series.values)
     if not (t != 0).any() and len(t) > 1:
-        raise _unusable(name, spec, f"all its {spec.clock} stamps are 0; use another clock")
+        raise _unusable(name, spec, "zero")
     nearest = np.abs(t[t != 0]).min(initial=2**62)
     apart = np.abs(np.diff(t[t != 0]))
     usual = float(np.median(apart)) if len(apart) else 0.0
@@ -268,19 +263,14 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     stamped = (t != 0) | (nearest < near)
     good = finite & stamped
     if not good.any():
-        raise _unusable(name, spec, f"none of its {len(t)} values is a finite number")
+        raise _unusable(name, spec, "nothing", len(t))
     t, y = t[good], spec.scale * series.values[good] + spec.offset
     back = np.diff(t)
     if len(back) and back.min() < -JUMP_S * 1e9:
         k = int(np.argmin(back))
-        raise _unusable(
-            name,
-            spec,
-            f"its {spec.clock} clock jumps back by {-back[k] * 1e-9:.3f} s after sample {k}; it "
-            "was set or overflowed, or a simulation restarted: cut the log there"
-            + ', or use clock = "log"'
-            * (spec.clock != "log"),
-        )
+        facts: dict[str, Any] = {"clock": spec.clock, "by": float(-back[k]) * 1e-9, "sample": k}
+        other = int(spec.clock != "log")
+        raise GroundedError(found("file.clock_jumps", name, path=spec.path, other=other, **facts))
     order = np.argsort(t, kind="stable")
     t, y = t[order], y[order]
     last_of_stamp = np.append(np.diff(t) != 0, True)
@@ -300,8 +290,8 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     )
 
 
-def _unusable(name: str, spec: SignalSpec, why: str) -> GroundedError:
-    return GroundedError(f"'{name}' ({spec.path}) can't be used: {why}")
+def _unusable(name: str, spec: SignalSpec, what: str, values: int = 0) -> GroundedError:
+    return GroundedError(found("file.unusable", name, path=spec.path, what=what, values=values))
 
 
 def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
@@ -325,19 +315,13 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
     early = [s for s in (*states, *inputs) if s not in late]
     first, begin = (min(int(s.t[0]) for s in some) for some in (early, late))
     moved, by = (late, begin - first) if any(s in inputs for s in early) else (early, first - begin)
-    spans = [
-        f"{listed(s.name for s in some)} from {(start - first) * 1e-9:.3f} "
-        f"to {(max(int(s.t[-1]) for s in some) - first) * 1e-9:.3f} s"
-        for some, start in ((early, first), (late, begin))
-    ]
     lines = "; ".join(
         f"[log.{'state' if s in states else 'input'}.{s.name}] delay_s = "
         f"{s.spec.delay_s + by * 1e-9:.3f}"
         for s in moved
     )
-    raise GroundedError(
-        f"the log's signals are on clocks that differ, by about {abs(by) * 1e-9:.3f} s if they "
-        f"begin together: {', '.join(spans)} after its first sample. Log all on one clock, or "
-        f"align the two: {lines}. Determine the difference to a few ms (by a knock that both "
-        "show): any error of it looks like a delay, or like motion before its command"
-    )
+    names: dict[str, Any] = {
+        "early": tuple(s.name for s in early),
+        "late": tuple(s.name for s in late),
+    }
+    raise GroundedError(found("file.clocks", apart=abs(by) * 1e-9, lines=lines, **names))

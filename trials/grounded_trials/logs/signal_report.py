@@ -1,19 +1,20 @@
-"""Statistics of a log's signals, and warnings and errors that follow from them.
+"""Statistics of a log's signals, and findings that follow from them.
 
 `SignalReport` states rate, jitter, gaps and dropped samples of one signal. `check_clocks` refuses
 signals on different clocks, `staircase` warns of sensors that are late because rows repeat their
-values, `warnings_of` turns reports into sentences.
+values, `findings_of` says what is odd in reports.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.result import listed
+from grounded.findings import Finding, found
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import MIXED_S, Samples
 from grounded_trials.logs.signals import Series
@@ -100,12 +101,8 @@ def check_clocks(series: Mapping[str, Series]) -> None:
     """
     first, last, apart = _furthest({name: s.skew_s for name, s in series.items()})
     if apart > MIXED_S:
-        a, b = series[first].spec.clock, series[last].spec.clock
-        raise GroundedError(
-            f"'{first}' (clock {a}) and '{last}' (clock {b}) are on clocks that differ by "
-            f"{apart:.3f} s (simulation time, or an unset clock?); use the same clock for both, "
-            'such as clock = "log"'
-        )
+        facts: dict[str, Any] = {"early": (first,), "late": (last,), "apart": apart, "lines": ""}
+        raise GroundedError(found("file.clocks", **facts))
 
 
 def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
@@ -118,8 +115,8 @@ def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
     return first, last, known[last] - known[first]
 
 
-def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> list[str]:
-    """Return warnings on signals that are late because rows repeat each of their values.
+def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> list[Finding]:
+    """Find signals that are late because rows repeat each of their values.
 
     A table has a row per sample of its fastest signal, so rows repeat the samples of a slower
     sensor. A quantised signal also repeats values, but changes by few different steps.
@@ -131,9 +128,9 @@ def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> l
         dt: control step [s]; values held for up to half of it don't matter.
 
     Returns:
-        One warning for all signals that change at the same rate.
+        One finding for all signals that change at the same rate.
     """
-    slow: dict[str, list[str]] = {}
+    slow: dict[tuple[float, float, float], list[str]] = {}
     for samples in series:
         t, y = samples.within(first, last)
         new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
@@ -144,27 +141,23 @@ def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> l
         if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
             continue
         late = (apart - samples.interval) / 2
-        rates = f"{1 / apart:.3g} Hz, but rows come at {1 / samples.interval:.3g} Hz"
-        slow.setdefault(f"{rates}: samples are held and {late:.2g} s late", []).append(samples.name)
-    advice = "Leave cells empty in rows that repeat a value (or log the sensor's own messages)"
-    found = []
-    for text, names in slow.items():
-        which, s = listed(map(repr, names)), "s" * (len(names) == 1)
-        found.append(
-            f"{which} change{s} at {text} on average. {advice}: then they are interpolated"
-        )
-    return found
+        rate, rows, by = (float(f"{x:.3g}") for x in (1 / apart, 1 / samples.interval, late))
+        slow.setdefault((rate, rows, by), []).append(samples.name)
+    return [
+        found("file.staircase", *names, changes=rate, rows=rows, late=late)
+        for (rate, rows, late), names in slow.items()
+    ]
 
 
-def outliers(series: Sequence[Samples], first: int, last: int) -> list[str]:
-    """Return warnings on single samples far outside everything else that their signal has.
+def outliers(series: Sequence[Samples], first: int, last: int) -> list[Finding]:
+    """Find single samples far outside everything else that their signal has.
 
     Args:
         series: of states.
         first: the trial's start [ns].
         last: the trial's end [ns].
     """
-    found = []
+    far = []
     for samples in series:
         t, y = samples.within(first, last)
         if len(y) < LEAST_RUNS:
@@ -174,16 +167,14 @@ def outliers(series: Sequence[Samples], first: int, last: int) -> list[str]:
         i = int(np.argmax(alone)) + 1
         others = np.delete(y, i)
         if alone[i - 1] > FAR * np.ptp(others) > 0:
-            found.append(
-                f"'{samples.name}' is {y[i]:.4g} at {(t[i] - first) * 1e-9:.3f} s, far outside all "
-                f"its other samples, {others.min():.4g} to {others.max():.4g}: delete that row or "
-                "message from the log"
-            )
-    return found
+            facts: dict[str, Any] = {"value": float(y[i]), "at": float(t[i] - first) * 1e-9}
+            ends: dict[str, Any] = {"low": float(others.min()), "high": float(others.max())}
+            far.append(found("file.outlier", samples.name, **facts, **ends))
+    return far
 
 
-def vanished(series: Sequence[Samples], last: int) -> list[str]:
-    """Return a warning on a signal that ends the trial, long before the others end.
+def vanished(series: Sequence[Samples], last: int) -> list[Finding]:
+    """Find a signal that ends the trial, long before the others end.
 
     Args:
         series: of states.
@@ -196,38 +187,26 @@ def vanished(series: Sequence[Samples], last: int) -> list[str]:
     if not gone or last - origin > (1 - LOST) * (goes_on - origin):
         return []
     until, whole = ((end - origin) * 1e-9 for end in (ends[gone[0]], goes_on))
-    return [
-        f"{listed(map(repr, gone))} has no sample after {until:.2f} s of the log, in which other "
-        f"states go on until {whole:.2f} s: the trial ends there"
-    ]
+    return [found("file.vanished", *gone, until=until, whole=whole)]
 
 
-def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:
-    """Return warnings on a trial, as sentences for a person."""
-    found = []
-    if late > 0:
-        found.append(f"the trial starts {late:.3f} s late, when all states are known")
-    alike: dict[str, list[str]] = {}  # what holds of the signals of one message is said once
+def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]:
+    """Return what is odd in the signals of a trial; what several share is told once."""
+    odd = [found("file.late_start", late=late)] if late > 0 else []
+    alike: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for r in reports:
-        for text in _warnings_of(r):
-            alike.setdefault(text, []).append(f"'{r.name}'")
-    found += [f"{listed(names)}: {text}" for text, names in alike.items()]
+        disordered = r.out_of_order if r.out_of_order >= DISORDERED * r.samples else 0
+        facts: dict[str, Any] = {
+            "lost": r.not_finite,
+            "bridged": r.bridged,
+            "single": int(r.samples == 1),
+        }
+        facts |= {"stamps": disordered + r.repeated + r.unstamped}
+        if any(facts.values()):
+            gap = {"gap": r.largest_gap_s, "at": r.largest_gap_at_s, "samples": r.samples}
+            alike.setdefault(tuple({**facts, **gap}.items()), []).append(r.name)
+    odd += [found("file.odd_values", *names, **dict(facts)) for facts, names in alike.items()]
     low, high, apart = _furthest({r.name: r.skew_s for r in reports})
     if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
-        found.append(f"'{low}' and '{high}' are on clocks that differ by {apart:.3f} s")
-    return tuple(found)
-
-
-def _warnings_of(r: SignalReport) -> Iterator[str]:
-    """Yield warnings on one signal, without its name."""
-    if r.not_finite:
-        yield f"{r.not_finite} of {r.samples} values are not finite numbers"
-    if r.bridged:
-        gap = f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
-        yield f"{r.bridged} values bridged, the largest gap is {gap}"
-    disordered = r.out_of_order if r.out_of_order >= DISORDERED * r.samples else 0
-    kinds = ("out of order", disordered), ("repeated", r.repeated), ("0", r.unstamped)
-    if counts := [f"{n} stamp{'s' * (n > 1)} {kind}" for kind, n in kinds if n]:
-        yield ", ".join(counts)
-    if r.samples == 1:
-        yield "held from a single sample"
+        odd.append(found("file.clocks_apart", low, high, apart=apart))
+    return odd

@@ -12,19 +12,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.findings import found
 from grounded.result import listed
+from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.message_path import MessagePath, parse_path
 from grounded_trials.formats.messages import (
-    BadMessage,
-    BadPath,
-    BadSchema,
     Dynamic,
     Floats,
     Ints,
@@ -122,19 +121,11 @@ def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
         return
     first = next(iter(missing.values()))
     topic, known = first.path.topic, sorted(first.topics)
-    names = [name for name, one in missing.items() if one.path.topic == topic]
+    names = tuple(name for name, one in missing.items() if one.path.topic == topic)
     few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
-    there = f"it has {listed(known)}" if few else nearest(topic, known)
-    of = f"'{names[0]}' is read from '{first.path.text}'"
-    if several := len(names) > 1:
-        of = f"{listed(names)} are read from {topic}"
-    ends = [one for one in known if one.rpartition("/")[2] == topic.rpartition("/")[2]]
-    renamed = f" to {ends[0]}" if len(ends) == 1 else ""
-    raise GroundedError(
-        f"{of}, but the log has no topic '{topic}': {there}. If it was renamed{renamed}, edit "
-        f"{'their paths' if several else 'its path'} in [log] of grounded.toml",
-        NextCommand("inspect", (file,)),
-    )
+    hint = f"it has {listed(known)}" if few else nearest(topic, known)
+    then = NextCommand("inspect", (file,))
+    raise GroundedError(found("file.no_topic", *names, topic=topic, hint=hint, then=then))
 
 
 class _Log:
@@ -168,10 +159,9 @@ class _Log:
         present = batch.channel_ids()
         unknown = [c for c in present if c not in self.channels]
         if unknown:
+            then = NextCommand("recover", (self.name,))
             raise GroundedError(
-                f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
-                "`recover` saves the other messages",
-                NextCommand("recover", (self.name,)),
+                found("file.no_channel", self.name, channel=int(unknown[0]), then=then)
             )
         for identity, (decoder, wanting) in self.wanted.items():
             if identity not in present:
@@ -188,29 +178,28 @@ class _Log:
             for collector in wanting:
                 collector.collect(root, decoder, own)
         except BadMessage as error:
-            raise GroundedError(
-                f"{self.name}: a message of {decoder.topic} ({decoder.name}) logged at "
-                f"{own.log_times[error.message] * 1e-9:.3f} s does not fit its definition: {error}"
-            ) from None
+            facts: dict[str, Any] = {
+                "topic": decoder.topic,
+                "type": decoder.name,
+                "why": str(error),
+            }
+            at = float(own.log_times[error.message]) * 1e-9
+            raise GroundedError(found("file.message", self.name, at=at, **facts)) from None
         except BadPath as error:
             raise self._misfit(channel, collector, error) from None
 
-    def _misfit(self, channel: Channel, collector: _Collector, error: Exception) -> GroundedError:
-        name, said = self.topics[channel.topic], str(error)
+    def _misfit(self, channel: Channel, collector: _Collector, error: Bad) -> GroundedError:
         if isinstance(error, NoField):
             mapped = (c.path for c in self.collectors if c is not collector)
             same = [path for path in mapped if path.topic == channel.topic]
-            said = error.beside({re.split(r"[./]", path.text)[-1].strip('"') for path in same})
-        what = said.removeprefix(f"{name} has ")
-        kind = f" ({name})" * (name != channel.topic)
-        said = (
-            f"in {channel.topic}{kind} {said}"
-            if what == said
-            else f"{channel.topic}{kind} has {what}"
-        )
-        return GroundedError(
-            f"{self.name}: '{collector.name}' is read from '{collector.path.text}', but {said}"
-        )
+            error = error.beside({re.split(r"[./]", path.text)[-1].strip('"') for path in same})
+        facts: dict[str, Any] = {
+            "topic": channel.topic,
+            "type": self.topics[channel.topic],
+            "why": str(error),
+        }
+        facts |= {"file": self.name, "path": collector.path.text}
+        return GroundedError(found("file.misfit", collector.name, **facts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,11 +238,9 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
     if encoding == "json":
         return Decoder(channel.topic, name or "json", Dynamic(), json_messages)
     if encoding not in _READERS:
-        raise BadSchema(
-            f"the messages are encoded as '{encoding}'; expected cdr, ros1, protobuf or json"
-        )
+        raise BadSchema("encoding", encoding=encoding)
     if schema is None:
-        raise BadSchema(f"the messages are {encoding} without a schema, which defines their fields")
+        raise BadSchema("encoding", encoding=encoding, bare=1)
     type, read = struct_of(schema), _READERS[encoding]
     return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
 
@@ -276,37 +263,36 @@ class _Collector:
         self.type, self.stamped = decoder.name, bound.stamp is not None
         dynamic = isinstance(decoder.type, Dynamic)
         if self.spec.clock == "header" and not self.stamped and not dynamic:
-            raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
+            raise BadPath("no_stamp")
 
     def collect(self, root: Node, decoder: Decoder, batch: Messages) -> None:
         self.messages += len(batch)
-        found = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
-        if len(found.rows) > 1 and (np.diff(found.rows) == 0).any():
-            at = int(found.rows[np.argmax(np.diff(found.rows) == 0)])
-            raise BadPath(
-                f"the message logged at {batch.log_times[at] * 1e-9:.3f} s has several values for "
-                'it; name one item, or add a filter such as {name=="arm"}'
-            )
-        self.parts.append((self._times(batch, found), found.values, batch.log_times[found.rows]))
+        values = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
+        if len(values.rows) > 1 and (np.diff(values.rows) == 0).any():
+            at = int(values.rows[np.argmax(np.diff(values.rows) == 0)])
+            raise BadPath("several_values", at=float(batch.log_times[at]) * 1e-9)
+        self.parts.append((self._times(batch, values), values.values, batch.log_times[values.rows]))
 
-    def _times(self, batch: Messages, found: Values) -> Ints:
+    def _times(self, batch: Messages, values: Values) -> Ints:
         if self.spec.clock == "log":
-            return batch.log_times[found.rows]
+            return batch.log_times[values.rows]
         if self.spec.clock == "publish":
-            times = batch.publish_times[found.rows]
+            times = batch.publish_times[values.rows]
             if (times < 0).any():
-                raise BadMessage(found.rows[np.argmax(times < 0)], "published after the year 2262")
+                raise BadMessage(values.rows[np.argmax(times < 0)], "stamp", stamp="after 2262")
             return times
-        if found.stamps is None:
-            raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
-        return found.stamps
+        if values.stamps is None:
+            raise BadPath("no_stamp")
+        return values.stamps
 
     def series(self) -> Series:
         columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
         if not columns or not len(columns[0]):
-            what = "no messages" if not self.messages else f"{self.messages} messages, none with it"
-            raise GroundedError(
-                f"'{self.name}' is read from '{self.path.text}', but {self.path.topic} has {what}"
-            )
+            facts: dict[str, Any] = {
+                "path": self.path.text,
+                "topic": self.path.topic,
+                "messages": self.messages,
+            }
+            raise GroundedError(found("file.no_samples", self.name, **facts))
         t, values, log_times = columns
         return Series(self.spec, t, values, log_times, self.messages, self.type, self.stamped)

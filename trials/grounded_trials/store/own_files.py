@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded_trials.formats.bad import BadMessage, BadSchema
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -31,7 +32,7 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
-from grounded_trials.formats.messages import BadMessage, BadSchema, Number, Struct
+from grounded_trials.formats.messages import Number, Struct
 from grounded_trials.formats.protobuf import (
     ProtobufItems,
     double_tag,
@@ -218,7 +219,9 @@ class OwnFile:
                 found = found.items(0, -1)
             return found.numbers(), np.bincount(found.rows, minlength=len(batch))
         except BadMessage as error:
-            raise DamagedFile(self.name, 0, f"message {error.message}: {error}") from None
+            raise DamagedFile(
+                self.name, 0, "record", f"message {error.message}", str(error)
+            ) from None
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
@@ -256,7 +259,7 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
                 if counts[topic] > STEP_LIMIT:
                     raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
         elif isinstance(record, End) and not record.data_crc and meta is not None:
-            raise DamagedFile(name, len(source), "its checksum is missing")
+            raise DamagedFile(name, len(source), "record", "its end", "no checksum")
     if meta is None or meta.get("format") != kind:
         stated = f"its format is '{meta.get('format', '')}'" if meta else "it has no such metadata"
         raise GroundedError(f"{name} is not a '{kind}' file: {stated}")
@@ -270,9 +273,7 @@ def _sorted(
     """Yield the messages of a batch by topic."""
     for identity in batch.channel_ids():
         if identity not in channels:
-            raise DamagedFile(
-                name, 0, f"a message belongs to channel {identity}, which is not defined"
-            )
+            raise DamagedFile(name, 0, "record", "a message", f"channel {identity}")
         yield channels[identity].topic, batch.of(identity)
 
 

@@ -303,7 +303,7 @@ def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         policy, states, inputs, meta = read_candidate(data, name)
     except DamagedFile as error:
         raise GroundedError(
-            f"{name} is damaged: {error.found} (at byte {error.offset}). Delete it: a trial that "
+            f"{error}. Or delete it: a trial that "
             "ran it carries a copy, and one that was not run is made again",
             NextCommand("propose"),
         ) from None

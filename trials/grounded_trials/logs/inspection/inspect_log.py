@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
+from grounded_trials.formats.bad import Bad, BadPath
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.formats.message_path import WORLD, is_topic, parse_path
 from grounded_trials.formats.messages import (
-    BadMessage,
-    BadPath,
-    BadSchema,
     Dynamic,
     Floats,
     Ints,
@@ -119,43 +118,38 @@ class LogReport:
         return [field.path for field in self.numbers if field.low != field.high]
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is odd about the log, besides its damage."""
+        return _findings(self)
+
+    @property
     def remarks(self) -> tuple[str, ...]:
-        """Warnings about the log, as sentences for a person."""
-        return _remarks(self)
+        """Its damage and the findings as sentences."""
+        return (*[self.damage] * bool(self.damage), *(one.sentence for one in self.findings))
 
 
-def _remarks(log: LogReport) -> tuple[str, ...]:
-    found = [log.damage] if log.damage else []
-    found += [f"{file}: {odd}" for file in log.files for odd in table_remarks(file)]
+def _findings(log: LogReport) -> tuple[Finding, ...]:
+    odd = [one for file in log.files for one in table_remarks(file)]
     for topic in log.topics:
+        name, bad = topic.topic, [f.path for f in topic.fields if f.not_finite]
         if topic.problem:
-            found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")
-        if topic.messages == 0:
-            found.append(f"{topic.topic} has no messages")
-        elif topic.messages == 1:
-            found.append(f"{topic.topic} has a single message, {topic.first_s:.3f} s into the log")
-        elif topic.rate_hz and topic.largest_gap_s > GAP / topic.rate_hz:
-            found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
+            odd.append(found("file.topic", name, type=topic.type, why=topic.problem))
+        gap = topic.largest_gap_s if topic.messages > 1 and topic.rate_hz else 0.0
+        gap *= gap > GAP / max(topic.rate_hz, 1e-9)
+        if topic.messages < 2 or gap:
+            odd.append(found("file.gaps", name, messages=topic.messages, gap=gap))
         if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
-            found.append(
-                f"the stamps of {topic.topic} differ from the log's clock by {topic.skew_s:.3f} s "
-                "(simulation time, or an unset clock?)"
-            )
+            odd.append(found("file.clocks_apart", name, "the log", apart=topic.skew_s))
         if len(topic.fields) >= FIELD_LIMIT:
-            found.append(
-                f"{topic.topic} is listed with its first {FIELD_LIMIT} numbers; "
-                "[log] can use any other by its path"
-            )
-        bad = [f.path for f in topic.fields if f.not_finite]
+            odd.append(found("file.first_numbers", name, numbers=FIELD_LIMIT))
         if bad:
-            found.append(f"{topic.topic} has values that are not numbers, first in {bad[0]}")
-    for twins in log.twins:
-        if twins.opposite:
-            found.append(
-                f"{twins.first} and {twins.second} show the same motion with OPPOSITE SIGN "
-                f"(correlation {twins.correlation:.3f})"
-            )
-    return tuple(found)
+            odd.append(found("file.not_finite", bad[0]))
+    odd += [
+        found("file.opposite", twins.first, twins.second, correlation=twins.correlation)
+        for twins in log.twins
+        if twins.opposite
+    ]
+    return tuple(odd)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
@@ -234,13 +228,13 @@ class _Look:
         )
 
     def _samples(self) -> dict[str, tuple[Ints, Floats]]:
-        found = {}
+        kept = {}
         for topic in self.topics.values():
             for path, r in topic.ranges.items():
                 if r.samples:
                     t, y = (np.concatenate(part) for part in zip(*r.samples, strict=True))
-                    found[path] = (t, y)
-        return found
+                    kept[path] = (t, y)
+        return kept
 
 
 @dataclass
@@ -299,17 +293,17 @@ class _Topic:
                 self._find_paths(batch)
             for part in self.decoder.parts(batch.take(chosen)):
                 self._look(self.decoder, part)
-        except (BadSchema, BadMessage, BadPath) as error:
+        except Bad as error:
             self.problem = str(error)
 
     def _look(self, decoder: Decoder, batch: Messages) -> None:
         root = decoder.root(batch.buffer, batch.starts, batch.ends)
-        for i, found in enumerate(self.ranges.values()):
+        for i, one in enumerate(self.ranges.values()):
             try:
-                values = evaluate(root, found.bound, stamps=i == 0)
+                values = evaluate(root, one.bound, stamps=i == 0)
             except BadPath:  # behind a wstring, or a text in one JSON message
                 continue
-            found.add(values.values, batch.log_times[values.rows])
+            one.add(values.values, batch.log_times[values.rows])
             if values.stamps is not None:
                 self.skews.append(values.stamps - batch.log_times[values.rows])
 

@@ -130,11 +130,9 @@ def _values(table: Table, kind: type, *others: str) -> dict[str, Any]:
 def _model(table: Table) -> ModelTable:
     found = ModelTable(**_values(table, ModelTable, "effects"), effects=_effects(table))
     if bool(found.file) == bool(found.module):
-        raise table.error(
-            "file", 'give exactly one of file = "model.py" and module = "package.name"'
-        )
+        raise table.error("file", "one", found.file or found.module)
     if found.smoothing < 0:
-        raise table.error("smoothing", f"must not be negative, found {found.smoothing:g}")
+        raise table.error("smoothing", "natural", found.smoothing)
     return found
 
 
@@ -142,19 +140,16 @@ def _effects(table: Table) -> tuple[Mapping[str, Any], ...]:
     effects = table.take("effects", list, [])
     for effect in effects:
         if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
-            raise table.error(
-                "effects",
-                f'must hold tables like {{ name = "dead_zone:throttle" }}, found {effect!r}',
-            )
+            raise table.error("effects", "effects", effect)
     return tuple(effects)
 
 
 def _task(table: Table) -> TaskTable:
     found = TaskTable(**_values(table, TaskTable))
     if found.dt <= 0:
-        raise table.error("dt", f"must be a positive number of seconds, found {found.dt:g}")
+        raise table.error("dt", "positive", found.dt)
     if found.horizon < 1:
-        raise table.error("horizon", f"must be at least 1 step, found {found.horizon}")
+        raise table.error("horizon", "positive", found.horizon)
     return found
 
 
@@ -174,13 +169,13 @@ def _system(table: Table) -> SystemTable:
         kinds[kind] = inner.all_numbers()
         for name, std in kinds[kind].items():
             if std < 0:
-                raise inner.error(name, f"must not be negative, found {std:g}")
+                raise inner.error(name, "natural", std)
     noise.finish()
     found = SystemTable(**_values(table, SystemTable, "noise"), noise=kinds)
     if found.command and found.model:
-        raise table.error("command", "give command or model, not both")
+        raise table.error("command", "alone", found.command)
     if found.seed < 0:
-        raise table.error("seed", f"must not be negative, found {found.seed}")
+        raise table.error("seed", "natural", found.seed)
     return found
 
 
@@ -190,11 +185,7 @@ def _log(table: Table) -> Table:
         group = table.sub(kind)
         for name in group.names():
             if not (one := group.sub(name)).has("path"):
-                raise one.error(
-                    "path",
-                    f"is missing: [log] states where {name} is in a foreign log and how to convert "
-                    "it; trials written by grounded's own TrialWriter need no entry",
-                )
+                raise one.error("path", "path")
     return table
 
 

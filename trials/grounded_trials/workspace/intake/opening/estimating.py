@@ -67,11 +67,9 @@ def read_estimate(table: Table, model: Model) -> EstimateTable:
     for kind, values in (("measured", measured), ("process", process)):
         for name, std in values.items():
             if std <= 0:
-                raise table.error(
-                    f"{kind}.{name}", f"must be a positive standard deviation, found {std:g}"
-                )
+                raise table.error(f"{kind}.{name}", "positive", std)
     if not measured:
-        raise table.error("measured", "names no state; give { x = 0.002, ... }")
+        raise table.error("measured", "deviations")
     ordered = {name: measured[name] for name in model.state_names if name in measured}
     return EstimateTable(ordered, process)
 

@@ -79,7 +79,7 @@ class ForeignLog:
             rates=rates_of(model),
             past=self.workspace.task.past if candidate and start is not None else None,
         )
-        logged = tuple(one for one in found.reports if one.name in self.series), found.warnings
+        logged = tuple(one for one in found.reports if one.name in self.series), found.findings
         found = replace(found, told=lambda: logged)
         trial = Trial(
             states=found.states,

@@ -231,7 +231,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         trial,
         encoded,
         (
-            *(text for file in log_files(log.path) for text in table_remarks(file)),
+            *(one.sentence for file in log_files(log.path) for one in table_remarks(file)),
             *misread(log),
             *log.unlike_units,
             *log.unread,
