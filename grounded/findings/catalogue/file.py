@@ -279,7 +279,7 @@ ENTRIES: dict[str, Entry] = {
     "odd_values": Entry(
         "warn",
         "{about}:[[ {lost} of {samples} values are not finite numbers]][[ {bridged:value} bridged, "
-        "the largest gap is {gap:.3f} s at {at:.3f} s]][[ {stamps:stamp} out of order, repeated or "
+        "the largest gap is {gap}]][[ {stamps:stamp} out of order, repeated or "
         "0]][[ held from a single sample{single:1=}]]",
     ),
     "clocks_apart": Entry("warn", "the clocks of {about} differ by {apart:.3f} s"),
@@ -304,9 +304,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "lost": Entry(
         "warn",
-        "[[{bytes} bytes ]][[{part} ]][[{messages:message} of unknown topics or times ]]"
-        "[[{more} more losses of these kinds ]][[second {start:.2f} to {end:.2f} ]]is lost"
-        "[[, at byte {byte}]][[: {why}]]",
+        "not saved:[[ {bytes} bytes]][[ {part}]][[ {messages:message} of unknown topics or times]]"
+        "[[ {more} more losses of these kinds]][[ second {span} of the log]][[, at byte {byte}]]"
+        "[[: {why}]]",
     ),
     "unverified": Entry(
         "warn",

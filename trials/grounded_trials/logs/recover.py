@@ -241,7 +241,8 @@ class _Copy:
         sane = [(a, b) for a, b in dropped if first - room <= a <= b <= last + room]
         first = min([first, *(a for a, _ in sane)])
         return [
-            found("file.lost", start=(a - first) * 1e-9, end=(b - first) * 1e-9) for a, b in sane
+            found("file.lost", span=f"{1e-9 * (a - first):.2f} to {1e-9 * (b - first):.2f}")
+            for a, b in sane
         ]
 
     def finish(self) -> None:

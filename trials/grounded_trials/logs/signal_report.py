@@ -203,8 +203,9 @@ def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]
         }
         facts |= {"stamps": disordered + r.repeated + r.unstamped}
         if any(facts.values()):
-            gap = {"gap": r.largest_gap_s, "at": r.largest_gap_at_s, "samples": r.samples}
-            alike.setdefault(tuple({**facts, **gap}.items()), []).append(r.name)
+            gap = f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
+            facts |= {"gap": gap, "samples": r.samples}
+            alike.setdefault(tuple(facts.items()), []).append(r.name)
     odd += [found("file.odd_values", *names, **dict(facts)) for facts, names in alike.items()]
     low, high, apart = _furthest({r.name: r.skew_s for r in reports})
     if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
