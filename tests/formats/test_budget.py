@@ -113,7 +113,7 @@ def echo(a: np.ndarray, b: list[int]) -> np.ndarray:
 
 
 def broken() -> None:
-    raise DamagedFile("a.log", 7, "a hole")
+    raise DamagedFile("a.log", 7, "record", "a hole")
 
 
 def divided() -> float:
@@ -181,7 +181,7 @@ def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DamagedFile, match=holding("channel 1", "'/a'", "'/b'")):
         read_signals(path, {"x": SignalSpec("/a.x", clock="log")})
     saved = recover_log(path, tmp_path / "saved.mcap")
-    assert not saved.complete and any("defined again" in loss for loss in saved.losses)
+    assert not saved.complete and any(loss.code == "file.defined_again" for loss in saved.losses)
     series = read_signals(tmp_path / "saved.mcap", {"x": SignalSpec("/a.x", clock="log")})
     assert series["x"].values.tolist() == [1.0]
 
