@@ -135,6 +135,27 @@ ENTRIES: dict[str, Entry] = {
         "learn stops here, since the next plan would be based on this log",
         "fix it first, or run `learn` again if the warning is wrong",
     ),
+    # names
+    "aside": Entry("refuse", "{about} is set aside[[ ({why})]]"),
+    "unknown": Entry(
+        "refuse",
+        "{about} is no {kind} of this workspace[[; did you mean '{meant}'?]][[; beside it: "
+        "{beside}]][[; there are: {known}]]",
+    ),
+    "unusable": Entry(
+        "refuse",
+        "{about} can't be used: it is too short, or has other states, inputs or dt than this task",
+        "trials to use: {usable}",
+    ),
+    "no_trial": Entry(
+        "refuse",
+        "there is no trial to learn from",
+        "ingest runs of candidates, or other logs with --data",
+    ),
+    "no_log_file": Entry(
+        "refuse",
+        "{about} is a trial or a candidate, expected the file of a log[[: its own is {path}]]",
+    ),
     # how sure a gain is
     "gain": Entry(
         "note",
@@ -147,12 +168,13 @@ ENTRIES: dict[str, Entry] = {
     ),
     "better": Entry(
         "note",
-        "{share:%} {better:1=better,0=worse} than {before}[[, +- {error:%}]][[, from {few:repeat} "
-        "only]][[; by the model, different start states alone changed the cost by {start:%}]]",
+        "{share:%} {better:1=better,0=worse} than the model's own policy[[, +- {error:%}]][[, from "
+        "{few:repeat} only]][[; by the model, different start states alone changed the cost by "
+        "{start:%}]]",
     ),
     "lead": Entry(
         "note",
         "{doubt:scatter=the scatter of repeats,starts=where the runs began,unknown=scatter that is "
-        "not known yet} may explain its lead on {before}",
+        "not known yet} may explain its lead on the model's own policy",
     ),
 }
