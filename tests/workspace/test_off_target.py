@@ -164,5 +164,5 @@ def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
         return SimpleNamespace(candidate=made, trials=(trial,), utility=here.utility(trial))
 
     before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
-    assert best.utility > before.utility and "c0002" in traded(here, best, before)
-    assert traded(here, tried("c0003", 0.01, 0 * rough), before) == ""
+    assert best.utility > before.utility and traded(here, best, before).facts["inputs"]
+    assert traded(here, tried("c0003", 0.01, 0 * rough), before) is None

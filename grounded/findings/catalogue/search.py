@@ -135,6 +135,28 @@ ENTRIES: dict[str, Entry] = {
         "learn stops here, since the next plan would be based on this log",
         "fix it first, or run `learn` again if the warning is wrong",
     ),
+    # what a run changes
+    "counts": Entry(
+        "note",
+        "{about} counts as a run of {candidate} only because --candidate says so[[: its utility "
+        "changes from {was:.4g} to {now:.4g}]][[, and {best} is the best now]][[; that of this run "
+        "is {run:.4g}, far from its other {runs}]]",
+        "[[aside? `{undo}`, unless it ran that; then `propose` goes on]][[!aside? to undo this: "
+        "`{undo}`]]",
+    ),
+    "settled": Entry(
+        "note",
+        "{candidate} need not be run once more: by this run, the loss of {loser} is in doubt no "
+        "longer",
+        "if the robot has run {candidate} meanwhile, that log still counts",
+    ),
+    "traded": Entry(
+        "note",
+        "{candidate} is better than {before} although {what} is off by {now:size} rms instead of "
+        "{was:size}: [[inputs? its inputs cost less]][[!inputs? other states are nearer to "
+        "theirs]]",
+        "if that matters more, weigh it more in [reward] state, or stop here",
+    ),
     # names
     "aside": Entry("refuse", "{about} is set aside[[ ({why})]]"),
     "unknown": Entry(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, measured_alike, or_zero
@@ -102,7 +103,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     groups, arrives = weighed_groups(task), reaches(task)
     units, rates = [task.model.states[names[0]] for names, _ in groups], rates_among(task, groups)
     ranked: list[tuple[bool, float, int]] = []
-    found: dict[int, OffTarget] = {}
+    errors_of: dict[int, OffTarget] = {}
     for k, (names, what) in enumerate(groups):
         states = [task.model.state_names.index(name) for name in names]
         each = [e[:, states] for e in errors]
@@ -123,11 +124,11 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values["end_std"] = std_at_end([e[-1] for e in each], noise)
         ranked.append((rates[k], -cost, k))
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
-        found[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
+        errors_of[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
     told = sorted(k for *_, k in sorted(ranked)[:FEW])
     dear = MOST * sum(cost for _, cost, _ in ranked)
     told += [k for _, cost, k in ranked if cost < dear and k not in told]
-    return tuple(found[k] for k in told)
+    return tuple(errors_of[k] for k in told)
 
 
 def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
@@ -267,50 +268,32 @@ def tracking_error(task: Task, trial: Trial) -> Array:
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
 
 
-def traded(task: Task, best: Tried, before: Tried) -> str:
-    """Return why a better candidate is farther from its target than the one before; else "".
+def traded(task: Task, best: Tried, before: Tried) -> Finding | None:
+    """Return that a better candidate is farther from its target than the one before; else None.
 
     Utility also counts inputs and other states. On a path that is followed to a centimetre they may
     be all that is left to gain. Runs that began apart are farther off for that reason alone.
     """
     if began_apart(before, best):
-        return ""
+        return None
     pair = [off_target_of(task, tried.trials)[:1] for tried in (before, best)]
     if not all(pair) or pair[0][0].what != pair[1][0].what:
-        return ""
+        return None
     was, now = pair[0][0], pair[1][0]
     if not now.rms > FARTHER * was.rms:
-        return ""
-    pairs = ([cost_of_inputs(task, run) for run in one.trials] for one in (before, best))
-    costs = [float(np.mean(own)) for own in pairs]
-    smoother = costs[0] - costs[1] > 0.5 * (best.utility - before.utility)
-    why = "its inputs cost less" if smoother else _nearer(task, best, before)
-    a, b = measured_alike([was.rms, now.rms], was.unit)
-    return (
-        f"{best.candidate.id} is better than {before.candidate.id} because {why}: {was.what} is "
-        f"off by {b} rms instead of {a}. If that matters more, weigh it more in [reward] state, or "
-        "stop here"
+        return None
+    each = ([cost_of_inputs(task, run) for run in one.trials] for one in (before, best))
+    costs = [float(np.mean(own)) for own in each]
+    return found(
+        "search.traded",
+        best.candidate.id,
+        candidate=best.candidate.id,
+        before=before.candidate.id,
+        what=was.what,
+        was=Quantity(was.rms, was.unit),
+        now=Quantity(now.rms, was.unit),
+        inputs=int(costs[0] - costs[1] > 0.5 * (best.utility - before.utility)),
     )
-
-
-def _nearer(task: Task, best: Tried, before: Tried) -> str:
-    """Return which state's error costs less than before, of those that fell most, with figures."""
-    known, weights = tracked(task), task.reward
-    errors = [[tracking_error(task, run) for run in one.trials] for one in (before, best)]
-    way, last = (
-        np.subtract(*[np.mean([(e[rows] ** 2).sum(axis=0) for e in own], axis=0) for own in errors])
-        for rows in (slice(None), slice(-1, None))
-    )
-    way, last = (weights.state * way)[known], (weights.terminal * last)[known]
-    k = int((way + last).argmax())
-    if not way[k] + last[k] > 0:
-        return "other states are nearer to theirs"
-    i, at_end = known[k], last[k] > way[k]
-    ends = [np.concatenate([e[-1:, i] if at_end else e[:, i] for e in own]) for own in errors]
-    name, unit = list(task.model.states.items())[i]
-    was, now = measured_alike([float(np.sqrt(np.mean(e**2))) for e in ends], unit)
-    when = "at the end" if at_end else "rms"
-    return f"{name} is nearer to its target ({now} {when} instead of {was})"
 
 
 def cost_of_inputs(task: Task, run: Trial) -> float:

@@ -13,6 +13,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from grounded.errors import NextCommand
+from grounded.findings import Finding, found
 from grounded.search.standing import Standing, standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
@@ -34,8 +35,8 @@ def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
 
 def odd_run(
     workspace: Folder, now: Standing, identity: str, *, aside: bool = False
-) -> tuple[str, ...]:
-    """Return a note on a doubted run: that it counts, or how it changed its candidate's utility.
+) -> tuple[Finding, ...]:
+    """Return that a doubted run counts, and how it changed its candidate's utility.
 
     Args:
         workspace: the workspace with the trials.
@@ -46,32 +47,24 @@ def odd_run(
     after = _of(now, identity)
     if after is None:
         return ()
-    undo = rendered(NextCommand("discard", (identity,)), workspace.address)
-    counts = (
-        f"it counts as a run of {after.candidate.id} all the same, because --candidate says so. To "
-        f"undo this: `{undo}`",
+    name, then = after.candidate.id, NextCommand("discard", (identity,))
+    undo = rendered(then, workspace.address)
+    counts = found(
+        "search.counts", identity, then=then, candidate=name, undo=undo, aside=int(aside)
     )
-    if aside:
-        return (
-            f"it counts as a run of {after.candidate.id} only because --candidate says so: "
-            f"`{undo}`, unless it ran that; then `propose` goes on",
-        )
-    if len(after.utilities) < 3 or now.incumbent is None:
-        return counts
+    if aside or len(after.utilities) < 3 or now.incumbent is None:
+        return (counts,)
     was = standing_without(workspace, {identity})
-    before = next((t for t in was.history if t.candidate.id == after.candidate.id), None)
+    before = next((t for t in was.history if t.candidate.id == name), None)
     if before is None or len(before.utilities) < 2 or not before.deviation > 0:
-        return counts
+        return (counts,)
     n, run = len(before.utilities), after.utilities[[t.id for t in after.trials].index(identity)]
     if not abs(run - before.utility) > FAR * before.deviation * (1 + 1 / n) ** 0.5:
-        return counts
-    name, best = before.candidate.id, now.incumbent.candidate.id
+        return (counts,)
+    best = now.incumbent.candidate.id
     dethroned = was.incumbent is not None and was.incumbent.candidate.id == name != best
-    return (
-        f"the utility of {name} changes from {before.utility:.4g} to {after.utility:.4g}"
-        f"{f', and {best} is the best now' * dethroned}: that of this run, {run:.4g}, is far from "
-        f"its other {n}, which scatter by {before.deviation:.2g}. To undo this: `{undo}`",
-    )
+    changed = {"was": before.utility, "now": after.utility, "run": run, "runs": n}
+    return (counts.knowing({**changed, "best": best if dethroned else None}),)
 
 
 def _of(now: Standing, identity: str) -> Tried | None:
@@ -93,8 +86,8 @@ def asked_again(workspace: Folder) -> str:
     return ""
 
 
-def no_longer(workspace: Folder, trial: str, now: Standing) -> list[str]:
-    """Return a note if a trial that was just stored settled a doubt without the run asked for.
+def no_longer(workspace: Folder, trial: str, now: Standing) -> list[Finding]:
+    """Return that a trial that was just stored settled a doubt without the run asked for.
 
     Args:
         workspace: the workspace.
@@ -110,8 +103,5 @@ def no_longer(workspace: Folder, trial: str, now: Standing) -> list[str]:
         return []
     if now.outstanding is not None and now.outstanding.id == waited.id:
         return []
-    name = waited.id
-    return [
-        f"{name} need not be run once more: by this run, the loss of {doubt.candidate.id} is in "
-        f"doubt no longer. If the robot has run {name} meanwhile, that log still counts"
-    ]
+    name, loser = waited.id, doubt.candidate.id
+    return [found("search.settled", name, candidate=name, loser=loser)]

@@ -209,7 +209,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
             workspace.notes.add(note, again=False)
         vars(workspace).pop("noted", None)
     best = tried is not None and now is not None and now.incumbent is tried
-    told = traded(workspace.task, tried, outdone) if best and tried and outdone else ""
+    farther = traded(workspace.task, tried, outdone) if best and tried and outdone else None
+    told = farther.sentence if farther else ""
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -228,11 +229,17 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         notes=(
             *([read.before.told(used=not aside)] if read.before else []),
             *filter(None, [*read.notes, *(() if odd or wrong or lag else read.aged), told]),
-            *(no_longer(workspace, added.id, now) if now and not added.known else ()),
             *(
-                odd_run(workspace, now, added.id, aside=bool(read.aside))
-                if now and read.doubted and not aside
-                else ()
+                one.sentence
+                for one in (no_longer(workspace, added.id, now) if now and not added.known else ())
+            ),
+            *(
+                one.sentence
+                for one in (
+                    odd_run(workspace, now, added.id, aside=bool(read.aside))
+                    if now and read.doubted and not aside
+                    else ()
+                )
             ),
         ),
         off_target=off_target_of(workspace.task, judged),
