@@ -25,7 +25,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "outside_safety": Entry(
         "refuse",
-        "{candidate} (alpha = {alpha:g}) is predicted to take {state} to {value} at t = {at}, "
+        "{candidate} (alpha = {alpha:.6g}) is predicted to take {state} to {value} at t = {at}, "
         "outside [safety] {state} = [{low}, {high}]",
         "[[+- is the distance of trial {trial} from what it should repeat: if that run was "
         "disturbed, remove it with `discard {trial}`]]",
@@ -33,10 +33,10 @@ ENTRIES: dict[str, Entry] = {
     "gain": Entry(
         "refuse",
         "the gain of {input} on {state} reaches {gain} in {candidate}, at t = {at}, more than "
-        "{most:g}[[; the plan moves {state} by {moved}]]",
-        "[[weigh {state} less in [reward] (now {state_weight:g}), or ]][[!state_weight? check the "
+        "{most:.6g}[[; the plan moves {state} by {moved}]]",
+        "[[weigh {state} less in [reward] (now {state_weight:.6g}), or ]][[!state_weight? check the "
         "unit of {state} and what it drives in the model, or ]]raise [reward] input_change of "
-        "{input} (now {change:g})",
+        "{input} (now {change:.6g})",
     ),
     # what it is, what it promises, how far to trust it
     "made": Entry(
@@ -144,9 +144,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "limits_of_log": Entry(
         "note",
-        "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]"
-        "[[; those of {beyond} reach more than {times:g} times as far as was ever sent: check "
-        "their unit]]",
+        "[[!beyond? [limits] are only the range used in {log}]][[[limits] of {beyond} reach more "
+        "than {times:.6g} times as far as was ever sent: check their unit]][[; {at} is at them for "
+        "{share:%} of this plan]]",
         "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
         "(`target`): target.csv is the run in that log]]",
     ),
@@ -179,7 +179,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "outweighed": Entry(
         "note",
-        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:g} times "
+        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:.6g} times "
         "the weight on it",
         "[[helps? weigh it so in [reward] state ({weights}) if that matters more than the other "
         "states]][[!helps? check its weight in [reward] state, and whether the model and [limits] "

@@ -33,7 +33,7 @@ ENTRIES: dict[str, Entry] = {
     # it has ended with a result
     "no_step": Entry(
         "note",
-        "no step improved on {best}[[ down to alpha = {alpha:g}]][[ in the last {last} "
+        "no step improved on {best}[[ down to alpha = {alpha:.6g}]][[ in the last {last} "
         "candidates]][[ ({lost} lost)]][[; the next promises {gain}, with a likely error of "
         "{error}]][[; the model promises less than {least:%} from smaller steps]]: {best} is the "
         "result",
@@ -102,11 +102,6 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
         "model lacks; without, `propose` plans with the model as it is",
-    ),
-    "lost_by_starts": Entry(
-        "note",
-        "{candidate} lost to {best} by {loss}; by the model {start} of that is due to where their "
-        "runs began",
     ),
     "uncounted": Entry(
         "note",

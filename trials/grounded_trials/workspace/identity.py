@@ -85,11 +85,6 @@ class StoredTrial:
         return self.policy_of() if self.ran else None
 
 
-def estimated_in(trials: Iterable[StoredTrial]) -> set[str]:
-    """Return the states that no sensor measured in some trial, so that a smoother found them."""
-    return {n for one in trials for n in one.meta.get("estimated", "").split(",") if n}
-
-
 @dataclass(frozen=True, eq=False)
 class StoredCandidate:
     """A candidate with the kind, the task and the hash of its file."""

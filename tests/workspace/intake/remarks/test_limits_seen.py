@@ -98,9 +98,8 @@ def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path
     w = Workspace(make(tmp_path / "w", config=seen).folder)
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
     w.ingest(tmp_path / "d.mcap", data=True)
-    (note,) = (one for one in w.propose().notes if "seen_in" in one)
-    assert holds(note, "57.4 times", "(0.0204 N)", "unit") is far
-    assert ("only the range used in a.csv" in note) is not far
+    (told,) = (one for one in w.propose().findings if one.code == "plan.limits_of_log")
+    assert told.facts["beyond"] == ("force",) * far and told.facts["log"] == "a.csv"
 
 
 @pytest.mark.parametrize(("limit", "bound"), [(0.3, True), (50.0, False)])
@@ -132,10 +131,10 @@ def test_a_side_without_a_limit_has_no_beyond(w):
 def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
     """It sent 1.17 m/s for 8 s, reached 2.2 of 3 m, and had no note."""
     config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
-    notes = Workspace(make(tmp_path / "w", config=config).folder).propose().notes
-    told = [one for one in notes if "at its limit" in one]
+    findings = Workspace(make(tmp_path / "w", config=config).folder).propose().findings
+    told = [one for one in findings if one.code == "plan.at_limits"]
     assert len(told) == said
-    assert all(holds(one, "force", "0.3 N", "x", "[limits]") for one in told)
+    assert all(one.about == ("force",) for one in told)
 
 
 @pytest.mark.parametrize(("most", "said"), [(40.0, True), (0.9, False), (400.0, False)])

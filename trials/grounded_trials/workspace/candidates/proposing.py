@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -57,7 +56,6 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.identity import StoredTrial
 
 PROPOSE = NextCommand("propose")
-MOSTLY = 0.5  # share of a loss that is told if it is due to where runs began
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -334,23 +332,6 @@ def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
     return void
 
 
-def _lost_by_starts(now: Standing) -> list[Finding]:
-    """Return the steps from the best candidate whose losses are mostly due to where runs began.
-
-    Their utilities in the table include that: one of -0.96 beside -0.51 was itself 0.04 worse.
-    """
-    if (best := now.incumbent) is None:
-        return []
-    own = best.candidate.id
-    steps = [t for t in now.history if t.accepted is False and t.candidate.base == own]
-    lost = {t.candidate.id: (best.utility - t.utility, t.excused(best)) for t in steps}
-    return [
-        found("search.lost_by_starts", name, candidate=name, best=own, loss=loss, start=due)
-        for name, (loss, due) in lost.items()
-        if math.isfinite(loss) and due > MOSTLY * loss
-    ]
-
-
 def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
     """Return whether the search's last candidate was planned with another model, and never run."""
     last = _not_run(workspace, before)
@@ -398,7 +379,6 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *_nothing_stored(workspace),
         *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
-        *_lost_by_starts(standing),
         *_namesakes(workspace),
         *not_counted(uncounted(workspace, workspace.trials(), standing)),
         *left_out(workspace),
