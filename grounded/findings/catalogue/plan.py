@@ -34,8 +34,8 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "the gain of {input} on {state} reaches {gain} in {candidate}, at t = {at}, more than "
         "{most:.6g}[[; the plan moves {state} by {moved}]]",
-        "[[weigh {state} less in [reward] (now {state_weight:.6g}), or ]][[!state_weight? check the "
-        "unit of {state} and what it drives in the model, or ]]raise [reward] input_change of "
+        "[[weigh {state} less in [reward] (now {state_weight:.3g}), or ]][[!state_weight? check "
+        "the unit of {state} and what it drives in the model, or ]]raise [reward] input_change of "
         "{input} (now {change:.6g})",
     ),
     # what it is, what it promises, how far to trust it
