@@ -541,7 +541,7 @@ def flips(rng: random.Random, seconds: float) -> Tally:
     results = {f"seed {k}": {"utility": -1.5 + k, "errors": [0.25, float("inf")]} for k in range(3)}
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
         where, _ = prepared(Path(folder))
-        for words in (["diagnose"], ["report"]):
+        for words in (["diagnose", "--max-effects", "1"], ["report"]):
             grounded("-C", where, *words)
         save_optimum(Folder(where), -1.5)
         study = StudyStore(where / "study")
