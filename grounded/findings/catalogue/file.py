@@ -299,8 +299,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "cut_at": Entry(
         "warn",
-        "the file is cut off at byte {byte}: [[only its index is missing{index:1=}]] what came "
-        "after that is lost",
+        "the file is cut off at byte {byte}: what came after that is lost[[, only its index"
+        "{index:1=}]]",
     ),
     "lost": Entry(
         "warn",

@@ -68,6 +68,7 @@ class Inspected(Result):
             "messages": report.messages,
             "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
             "remarks": [*report.remarks, *self.odd],
+            "findings": [one.to_json() for one in report.findings],
             "damage": report.damage,
             "log_table": self.log_table,
         }
