@@ -469,8 +469,8 @@ class _Table:
         may = [n for n in left if not (role.sent and n.measured)]
         some = [n for n in may if role.sent and n.command]
         some = some or [n for n in may if row[self.at[n.path]] > 0]
-        some = some or [n for n in may if n.path in possible and not n.said]
         some = some or [n for n in self.numbers if (role.name, n.path) in self.named]
+        some = some or [n for n in may if n.path in possible and not n.said]
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
         empty = [t.topic for t in self.log.topics if not t.messages]
         empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
