@@ -83,5 +83,5 @@ def test_no_plan_is_made_for_an_input_that_log_does_not_map(tmp_path):
     file.write_text(without + '\n[system]\nmodel = "model.py"\n')
     Workspace(w).propose()
     file.write_text(without)
-    with pytest.raises(GroundedError, match="maps no .*duty"):
+    with pytest.raises(GroundedError, match=r"maps no .*duty"):
         Workspace(w).propose()
