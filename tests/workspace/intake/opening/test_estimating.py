@@ -308,7 +308,7 @@ def test_seconds_under_a_column_of_milliseconds_are_told(task):
     """The smoother's noise was NaN, with warnings of numpy."""
     logged, _, _ = driven()
     log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
-    with pytest.raises(GroundedError, match=r"times 1000 they would be 0\.01 s"):
+    with pytest.raises(GroundedError, match="in another unit"):
         with_estimates(log, TABLE, task)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.estimate.record import Record
+from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import probe
@@ -101,9 +102,9 @@ def with_estimates(
     check_overlap(samples, sent)
     lasts = 1e-9 * (min(int(s.t[-1]) for s in samples) - max(int(s.t[0]) for s in samples))
     if lasts < task.dt:
+        every = stamped_otherwise((*samples, *sent), task.dt)
         raise GroundedError(
-            f"the log lasts {lasts:.3g} s, less than a step of [task] dt = {task.dt:g} s: states "
-            f"can't be estimated from it{stamped_otherwise((*samples, *sent), task.dt)}"
+            found("file.steps", steps=0, dt=task.dt, every=every, start=0.0, stop=max(lasts, 0.0))
         )
     clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task)
     records = _records(samples, sent, clock, task.dt)
@@ -111,15 +112,15 @@ def with_estimates(
         return dict(series)
     times, states = _smoothed(records, table, task, _sizes(samples, task))
     t, first = clock.stamps(times), series[next(iter(table.measured))]
-    found, rests = dict(series), _at_rest(samples, sent, model)
+    filled, rests = dict(series), _at_rest(samples, sent, model)
     for name in guessed:
         values = states[:, model.state_names.index(name)]
         if name in rests:
             values = np.where(t <= rests[name], 0.0, values)
         spec = SignalSpec(f"/estimate.{name}", first.spec.clock)
         logged = t - round(float(np.median(first.t - first.log_times)))
-        found[name] = replace(first, spec=spec, t=t, values=values, log_times=logged)
-    return found
+        filled[name] = replace(first, spec=spec, t=t, values=values, log_times=logged)
+    return filled
 
 
 def _at_rest(samples: Sequence[Samples], sent: Sequence[Samples], model: Model) -> dict[str, int]:
