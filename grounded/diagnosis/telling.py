@@ -146,7 +146,7 @@ def open_line(d: Diagnosed) -> Iterator[Finding]:
         left, others = d.leftover[0], len(d.leftover) - 1
         place = None if left.region is None else left.region.told
         if not math.isfinite(left.error) or (not left.above and math.isfinite(left.size)):
-            size = Quantity(left.size, left.unit)
+            size = Quantity(left.size, left.unit) if math.isfinite(left.size) else None
             yield found("gap.lacks", left.channel, state=left.channel, size=size, place=place,
                         others=others)  # fmt: skip
             return
@@ -167,7 +167,10 @@ def open_line(d: Diagnosed) -> Iterator[Finding]:
             **facts,
         )
         return
-    channels = [one for one in d.where.channels if one.share >= LEAST_SHARE]  # NaN: only noise
+    # NaN: only noise
+    channels = [
+        one for one in d.where.channels if LEAST_SHARE <= one.share < math.inf
+    ]  # NaN: only noise
     if not channels:
         return
     first, second, region = channels[0], channels[1:2], d.where.regions[:1]

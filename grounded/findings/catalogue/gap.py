@@ -39,7 +39,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "lacks": Entry(
         "note",
-        "small but lasting: the rate of {state} lacks {size} rms[[, mostly where {place}]]"
+        "small but lasting: the rate of {state} lacks something[[, {size} rms]]"
+        "[[, mostly where {place}]]"
         "[[; {others:more state} {others:is/are} off]]",
     ),
     "where": Entry(
