@@ -14,8 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.joint_model import joint_model, split
-from grounded.diagnosis.hypotheses.plainest import plain_friction, plainer
+from grounded.diagnosis.hypotheses.joint_model import joint_model
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -24,8 +23,8 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
 )
-from grounded.diagnosis.hypotheses.swaps import HOPEFUL, TUNED, parted, reordered, swapped
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
+from grounded.diagnosis.hypotheses.variations import HOPEFUL, TUNED, reordered, swapped, varied
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.levels import NATS
@@ -239,7 +238,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     """
     size, done = len(best.hypothesis.effects), set[frozenset[str]]()
     while 1 <= size < most:
-        best = plain_friction(search, best)
+        best = varied(search, best)
         starts = _starts(search, size, best)
         done |= {frozenset(fit.hypothesis.names) for fit in starts}
         halves = _halves(search, starts) if size == 1 else []
@@ -269,7 +268,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if search.chosen(most) is chosen:
             break
     chosen = search.chosen(most)
-    plain_friction(search, chosen)
+    varied(search, chosen)
     if (plain := search.chosen(most)) is not chosen:
         _nested(search, plain)
         chosen = search.chosen(most)
@@ -283,9 +282,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     settle(search, most)
     chosen = search.chosen(most)
     for fit in [chosen, *search.of_size(len(chosen.hypothesis.effects))[:TUNED]]:
-        parted(search, fit)  # the rule may prefer what blames less
-        split(search, fit)
-        plainer(search, fit)
+        varied(search, fit)  # the rule may prefer what blames less
     return search.chosen(most)
 
 

@@ -18,7 +18,6 @@ from itertools import product
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.plainest import push
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
     TO_THE_TOP,
@@ -26,6 +25,7 @@ from grounded.diagnosis.hypotheses.search import (
     Start,
 )
 from grounded.diagnosis.hypotheses.tuning import tune
+from grounded.diagnosis.hypotheses.variations import LATE, push, varied
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.levels import NATS
@@ -41,8 +41,6 @@ STICKING = (0.03, 0.2)  # initial dry frictions, as fractions of an input's peak
 MANY = 3  # joints, and effects, above which adding one effect at a time may fail
 AGAIN = 8  # iterations after an effect was removed or added
 BEYOND = 4  # most effects added to those of the joints
-APART = 8.0  # nats by which delays of each input must be likelier than one of all
-LATE = ("delay", "first_order_lag")  # families that motors on one bus or of one kind share
 OWN = 0.3  # initial added inertia, as a fraction of a joint's own
 
 
@@ -72,7 +70,7 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
         tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
     best = _completed(search, best, len(best.hypothesis.effects) + BEYOND)
-    return _coloured(search, shared(search, best))
+    return _coloured(search, varied(search, best))
 
 
 def _joints(search: HypothesisSearch) -> list[tuple[Effect, Effect]]:
@@ -144,49 +142,6 @@ def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
     start = fit.hypothesis.minus(fit.hypothesis.names[index])
     found = search.refined([(start, fit.noise, fit.track)], AGAIN)
     return found[0] if found else fit
-
-
-def shared(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """Replace delays and lags of some inputs by one of all inputs, if that is likelier."""
-    rest = fit.hypothesis
-    late = [(e, v) for e, v in rest.pairs if e.family.name in LATE]
-    if not late:
-        return fit
-    for one, _ in late:
-        rest = rest.minus(one.name)
-    size = max(max(v.values()) for _, v in late)
-    starts = [
-        (rest.plus(effect, {effect.free[0].name: size}), fit.noise, fit.track)
-        for effect in search.candidates
-        if effect.family.name in LATE and len(effect.site.targets) == search.data.model.m
-    ]
-    return max([fit, *search.refined(starts, TO_THE_TOP)], key=search.score)
-
-
-def split(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """Replace one delay or lag of all inputs by one of each, if that is far likelier.
-
-    The scan offers both, and the shared one explains more at first. A car's 30 ms of dead time and
-    the servo's lag were one delay of 44 ms of both commands.
-    """
-    by_name = {e.name: e for e in search.candidates}
-    for effect, values in fit.hypothesis.pairs:
-        family, targets = effect.family.name, effect.site.targets
-        each = [by_name.get(f"{family}:{target}") for target in targets]
-        if family not in LATE or len(each) < 2 or effect.known:
-            continue
-        rest, size = fit.hypothesis.minus(effect.name), max(values.values())
-        taken = {one.name for one in each if one is not None} & {*rest.names}
-        if taken or None in each:
-            continue
-        for one in each:
-            assert one is not None
-            rest = rest.plus(one, {one.free[0].name: size})
-        found = search.refined([(rest, fit.noise, fit.track)], TO_THE_TOP)
-        best = max(found, key=search.score, default=fit)
-        if search.score(best) > search.score(fit) + APART:
-            return best
-    return fit
 
 
 def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:

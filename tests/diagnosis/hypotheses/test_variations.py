@@ -7,7 +7,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.orders import first, orders
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.hypotheses.swaps import merged, parted, reordered
+from grounded.diagnosis.hypotheses.variations import reordered, variations, varied
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
@@ -84,23 +84,24 @@ def test_effects_found_in_the_wrong_order_are_put_right(search):
     assert best.hypothesis.values[1]["k"] == pytest.approx(FADE, rel=0.05)
 
 
+def names_of(search, *parts):
+    """Return the effects of all variations of a set, each in its order."""
+    return [h.names for h in variations(search, hypothesis(search, *parts))]
+
+
 def test_one_effect_of_all_inputs_replaces_one_for_each(search):
-    h = hypothesis(search, (DELAY, {"d": 0.04}), (WEAKER, {"k": FADE}), ("delay:b", {"d": 0.06}))
-    (fit,) = search.refined([search.fresh(h)], 1)
-    found = {start[0].names: start[0].values for start in merged(search, fit)}
-    assert (WEAKER, "delay:a+b") in found
-    late = found[WEAKER, "delay:a+b"][1]["d"]
-    own = [fit.hypothesis.values[i]["d"] for i in (0, 2)]
-    assert min(own) <= late <= max(own)
-    (alone,) = search.refined([search.fresh(h.minus("delay:b"))], 1)
-    assert not list(merged(search, alone))
+    delays = (DELAY, {"d": 0.04}), ("delay:b", {"d": 0.06})
+    h = hypothesis(search, delays[0], (WEAKER, {"k": FADE}), delays[1])
+    found = {one.names: one.values for one in variations(search, h)}
+    assert found[WEAKER, "delay:a+b"][1]["d"] == pytest.approx(0.05)
+    assert not names_of(search, delays[0], (WEAKER, {"k": FADE}))
 
 
 def test_a_set_is_rivalled_by_those_that_blame_fewer_inputs(search):
     both, fade = ("rate_limit:a+b", {"r": RATE}), (WEAKER, {"k": FADE})
     (fit,) = search.refined([search.fresh(hypothesis(search, both, fade))], 25)
-    found = {f.hypothesis.names: search.score(f) for f in parted(search, fit)}
-    assert set(found) == {(LIMIT, WEAKER), ("rate_limit:b", WEAKER)}  # in the same order
+    varied(search, fit)
+    found = {f.hypothesis.names: search.score(f) for f in search.of_size(2)}
     assert found[LIMIT, WEAKER] > search.score(fit) - 1  # only one of the valves is slow
     assert found["rate_limit:b", WEAKER] < search.score(fit) - 10
 
@@ -108,12 +109,10 @@ def test_a_set_is_rivalled_by_those_that_blame_fewer_inputs(search):
 @pytest.mark.parametrize("more", [("first_order_lag:b", "tau"), ("delay:b", "d")])
 def test_a_delay_of_each_input_replaces_one_of_all_and_more_of_some(search, more):
     later, name = more
-    h = hypothesis(search, ("delay:a+b", {"d": 0.04}), (later, {name: 0.01}), (LIMIT, {"r": RATE}))
-    (fit,) = search.refined([search.fresh(h)], 1)
-    found = [f for f in parted(search, fit) if set(f.hypothesis.names) == {DELAY, "delay:b", LIMIT}]
-    assert len(found) == 1
-    (alone,) = search.refined([search.fresh(hypothesis(search, ("delay:a+b", {"d": 0.04})))], 1)
-    assert not parted(search, alone)  # a delay of all commands is one cause
+    both, limit = ("delay:a+b", {"d": 0.04}), (LIMIT, {"r": RATE})
+    found = names_of(search, both, (later, {name: 0.01}), limit)
+    assert (DELAY, "delay:b", LIMIT) in found
+    assert names_of(search, both) == [(DELAY, "delay:b")]
 
 
 AXES = Model(

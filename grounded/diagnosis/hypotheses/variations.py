@@ -1,0 +1,208 @@
+"""Variations of a set of effects that say the same in other terms, for the rule to choose from.
+
+A set that grew one effect at a time may have begun with a wrong one, may blame more than it needs,
+or name an effect that another one contains. So it is varied, and every variation is fitted until it
+converges, with constants of its own:
+
+    another effect  one of them is replaced by any other that fits better beside the rest
+    one for several effects of single inputs become one of several inputs (`delay:a+b`)
+    fewer inputs    an effect of several inputs becomes one of some of them, or one of each
+    plain friction  a richer friction of a joint becomes its plain dry friction
+    another order   effects act on a command in another order: a gain before or after a rate limit
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded import places
+from grounded.diagnosis.hypotheses.orders import orders
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.tuning import tune
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.levels import NATS
+from grounded.diagnosis.likelihood.refine import refine
+from grounded.effects import Effect, InputFamily, MemoryFamily
+from grounded.effects.actuator import delay
+from grounded.effects.drive import motion_of, speed
+from grounded.effects.family import coupled
+from grounded.effects.joint import joint_friction, load_friction
+
+HOPEFUL = 4  # best sets of a size that are fitted to convergence
+TUNED = 2  # best larger sets whose constants are optimised
+ROUNDS = 3  # most rounds; after one, another set may be better
+AT_FIRST = 6  # iterations of the first fit of a swapped effect
+LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
+
+Change = Mapping[
+    str, tuple[tuple[Effect, Mapping[str, float]], ...]
+]  # effect -> those in its place
+
+
+def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
+    """Replace effects of a set by others while its evidence rises; return the likeliest fit.
+
+    All fits are added to the search. The result may have fewer effects than `best`.
+    """
+    size = len(best.hypothesis.effects)
+    for _ in range(ROUNDS):
+        known = {fit.hypothesis.names for fit in search.of_size(size)[:HOPEFUL]}
+        for name in best.hypothesis.names:  # does another effect fit better beside the others?
+            search.extended(search.without(best, name), AT_FIRST)
+        varied(search, best)
+        new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
+        search.finished(new, TO_THE_TOP)
+        reordered(search, new)
+        tune(search, [search.latest(fit) for fit in new])
+        before, best = best, search.of_size(size)[0]
+        if set(best.hypothesis.names) == set(before.hypothesis.names):
+            break
+    return max([best, *search.of_size(size - 1)[:1]], key=search.score)
+
+
+def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """Fit the variations of a set; return the likeliest that is not larger, or the set itself."""
+    known = {frozenset(fit.hypothesis.names)}
+    starts = []
+    for h in variations(search, fit.hypothesis):
+        if (names := frozenset(h.names)) not in known or names == frozenset(fit.hypothesis.names):
+            known.add(names)
+            starts.append((h, fit.noise, fit.track))
+    found = search.refined(starts, TO_THE_TOP)
+    tune(search, found)  # the speed over which another law builds up is not that of this one
+    size = len(fit.hypothesis.effects)
+    small = [f for f in map(search.latest, found) if len(f.hypothesis.effects) <= size]
+    best = max([fit, *small], key=search.score)
+    return varied(search, best) if search.score(best) > search.score(fit) + NATS else best
+
+
+def variations(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
+    """Yield a set with one effect for several, with fewer inputs, and with plain frictions."""
+    own = {effect.name: effect for effect in search.candidates}
+    for change in (*merged(own, h), *parted(own, h), *plainer(search, h)):
+        yield _in_place(h, change)
+
+
+def merged(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
+    """Yield one effect of several inputs in place of two or more effects of fewer.
+
+    They are of the same family, or all of them make the inputs late.
+    """
+    for effect in own.values():
+        targets, family = set(effect.site.targets), effect.family
+        if len(targets) < 2 or not isinstance(family, InputFamily | MemoryFamily):
+            continue
+        kinds = LATE if family.name in LATE else (family.name,)
+        of_fewer = (p for p in h.pairs if p[0].family.name in kinds)
+        old = [(e, v) for e, v in of_fewer if set(e.site.targets) <= targets]
+        same = [v for e, v in old if e.family.name == family.name]
+        if len(old) > 1 and same:
+            values = {q.name: float(np.mean([v[q.name] for v in same])) for q in effect.free}
+            gone: Change = {e.name: () for e, _ in old}
+            yield {**gone, old[-1][0].name: ((effect, values),)}
+
+
+def parted(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
+    """Yield an effect of some inputs, or one of each, in place of one effect of several inputs.
+
+    A delay of all inputs, with something else that makes some of them later still, is also replaced
+    by a delay of each.
+    """
+    for effect, values in h.pairs:
+        family, targets = effect.family, {*effect.site.targets}
+        if len(targets) < 2 or not isinstance(family, InputFamily | MemoryFamily) or effect.known:
+            continue
+        parts = {
+            frozenset(e.site.targets): e
+            for e in own.values()
+            if e.family.name == family.name and {*e.site.targets} < targets
+        }
+        same = {q.name: values[q.name] for q in effect.free}
+        each = [parts.get(frozenset({target})) for target in effect.site.targets]
+        if family.name in LATE and None not in each:
+            yield {effect.name: tuple((e, same) for e in each if e and e.name not in h.names)}
+        if family.name != delay.name:
+            yield from ({effect.name: ((part, same),)} for part in parts.values())
+            continue
+        for later, more in h.pairs:
+            those = frozenset(later.site.targets)
+            one, other = parts.get(frozenset(targets - those)), parts.get(those)
+            if later.family.name in LATE and one is not None and other is not None:
+                longer = {"d": values["d"] + more.get("d", more.get("tau", 0.0))}
+                yield {effect.name: ((one, values),), later.name: ((other, longer),)}
+
+
+def plainer(search: HypothesisSearch, h: Hypothesis) -> Iterator[Change]:
+    """Yield the plain dry friction of a joint in place of a law with more values, or of a rate.
+
+    A friction that depends on the load, or one beside a stiction, or with a viscous part, contains
+    it. An added Coulomb rate can't hold a joint at rest, so any richer friction that can would win
+    for that reason alone.
+    """
+    by_family = {(e.family.name, motion_of(e)): (e, v) for e, v in h.pairs}
+    for (family, motion), (effect, values) in by_family.items():
+        joint = search.joints.get(motion)
+        if joint is not None and family == load_friction.name:
+            same = {q.name: float(values[q.name]) for q in joint.quantities}
+            yield {effect.name: ((joint, same),)}
+        if joint is not None and family == "coulomb_friction":
+            own = (joint, {"c": values["c"] / push(joint), "b": 0.0})
+            if (stiction := by_family.get(("stiction", motion))) is not None:
+                yield {effect.name: (), stiction[0].name: (own,)}
+            if len(joint.free) == 1:
+                yield {effect.name: (own,)}
+    viscous = [p for p in h.pairs if p[0].family.name == joint_friction.name and _viscous(p[0])]
+    for some in (*([one] for one in viscous if one[1].get("b") == 0), viscous[1:] and viscous):
+        if some:
+            yield {e.name: ((_dry(e), {**v, "b": 0.0}),) for e, v in some}
+
+
+def _viscous(effect: Effect) -> bool:
+    return "b" not in effect.fixed
+
+
+def _dry(effect: Effect) -> Effect:
+    """Return a joint's friction without its viscous part."""
+    some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
+    return replace(effect, quantities=tuple(some))
+
+
+def push(joint: Effect) -> float:
+    """Return the median acceleration per unit of the joint's input."""
+    model, (tau, _) = joint.site.model, coupled(joint.site)
+    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
+    _, f_u = model.system.linearise(x, u, model.values, dt)
+    by = speed(
+        joint, dict(zip(model.state_names, f_u[..., model.input_names.index(tau)].T, strict=True))
+    )
+    return float(np.median(by)) / dt
+
+
+def _in_place(h: Hypothesis, change: Change) -> Hypothesis:
+    """Replace effects, by name, by others that act in the same place of the order."""
+    found = replace(h, effects=(), values=())
+    for effect, values in h.pairs:
+        for other, own in change.get(effect.name, ((effect, values),)):
+            found = found.plus(other, own)
+    return found
+
+
+def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
+    """Fit the sets of these fits with their effects on inputs in other orders, while they gain.
+
+    Another order has to be clearly likelier. A dead zone before a gain, for example, is the same as
+    another one after it.
+    """
+    for fit in fits:
+        for _ in range(ROUNDS):
+            starts = [(h, fit.noise, fit.track) for h in orders(search.predictor, fit.hypothesis)]
+            found = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
+            best = max(found, key=search.score, default=fit)
+            if search.score(best) < search.score(search.latest(fit)) + NATS:
+                break
+            search.keep([best])
+            fit = best
