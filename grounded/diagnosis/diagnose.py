@@ -13,7 +13,6 @@ leftover          structure that no effect explains
 correction        a curve that predicts the leftover, if it passes its own test
 agreement         agreement of the trials; changes between two groups of them
 prediction_error  where the gap is, by channel, time and region
-split             explained, unexplained and irreducible parts of the error
 unconfirmed       effects that only few trials show, and where
 writer            the facts of the result; remarks and next_step: its findings; telling: its lines
 excitation        the next trial, to separate two explanations that tie

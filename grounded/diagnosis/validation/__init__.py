@@ -11,7 +11,6 @@ Read `ruler`, then `decide`. The modules, from the measurement to the claims:
     measured           errors, noise floor, credit and leftover of a decision
     held_out           the noise-normalised gap and utilities, held out
     prediction_error   where the gap is, by channel, time and region
-    split              explained, unexplained and irreducible parts of the error
     blame              which of the model's own parameters are off
     claims             the claimed effects with intervals, their rivals and look-alikes
     averaged           intervals averaged over models

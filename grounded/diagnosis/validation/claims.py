@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import no_limits, parametric
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
-from grounded.diagnosis.hypotheses.one_clock import one_clock
+from grounded.diagnosis.hypotheses.lookalike import (
+    lookalikes,
+    moving,
+    of_parameters,
+    one_clock,
+    one_thing,
+    swap,
+    twins,
+)
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
-from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations

@@ -3,6 +3,9 @@
 Errors above the floor are reported as a leftover, whatever is claimed. A correction by a flexible
 regression counts as a leftover if predictions gain by it; what it predicts is not noise, so the
 floor is lowered to what it reaches.
+
+The mean squared error is split into what the diagnosis removes on held-out trials, what it leaves
+above the noise, and the noise floor, which no model predicts (`split`).
 """
 
 from __future__ import annotations
@@ -20,8 +23,10 @@ from grounded.diagnosis.error_report import (
     AT_MOST,
     BOUNDS,
     SURE,
+    ChannelParts,
     Credit,
     Part,
+    Parts,
     Remainder,
     RulerRow,
     RunChange,
@@ -34,7 +39,6 @@ from grounded.diagnosis.validation.ahead import unseen
 from grounded.diagnosis.validation.decide import Decision, plain
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
 from grounded.diagnosis.validation.ruler import Ruler, repeated
-from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 
@@ -63,7 +67,7 @@ class Measured:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
         self.lost = losses(ruler, decision)
-        self.credit = shares(ruler, decision, self.lost)
+        self.credit = credited(ruler, decision, self.lost)
         self.left, self.flexible = decision.left, decision.flexible
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
@@ -339,7 +343,7 @@ def losses(ruler: Ruler, decision: Decision) -> dict[str, float]:
     return {name: max(ruler.gain(fit, decision.fit).mean, 0.0) for name, fit in without}
 
 
-def shares(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dict[str, float]:
+def credited(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dict[str, float]:
     """Return the share of the total gain (in log error) that is lost without each cause.
 
     If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
@@ -352,3 +356,51 @@ def shares(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dict[
 def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
     """Return names by their credit, largest first."""
     return sorted(names, key=lambda name: -shares_.get(name, 0.0))
+
+
+def shares(before: Array, after: Array, floor: Array) -> Array:
+    """Return the explained, unexplained and irreducible shares of mean squared errors, (3, ...).
+
+    Args:
+        before: mean squared errors of the crude model.
+        after: those of the diagnosed model.
+        floor: those of noise alone.
+    """
+    after = np.minimum(after, before)
+    floor = np.minimum(floor, after)
+    return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
+
+
+def split(
+    horizon_s: float,
+    units: dict[str, str],
+    before: Array,
+    after: Array,
+    floor: Array,
+    source: str,
+    unsure: float = 0.0,
+) -> Split:
+    """Return the parts of the error at one horizon.
+
+    Args:
+        horizon_s: how far ahead [s].
+        units: {channel: unit}, in order.
+        before: rms error of the crude model (n,).
+        after: rms error of the diagnosed model (n,).
+        floor: rms error of noise alone (n,); NaN where it is not known.
+        source: how the floor was determined.
+        unsure: standard deviation of the floor's logarithm.
+    """
+    unknown = np.isnan(floor) & ~np.isnan(before)
+    squares = [np.nan_to_num(rms) ** 2 for rms in (before, after, floor)]
+    each = shares(*squares)
+    each[1:, unknown] = np.nan
+    unit = squares[0] if unknown.any() else squares[2]  # of each state's errors
+    scale = 1 / np.maximum(unit, 1e-9 * np.maximum(squares[0], 1e-300))
+    whole = shares(*(np.asarray((scale * part).sum()) for part in squares))
+    whole[1:] += np.nan if unknown.any() else 0.0
+    channels = tuple(
+        ChannelParts(name, unit, float(np.nan_to_num(before[i])), *map(float, each[:, i]))
+        for i, (name, unit) in enumerate(units.items())
+    )
+    return Split(horizon_s, Parts(*map(float, whole)), channels, source, unsure)

@@ -9,7 +9,7 @@ from grounded import Model, Param
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses import scan
 from grounded.diagnosis.hypotheses.explored import no_limits
-from grounded.diagnosis.hypotheses.grid_points import between, elsewhere
+from grounded.diagnosis.hypotheses.scan import between, elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis

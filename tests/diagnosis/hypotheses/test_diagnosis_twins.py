@@ -8,9 +8,8 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import lookalikes
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, moving, swap, twins
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor

@@ -8,7 +8,7 @@ import pytest
 import grounded as gr
 from grounded import Model
 from grounded.diagnosis.diagnose import DiagnosisOptions
-from grounded.diagnosis.hypotheses.one_clock import one_clock
+from grounded.diagnosis.hypotheses.lookalike import one_clock
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.cart_pole import model as cart_pole

@@ -16,7 +16,7 @@ from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import limits
-from grounded.diagnosis.validation.measured import losses, shares
+from grounded.diagnosis.validation.measured import credited, losses
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.experiments.pendulum import model as real_pendulum
@@ -98,7 +98,7 @@ def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
     assert ruler.gain(decision.crude, decision.fit).mean > 1
     for less in decision.without.values():
         assert ruler.gain(less, decision.fit).pays(1.0)
-    worth = shares(ruler, decision, losses(ruler, decision))
+    worth = credited(ruler, decision, losses(ruler, decision))
     assert max(worth.values()) > 0.2 and sum(worth.values()) <= 1 + 1e-9
 
 

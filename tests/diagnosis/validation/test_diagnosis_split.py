@@ -9,7 +9,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Split
 from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
 from grounded.diagnosis.pictures import where_figure
-from grounded.diagnosis.validation.split import shares, split
+from grounded.diagnosis.validation.measured import shares, split
 from grounded.effects import Library
 from small_tasks import DT, pushed_cart, pushed_cart_task
 
