@@ -18,6 +18,7 @@ from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.validation.ahead import FAR
 from grounded.diagnosis.validation.prediction_error import Horizon, errors, normalised
 from grounded.frozen import Array
 from grounded.task import Task
@@ -69,9 +70,6 @@ def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Hori
 def gaps_of(predictor: Predictor, fits: Sequence[Fitted], where: Horizon) -> list[float]:
     """Return the held-out gap that each of several fits leaves."""
     return [normalised(held_out_errors(predictor, fit, fit.states, where), where) for fit in fits]
-
-
-FAR = 1e6  # size of a state above which it has diverged
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.by_priors import information
+from grounded.diagnosis.validation.by_priors import PART, information
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -42,8 +42,7 @@ from grounded.trial import Trial
 
 FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
-DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor,
-PART = 0.2  # namely on those that contribute at least this part of its variance
+DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor
 FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
 ROUNDING = 1e-9  # of a channel's largest value: smaller differences are rounding, not noise
 SAMPLES = 20  # of the slopes by which inputs are compared
