@@ -8,9 +8,10 @@ steps:
        predictions are better by more than their standard error and as much as matters (LEAST, and
        SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
-    3. Of the supported sets within WITHIN standard errors of the reference, the smallest is chosen
-       (the one-standard-error rule of Breiman et al. 1984, and of projection predictive selection,
-       Piironen & Vehtari 2017).
+    3. Of the supported sets that the reference is not better than by the same test (likelier, and
+       predicting better by more than a standard error), the smallest is chosen: the
+       one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
+       (Piironen & Vehtari 2017).
     4. Of those that are as small, and those that predict better than one of them, the likeliest.
        Within NATS nats they tie: then a parameter comes before a mechanism, and that before what
        has no mechanism (`Option.order`).
@@ -25,11 +26,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.likelihood.levels import NATS
-from grounded.diagnosis.validation.gain import LEAST, Errors, Gain
+from grounded.diagnosis.validation.gain import Errors, Gain
 
 SCATTERS = 1.0  # standard errors by which predictions must gain by each cause
 SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
-WITHIN = 1.0  # standard errors of the reference within which a smaller set predicts as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +132,6 @@ class Rule:
         return not self.held_out or (matters and more.pays(SCATTERS))
 
     def _as_good(self, option: Option, best: Option) -> bool:
-        """Check whether a set predicts as well as the best, within its error or what matters."""
-        more = self.gain(option.errors, best.errors)
-        return more.mean <= max(WITHIN * more.scatter, LEAST)
+        """Check whether the best set is no better: not likelier, or it predicts no better."""
+        likelier = best.evidence - option.evidence >= NATS
+        return not (likelier and self.gain(option.errors, best.errors).pays(SCATTERS))
