@@ -31,7 +31,6 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.sound_data import sound_data
-from grounded.diagnosis.validation.choose import SCATTERS
 from grounded.diagnosis.validation.limits import counted_once, held
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
@@ -234,7 +233,7 @@ def _supported(search: Alone, fits: Sequence[Fitted]) -> Fitted:
     if not ruler.held_out or len(fits) == 1:
         return max(fits, key=search.score)
     best = max(fits, key=ruler.score)
-    near = [f for f in fits if (gain := ruler.gain(f, best)).mean <= SCATTERS * gain.scatter]
+    near = [f for f in fits if (gain := ruler.gain(f, best)).mean <= gain.scatter]
     return max(near or [best], key=search.score)
 
 

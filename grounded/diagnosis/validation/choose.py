@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.validation.gain import Errors, Gain
 
-SCATTERS = 1.0  # standard errors by which predictions must gain by each cause
+SCATTERS = 2.0  # standard errors by which predictions must gain by each cause
 SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
 
 

@@ -8,5 +8,4 @@ does one by one. `message_path.py` and `path_walk.py` extract numbers from them.
 writes message by message, `mcap_whole.py` a whole candidate at once.
 
 `bags.py` (.db3, .bag) and `tables.py` (.csv, .npz, .ulg) convert other files to the same records.
-`name_endings.py` lists the units at the end of names.
 """
