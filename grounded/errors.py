@@ -38,7 +38,7 @@ class GroundedError(Exception):
     """
 
     def __init__(self, message: Any, then: NextCommand | None = None) -> None:
-        self.finding = None if isinstance(message, str) else message
+        self.finding: Any = None if isinstance(message, str) else message
         super().__init__(message if self.finding is None else message.sentence)
         self.then = then or getattr(self.finding, "then", None)
 

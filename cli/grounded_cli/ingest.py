@@ -11,6 +11,7 @@ from grounded.errors import NextCommand
 from grounded.result import listed
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json
+from grounded_cli.console.options import details as all_findings
 from grounded_cli.console.terminal import (
     field,
     number,
@@ -20,6 +21,7 @@ from grounded_cli.console.terminal import (
     show,
     show_json,
     table,
+    tell,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import extent, with_unit
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.ingest import Ingested
 
 CLOCKS = {"header": "header stamps", "log": "log times", "publish": "publish times"}
+MOST = 3  # findings that are told without --details
 TABLE = "/csv."  # before the columns of a table, in the path of a signal
 AGAIN, ASIDE = "run again", "set aside"  # verdicts
 BEGUN = "in doubt for its start"  # a verdict "in doubt" that another run of the same one settles
@@ -63,10 +66,16 @@ VERDICTS = {
     metavar="NAME",
     help="A condition that no signal shows: wet.",
 )
+@all_findings
 @in_workspace
 @as_json
 def command(
-    files: tuple[str, ...], candidate: str | None, data: bool, group: str, json_: bool
+    files: tuple[str, ...],
+    candidate: str | None,
+    data: bool,
+    group: str,
+    details: bool,
+    json_: bool,
 ) -> None:
     """Check, resample and store logs of any format that `inspect` reads.
 
@@ -80,7 +89,7 @@ def command(
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data, group=group))
         if not json_:
-            _tell(name, done[-1], _best(workspace, done[-1]), workspace.base_model)
+            _tell(name, done[-1], _best(workspace, done[-1]), workspace.base_model, details)
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
@@ -92,9 +101,10 @@ def command(
 @click.option(
     "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
 )
+@all_findings
 @in_workspace
 @as_json
-def following(log: str, candidate: str | None, json_: bool) -> None:
+def following(log: str, candidate: str | None, details: bool, json_: bool) -> None:
     """Ingest a log, show the verdict, propose, and export for the robot.
 
     Does the same as `ingest LOG`, `propose` and `export ID --runner`; the candidate is written into
@@ -109,13 +119,14 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
         show_json(done.to_json())
         return
     if done.proposed is None:
-        _tell(log, done.taken, None, workspace.base_model)
+        _tell(log, done.taken, None, workspace.base_model, details)
         ran = done.taken.trial
         show("")
         sentence(f"nothing is proposed before {ran} is discarded; or go on with it: `propose`")
         show(next_line(done.taken.then))
         return
-    _tell(log, done.taken, done.proposed.standing.incumbent, workspace.base_model)
+    best = done.proposed.standing.incumbent
+    _tell(log, done.taken, best, workspace.base_model, details)
     show("")
     for path in done.removed:
         remark("note", f"{path} is deleted: {path.stem} was not run and is void")
@@ -136,13 +147,10 @@ def _best(workspace: Workspace, one: Ingested) -> Tried | None:
     return standing_in(workspace).incumbent
 
 
-def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
+def _tell(name: str, one: Ingested, best: Tried | None, model: Model, details: bool) -> None:
     if one.known:
         sentence(f"{name} was stored before as {one.trial}: nothing is new. Its result again:")
-    for warning in one.warnings:
-        remark("warning", f"{name}: {warning}")
-    for note in one.notes:
-        remark("note", f"{name}: {note}")
+    tell(one.findings, name, most=len(one.findings) if details else MOST)
     if not one.known:
         sentence(f"{name} is stored as {one.trial}")
     if not one.candidate:
@@ -153,10 +161,7 @@ def _tell(name: str, one: Ingested, best: Tried | None, model: Model) -> None:
         doubted = one.verdict == "in doubt" and one.to_settle == one.candidate
         meaning = VERDICTS.get(BEGUN if doubted else one.verdict, "")
         if one.then.verb == "discard":  # "it may be bad luck" would contradict the warning
-            noted = any("discard" in note for note in one.notes)
-            warned = any("discard" in text or "again" in text for text in one.warnings)
-            says = "note" if noted and not warned else "warning"
-            meaning = f"; discard it, as the {says} says, or go on with it: `propose`"
+            meaning = "; discard it, as the warning says, or go on with it: `propose`"
         if passed and one.verdict in BEST:
             meaning = " than those before it"
         ended = one.utility == float("-inf")

@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.accounts.finding import UnusableTrials, unusable
+from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.motion import HORIZONS, LEAST, Ahead, Fit, basis
-from grounded.errors import NextCommand
+from grounded.accounts.reported import names_of, tables
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
-from grounded.result import listed
 from grounded.trial import Trial
 
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
@@ -58,23 +58,18 @@ class Early:
     mended: float
     gain: float
 
-    def said(self, model: Model) -> str:
-        """One clause: what is wrong, and the evidence."""
-        name, sent = model.state_names[self.state], list(model.input_names)
-        unit = model.states[name]
-        return (
-            f"{name} moves about {self.seconds:.3g} s before {listed(sent)} "
-            f"command{'s' * (len(sent) == 1)} it: the clocks of states and commands differ (with "
-            f"commands from that much later, the model's error of {name} 0.25 s ahead is "
-            f"{self.mended:.2g} instead of {self.logged:.2g}{'' if unit == '1' else f' {unit}'})"
-        )
-
-    def mend(self, names: Sequence[str]) -> str:
-        """Return the instruction that corrects the clocks of the states with these names."""
-        tables = listed(f"[log.state.{name}]" for name in names)
-        return (
-            f"Subtract {self.seconds:.3g} s from delay_s in {tables} (delay_s = "
-            f"-{self.seconds:.3g} if it has none), or correct the commands' time stamps"
+    def finding(self, model: Model, shown: Sequence[int]) -> Finding:
+        """Return that the clocks of commands and of the states `shown` differ."""
+        name = model.state_names[self.state]
+        return found(
+            "log.clock",
+            *names_of(model, shown),
+            state=name,
+            lead=self.seconds,
+            tables=tables(model, names_of(model, shown)),
+            logged=Quantity(self.logged, model.states[name]),
+            mended=Quantity(self.mended, model.states[name]),
+            nats=self.gain,
         )
 
 
@@ -91,11 +86,10 @@ def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
     """
     each = {k: answers_early(model, one, shown) for k, one in enumerate(trials)}
     few = 2 * sum(early is not None for early in each.values()) < len(each)  # a swing that sticks
-    found = {k: e for k, e in each.items() if e and (not few or e.gain > SURELY)}
-    if found:
-        early = next(iter(found.values()))
-        names = [model.state_names[i] for i in _known(trials[min(found)], shown)]
-        raise unusable(trials, list(found), early.said(model), early.mend(names))
+    some = {k: e for k, e in each.items() if e and (not few or e.gain > SURELY)}
+    if some:
+        early, known = next(iter(some.values())), _known(trials[min(some)], shown)
+        raise UnusableTrials(trials, list(some), early.finding(model, known))
 
 
 def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | None:
@@ -294,18 +288,8 @@ def judge_signs(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> 
             continue
         # the fewer are wrong, and of equally many those that contradict the model
         odd, rest = (wrong, right) if len(wrong) <= len(right) else (right, wrong)
-        ids, others = ([trials[k].id or f"number {k + 1}" for k in some] for some in (odd, rest))
-        said = (
-            f"{name} acts the other way round than in {listed(others)}"
-            f"{' and in the model' if odd is wrong else ', though as in the model'} "
-            f"({100 * every[odd[0]].share:.0f} % of its modelled effect, in {others[0]} "
-            f"{100 * every[rest[0]].share:.0f} %): no model explains both"
+        share, usual = every[odd[0]].share, every[rest[0]].share
+        others = tuple(trials[k].id or f"trial number {k + 1}" for k in rest)
+        raise UnusableTrials(
+            trials, odd, found("log.reversed", name, others=others, share=share, usual=usual)
         )
-        these = "this trial" if len(odd) == 1 else "these trials"
-        mend = (
-            f"Was a motor wired otherwise, or a sign switched? Then discard {these}, mend it and "
-            "run again. If only the log has the other sign, correct the log and ingest it again"
-        )
-        where = f"in trial{'s' * (len(odd) > 1)} {listed(ids)}"
-        then = NextCommand("discard", tuple(ids)) if trials[0].id else None
-        raise UnusableTrials(f"{where} {said}. {mend}", said, mend, said, then)

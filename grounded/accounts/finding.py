@@ -10,6 +10,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import finding as told
 from grounded.result import Document
 from grounded.trial import Trial
 
@@ -174,48 +175,18 @@ class Preflight:
 
 
 class UnusableTrials(GroundedError):
-    """Raised for trials that must be corrected.
-
-    Args:
-        message: the whole message.
-        clauses: only what is wrong with them.
-        mend: what to do before their logs are ingested again.
-        in_program: only what is wrong with them, for a program that has no [log].
-        then: the command that discards them.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        clauses: str,
-        mend: str,
-        in_program: str,
-        then: NextCommand | None = None,
-    ) -> None:
-        super().__init__(message, then)
-        self.clauses, self.mend, self.in_program = clauses, mend, in_program
-
-
-def unusable(
-    trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str, in_program: str = ""
-) -> UnusableTrials:
-    """Return the error that some trials must be corrected and ingested again, with its command.
+    """Raised for trials that must be corrected; `finding` says why, and in which.
 
     Args:
         trials: all of them.
         odd: indices of those affected.
-        clauses: what is wrong with them.
-        mend: what to do before the log is ingested again.
-        in_program: the clauses for a program, if they name keys of [log].
+        finding: what is wrong with them.
     """
-    names = [trials[k].id or f"number {k + 1}" for k in odd]
-    one, every = len(odd) == 1, len(odd) == len(trials) > 1
-    where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
-    return UnusableTrials(
-        f"{where} {clauses}. {mend}; then discard {'this trial' if one else 'these trials'} and "
-        "ingest the log again",
-        clauses,
-        mend,
-        in_program or clauses,
-        then=NextCommand("discard", tuple(names)) if trials[odd[0]].id else None,
-    )
+
+    def __init__(self, trials: Sequence[Trial], odd: Sequence[int], finding: told.Finding) -> None:
+        which = tuple(trials[k].id or f"trial number {k + 1}" for k in odd)
+        named = trials[odd[0]].id != ""
+        facts: dict[str, told.Fact] = {"source": "log", "trials": which} if named else {}
+        super().__init__(
+            finding.also(which=which, **facts), NextCommand("discard", which) if named else None
+        )

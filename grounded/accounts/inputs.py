@@ -45,7 +45,8 @@ def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
     for j, name in enumerate(task.model.input_names):
         share = float(past[:, j].mean())
         if share > OFTEN:
-            mend = in_percent(task, inputs, j) or "widen [limits] if the robot allows it"
+            percent = f"is it in percent? then multiply scale in [log.input.{name}] by 0.01"
+            mend = percent if in_percent(task, inputs, j) else "widen [limits] if the robot can"
             text = (
                 f"beyond its limits, {limits_of(task, j)}, {100 * share:.0f} % of the time "
                 f"({span(inputs[:, j])}): {mend}"
@@ -57,20 +58,18 @@ def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
             yield Finding(name, text, "saturated", share=share)
 
 
-def in_percent(task: Task, inputs: Array, j: int) -> str:
-    """Return advice for a dimensionless input that seems to be logged in percent; "" otherwise.
+def in_percent(task: Task, inputs: Array, j: int) -> bool:
+    """Return whether a dimensionless input seems to be logged in percent.
 
     Args:
         task: with the limits.
         inputs: the commands (T, m) of a log.
         j: the input.
     """
-    name, unit = list(task.model.inputs.items())[j]
+    unit = list(task.model.inputs.values())[j]
     most = float(np.nanmax(np.abs(inputs[:, j]), initial=0.0))
     limit = float(max(abs(task.low[j]), abs(task.high[j])))
-    if unit != "1" or not FAR * limit < most <= 100 * OVER:
-        return ""
-    return f"is it in percent? then multiply scale in [log.input.{name}] by 0.01"
+    return unit == "1" and FAR * limit < most <= 100 * OVER
 
 
 def limits_of(task: Task, j: int) -> str:

@@ -18,15 +18,14 @@ import numpy as np
 
 from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
-from grounded.accounts.finding import Finding, Preflight, put_right, unusable
+from grounded.accounts.finding import Finding, Preflight, UnusableTrials, put_right
 from grounded.accounts.inputs import judge_inputs
 from grounded.accounts.judge import Told, Verdict, judge
 from grounded.accounts.kinematics import folded, gaps, kinematic_rows
+from grounded.accounts.reported import folded as is_folded
+from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_signal, signal_of
-from grounded.accounts.table import DEGREES
 from grounded.accounts.time_step import judge_resolution, judge_time_step
-from grounded.accounts.words import clause, is_folded, mend, remedy
-from grounded.errors import GroundedError, NextCommand
 from grounded.model import Model
 from grounded.result import listed, per_second, with_unit
 from grounded.task import Task
@@ -117,30 +116,26 @@ def refuse(model: Model, trials: Sequence[Trial], verdict: Verdict) -> None:
     stop_at_folded(model, trials, verdict.folded)
     stops = [one for one in verdict.told if not (one.certain or one.account.kind == "offset")]
     if stops:
-        first = stops[0]
-        some = [one for one in stops if one.trials == first.trials]
-        said, plain = (
-            "; ".join(clause(model, one, log=log) for one in some) for log in (True, False)
-        )
-        raise unusable(trials, first.trials, said, mend(model, first), plain)
+        raise UnusableTrials(trials, stops[0].trials, reported(model, stops[0])[0])
 
 
 def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[Finding]:
     """Yield the findings of an account that is corrected, or only reported: an offset."""
-    account, names = told.account, (*model.state_names, *model.input_names)
-    ids = [trials[k].id or f"number {k + 1}" for k in told.trials]
-    where = "" if told.whole else f" in trial{'s' * (len(ids) > 1)} {', '.join(ids)}"
+    account = told.account
+    which = (
+        () if told.whole else tuple(trials[k].id or f"trial number {k + 1}" for k in told.trials)
+    )
     for k in account.columns if told.certain or account.kind == "offset" else ():
-        text, log = remedy(model, told, k, where)
-        log *= not where
+        (name,), said = names_of(model, [k]), reported(model, told, k)[0].also(which=which).clause
         if account.kind == "dead":
-            yield Finding(names[k], text, "stuck", corrected=True)
+            yield Finding(name, said, "stuck", corrected=True)
         elif account.kind == "offset":
-            yield Finding(names[k], text, "offset")
+            yield Finding(name, said, "offset")
         else:
             kind = "degrees" if account.kind == "unit" else "sign"
             kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
-            yield put_right(names[k], text, kind, log, scale=account.factor)
+            log = "" if which else keys(model, account, k)
+            yield put_right(name, said, kind, log, scale=account.factor)
 
 
 def stop_at_folded(
@@ -154,21 +149,12 @@ def stop_at_folded(
         lost: such angles with their trials, if already known.
 
     Raises:
-        GroundedError: with the scale with which to ingest the log again.
+        UnusableTrials: with the scale with which to ingest the log again.
     """
     if lost is None:
         lost = folded(model, trials, kinematic_rows(model, range(model.n)))
     for i, some in lost.items():
-        name, ids = model.state_names[i], tuple(trials[k].id for k in some if trials[k].id)
-        where = f"in trial{'s' * (len(ids) > 1)} {listed(ids)} " if ids else ""
-        unit = model.states[name]
-        these = ("these trials", "their logs") if ids[1:] else ("it", "the log")
-        raise GroundedError(
-            f"{where}{name} {is_folded(model, i)} when the log was ingested: multiply the scale in "
-            f"[log.state.{name}] by {1 / DEGREES:.8g} (a missing scale is 1) or write {unit} into "
-            f"the log, discard {these[0]} and ingest {these[1]} again",
-            then=NextCommand("discard", ids) if ids else None,
-        )
+        raise UnusableTrials(trials, some, is_folded(model, i))
 
 
 def _unexplained(

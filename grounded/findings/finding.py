@@ -81,9 +81,23 @@ class Finding:
             return False
         return slots(entry.short) | slots(entry.remedy) <= {"about", *self.facts}
 
+    @property
+    def what(self) -> str:
+        """What was found, without a remedy."""
+        return filled(entry_of(self.code).short, {"about": self.about, **self.facts})
+
+    @property
+    def clause(self) -> str:
+        """What was found, as it continues a sentence after what it is about."""
+        return filled(entry_of(self.code).short, {**self.facts, "about": ()}).strip()
+
     def weighing(self, weight: Weight) -> Finding:
         """Return it with another weight."""
         return replace(self, weight=weight)
+
+    def also(self, **facts: Fact) -> Finding:
+        """Return it with further facts, or others in their place."""
+        return replace(self, facts={**self.facts, **facts})
 
     def to_json(self) -> dict[str, Any]:
         """Return its entry in the `findings` of a JSON document."""

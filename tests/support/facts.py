@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from fnmatch import fnmatchcase
+from typing import Any
 
 
 def holding(*facts: object) -> str:
@@ -13,6 +16,12 @@ def holding(*facts: object) -> str:
 def holds(text: str, *facts: object) -> bool:
     """Check whether a text has all of these as whole words."""
     return re.match(holding(*facts), text) is not None
+
+
+def of_code(found: Any, *codes: str) -> list[Any]:
+    """Return the findings of a result, or of a collection, that have one of these codes (with `*`)."""
+    some: Iterable[Any] = getattr(found, "findings", found)
+    return [one for one in some if any(fnmatchcase(one.code, code) for code in codes)]
 
 
 def _word(fact: str) -> str:

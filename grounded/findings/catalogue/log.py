@@ -4,4 +4,302 @@ from __future__ import annotations
 
 from grounded.findings.catalogue import Entry
 
-ENTRIES: dict[str, Entry] = {}
+OF = "[[{log}: ]]"  # the file, where the log is refused
+IN = "[[ (in {which})]]"
+MOTION = "[[; as logged the model misses {state} by {logged}, so by {mended}]]"
+RAN = "[[; only then are the commands those of {ran}]]"
+TIED = "[[; as likely: a fault of {tied}]]"
+AGAIN = "[[; then discard {trials} and {source:log=ingest the log,trial=run it} again]]"
+SCALE = "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]]"
+WRITES = "[[let the program write {writes}]]"
+# how a run went can't be judged by a wrong log
+RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.after*", "run.moved_on")
+RUN += ("run.let_go", "run.swings", "run.samples", "run.start")
+
+ENTRIES: dict[str, Entry] = {
+    # columns: the accounts
+    "unit": Entry(
+        "aside",
+        OF + "{about} {about:is/are} [[in {unit}, not {own}]][[{times:.4g} times too {size}]]"
+        "[[ and of {negative}]][[: far beyond {beyond:.3g} in [safety] otherwise]]"
+        + MOTION
+        + RAN
+        + IN,
+        SCALE + WRITES + "[[, and in [limits] {limits}]]" + AGAIN,
+        hides=(*RUN, "log.limits", "log.stated"),
+    ),
+    "folded": Entry(
+        "aside",
+        OF + "{about} is in degrees, but was unwrapped in {own}" + IN,
+        SCALE + WRITES + AGAIN,
+        hides=RUN,
+    ),
+    "sign": Entry(
+        "aside",
+        OF + "{about} {about:is/are} logged with the opposite sign" + MOTION + RAN + TIED + IN,
+        "reverse the sign[[ in {tables} (scale = -1 if it has none)]], or in the model if the log "
+        "is right" + AGAIN,
+        hides=RUN,
+    ),
+    "compass": Entry(
+        "aside",
+        "{about} turns the other way than positions do: it is {angle:.0f} degrees less the logged "
+        "value, as on a compass" + IN,
+        "[[set scale = -1 and that offset in {tables}]]" + AGAIN,
+        hides=RUN,
+    ),
+    "exchange": Entry(
+        "aside",
+        OF
+        + "{about} look exchanged[[, and {reversed} of the other sign]]"
+        + MOTION
+        + RAN
+        + "[[; {proven} show no exchange]]"
+        + TIED
+        + IN,
+        "exchange their paths in [log], or correct what wrote the log" + AGAIN,
+        hides=RUN,
+    ),
+    "dead": Entry(
+        "aside",
+        OF
+        + "{about} shows no motion, only noise around {mean:.4g}, while {state} moves by {moved}"
+        + IN,
+        "is its sensor on? If it is, look for its column in [log]" + AGAIN,
+        hides=RUN,
+    ),
+    "offset": Entry(
+        "aside",
+        OF + "{about} is {angle:.0f} degrees off the course given by the positions" + IN,
+        "[[then discard {trials} and {source:log=ingest the log,trial=run it} again]]",
+        hides=RUN,
+    ),
+    "axes": Entry(
+        "aside",
+        "{about} are in the axes of the positions, not in body axes[[ (in {which})]]",
+        "rotate them by -{heading}, in the log and in the robot's program, or write the model with "
+        "speeds in world axes" + AGAIN,
+        hides=RUN,
+    ),
+    "pace": Entry(
+        "aside",
+        OF + "a second of its stamps is {by:g} s of the run" + MOTION + RAN + IN,
+        "multiply the stamps by {by:g}" + AGAIN,
+        hides=RUN,
+    ),
+    "clock": Entry(
+        "aside",
+        "{state} moves {lead:.3g} s before it is commanded: the clocks of states and commands "
+        "differ (with later commands the model misses it by {mended}, not {logged})" + IN,
+        "subtract {lead:.3g} s from delay_s[[ in {tables}]], or stamp both by one clock" + AGAIN,
+        hides=RUN,
+    ),
+    "reversed": Entry(
+        "refuse",
+        "{about} acts the other way round than in {others} ({share:%} of its modelled effect, "
+        "there {usual:%}): no model explains both" + IN,
+        "was a motor wired otherwise, or a sign switched? Then mend it[[, discard {trials}]] and "
+        "run again; if only the log has the other sign, correct that",
+    ),
+    "zero": Entry(
+        "refuse",
+        OF + "{about} is {off} too {size} for the commands of {ran}: does its zero differ from "
+        "that of the program?",
+        "add {add:.3g} to the offset in {tables} (a missing one is 0)",
+    ),
+    # columns: what [log] and names say
+    "crossed": Entry(
+        "warn",
+        OF + "{about} are read from {paths}: by their {by} they are exchanged",
+        "exchange the paths in [log]",
+    ),
+    "path": Entry(
+        "warn",
+        OF + "{about} is read from {path}, {what}[[: {instead} is the angle]]",
+        "check its path in [log]",
+    ),
+    "stated": Entry(
+        "warn",
+        "{about} is read without a scale from a column in {unit}, but the model has {own}",
+        "set scale = {by:.6g} in {table}, if so",
+    ),
+    "unread": Entry(
+        "warn",
+        "{about} is in [log], but not in [estimate] measured: the trial has an estimate in its "
+        "place",
+        "to use it, add {about} = its scatter at standstill there",
+    ),
+    "estimated": Entry(
+        "note",
+        "the model that estimates {about} has {now}; for {trials} it had {before}",
+        "to have all from one model, discard {trials} and ingest the logs again",
+    ),
+    "reading": Entry("warn", "{text}"),
+    "limits": Entry(
+        "warn",
+        "{about} goes from {logged} in this log, beyond its [limits], {limits}",
+        "{how:percent=if it is in percent multiply its scale in [log] by 0.01,flip=its scale in "
+        "[log] is negative: multiply these limits by -1 too,widen=no plan will use that: widen "
+        "them if the robot can take it}",
+    ),
+    "outside": Entry(
+        "warn",
+        "{about} in the log is up to {most} outside its [limits]",
+        "log the commands after clipping",
+    ),
+    # what a log lacks
+    "gaps": Entry(
+        "warn",
+        "{samples} lost samples were interpolated, the longest gap is {longest} of {about} at {at}",
+    ),
+    "not_finite": Entry(
+        "warn", "{about} is not a finite number at {at}: the trial is treated as ended there"
+    ),
+    "short": Entry(
+        "warn",
+        "the log ends after {steps} of {horizon} steps[[, {missing:.3g} ms before the plan's last "
+        "state]]: the rest is extrapolated",
+        "log at least one more row after the last command",
+    ),
+    "still": Entry(
+        "warn",
+        "no state changes in it: was the robot switched on, and are these its columns?",
+        "`discard {trial}` sets it aside",
+    ),
+    "halted": Entry(
+        "warn",
+        "nothing moves from {begins:.1f} to {ends:.1f} s, though {inputs} {inputs:changes/change}: "
+        "was the robot against a stop, or switched off? A diagnosis takes that for its physics",
+        "cut the log there ([log.span] end), `discard {trial}` and ingest it again",
+    ),
+    "unknown": Entry("refuse", "{about} {about:is/are} NaN from the start"),
+    "late_states": Entry(
+        "refuse",
+        OF + "the run starts {late} before every state is known",
+        "start recording before the run[[, and remove {put_off} unless the clocks differ]]; or "
+        "ingest it with --data",
+    ),
+    # where a run begins
+    "from": Entry(
+        "note",
+        "it is used from {at:.3f} s on: what was sent before is not in the log, and the robot was "
+        "not at rest",
+    ),
+    "slow": Entry(
+        "note",
+        "the commands of {about} come every {every:.3g} s, but [task] dt is {dt:g} s",
+        "did you mean dt = {every:.3g}?",
+    ),
+    "rows": Entry(
+        "note",
+        "its rows repeat the commands every {every:.3g} s: a delay is known to +- {half:.3g} s "
+        "only",
+    ),
+    "earlier_rows": Entry(
+        "note", "the log begins {seconds:.3f} s before {ran} does: that part is left out"
+    ),
+    "start_doubt": Entry(
+        "warn",
+        "where {ran} begins is in doubt: its commands fit as well from {rival:.3f} s of the log on "
+        "as from {used:.3f} s, which is used",
+        "if it began elsewhere, `discard` it and set [log.span] start",
+    ),
+    "start_loose": Entry(
+        "warn",
+        "the start of the run is only known to {loose:size}, the time between rows",
+        "log the states that the controller used, or when it sent each command",
+    ),
+    "start_assumed": Entry(
+        "warn",
+        "no start of {ran} was found in it: the run is assumed to begin where the commands first "
+        "change, at {at:.3f} s[[, {longer:.3g} s before a run must]]",
+        "set another with [log.span] start",
+    ),
+    "begun_late": Entry(
+        "refuse",
+        OF + "its first row is {late} after {ran} began",
+        "record from before the run: without its beginning it can't be judged. If nothing was cut "
+        "off, the program's clock began before the run",
+    ),
+    # whose run it is
+    "not_run": Entry(
+        "refuse",
+        OF + "its commands are not what {ran} sends on the logged states: {about} differs by {rms} "
+        "(rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike up to {until}]][[; no "
+        "{unknown} for {gap}]][[; only {lasts} of commands]]"
+        "[[; {guessed} by [estimate] may be why]][[ (no copy of {bare} in it)]]",
+        "who drove, or got `runner.action` other states or times? Ingest it with --data",
+        hides=("log.start_doubt", "log.start_loose", "run.start"),
+    ),
+    "silent": Entry(
+        "refuse",
+        OF
+        + "{about} {about:is/are} 0 from the first step to the last, unlike in the plan of {ran}",
+        "were the commands recorded? If they were, pass `runner.action` the seconds since the run "
+        "began",
+    ),
+    "another": Entry(
+        "refuse",
+        OF + "did not run {ran}: its commands are those of {other}[[ to {theirs:%}, of {ran} only "
+        "to {mine:%}]]",
+        "was {ran} copied to the robot? Ingest it with --candidate {other}, or with --data",
+    ),
+    "earlier": Entry(
+        "refuse",
+        OF + "ran {ran}, which was made for an earlier task ({was}): its utility can't be compared",
+        "ingest it with --data; or change the task back",
+    ),
+    "bare": Entry(
+        "warn",
+        "its commands are like those of {ran}, but not the same, and it holds no copy of it",
+        "if another workspace's {ran} ran, `discard` it; to be sure, write trials with "
+        "TrialWriter(..., policy=Path(candidate).read_bytes())",
+    ),
+    "speeds": Entry(
+        "note",
+        "most of its commands are near those of {ran} on the {about} that [estimate] finds here; "
+        "its program used its own",
+        "to have them judged exactly, log and map those too",
+    ),
+    "late": Entry(
+        "warn",
+        "its commands are those of {ran} {steps:step} {side}: {what:log=the robot moved by them "
+        "before they were logged,either=its program sent them late or the log has them late,"
+        "start=shifted by that they fit better}",
+        "log each command when it is sent; if it is, [log.span] start is {steps:step} too "
+        "{side:late=early,early=late}",
+        hides=("run.samples", "run.older"),
+    ),
+    # stored before
+    "again": Entry(
+        "note",
+        "no candidate is waiting for a trial; its commands are those of {ran}, the best: it counts "
+        "as another run of it",
+    ),
+    "copy": Entry("note", "its rows are those of {about}: the same recording, or a part of it"),
+    "elsewhere": Entry(
+        "note", "the {about} that it ran is from another workspace, or was made again since"
+    ),
+    "before": Entry(
+        "note",
+        "it was stored before, as {about}, which is set aside: it is used as {ran} again",
+        "to change that, use --candidate ID",
+    ),
+    "not_used": Entry(
+        "note",
+        "it was stored before, as {about} ({ran}), which is set aside",
+        "if it ran another candidate, name that with --candidate ID",
+    ),
+    "aside": Entry(
+        "warn",
+        "{about} stays set aside and does not count: `restore {about}` undoes that",
+        "[[if you don't want that, run {waits} and record another log]]",
+        hides=(*RUN[:-1], "run.failed", "run.asked"),
+    ),
+    "repeats": Entry(
+        "warn",
+        "it repeats {about} to the last bit: {copy:True=other trials of one candidate differ and "
+        "it is probably a copy,False=the system is treated as deterministic and no candidate is "
+        "run a second time from now on}",
+    ),
+}

@@ -1,7 +1,227 @@
-"""Findings on what a run of a candidate shows."""
+"""Findings on what a run of a candidate shows: of the program, the robot, its start and its end."""
 
 from __future__ import annotations
 
 from grounded.findings.catalogue import Entry
 
-ENTRIES: dict[str, Entry] = {}
+OF = "[[{log}: ]]"  # the file, where the log is refused
+# of a run that its program spoilt, neither its end nor its motion says anything of the candidate
+OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.after*")
+OUTCOME += ("run.moved_on", "run.let_go", "run.swings", "run.samples", "run.start")
+
+ENTRIES: dict[str, Entry] = {
+    # the program
+    "passed": Entry(
+        "aside",
+        OF + "its commands are what {ran} sends if `runner.action` gets [[the time in {time}]]"
+        "[[{states} in {unit}]][[{states} times {times:.4g}]][[the states as {passed}]]",
+        "pass the seconds since the run began and the states as the model has them[[: {order}]], "
+        "and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "unfed": Entry(
+        "aside",
+        OF + "its commands are the feed-forward of {ran} alone, without its feedback",
+        "send what `runner.action(t, state)` returns, for a state that holds numbers only "
+        "(`runner.blind` counts the calls without), and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "other_states": Entry(
+        "aside",
+        OF + "its commands are near the feed-forward of {ran}, with feedback on states nearer to "
+        "its plan than those of the log: does the program read another message or estimate?",
+        "pass `runner.action` the signals that are logged, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "origin": Entry(
+        "aside",
+        OF + "its commands are what {ran} sends on states from another origin: {off} beside those "
+        "in the log",
+        "pass `runner.action` the states as they are logged, in one frame, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "clock": Entry(
+        "aside",
+        OF + "its first command is that of step {step} ({seconds:.3g} s) of {ran}, and the others "
+        "follow: its clock began before the run",
+        "pass `runner.action` the seconds since the run began, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "exchanged": Entry(
+        "aside",
+        OF + "{about} are exchanged on the robot, not in the log: [[it moved {moved}]][[{proven}, "
+        "read in the same way, show no exchange]][[; its commands are those of {ran}]]",
+        "put its {parts} back in their places[[, discard {trials}]] and run again",
+        hides=OUTCOME,
+    ),
+    "sends": Entry(
+        "refuse",
+        OF + "its program sends {about} times {times:.4g}: [[the robot moved {moved}]][[{proven}, "
+        "read in the same way, have it right]]",
+        "mend that and run {ran} again",
+    ),
+    "clipped": Entry(
+        "aside",
+        OF + "its commands are those of {ran} cut inside [limits] in {share:%} of the steps ({at})",
+        "if the robot takes no more, set [limits] to that and propose again; if it does, remove "
+        "the cut and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "smoothed": Entry(
+        "aside",
+        OF + "its commands are what {ran} sends on {states} smoothed by {share:.2g} of the last "
+        "value in each step, {lag:size} late, but the log has them as measured",
+        "pass `runner.action` what is logged, or log what it is passed, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "unsent": Entry(
+        "aside",
+        "its first {steps:step} sent nothing but what was held before the run, the others the "
+        "commands of {ran}",
+        "pass `runner.action` the seconds since the run began, not since the log did, and run "
+        "{ran} again",
+        hides=OUTCOME,
+    ),
+    "missed": Entry(
+        "warn",
+        "the first command in the log is that of step {steps} of {ran}: those before were not sent "
+        "or not logged[[, and {held} held until then]]",
+        "make the program send from step 0 on, and start recording before that",
+    ),
+    "skipped": Entry(
+        "aside",
+        "its commands change every {every:.3g} ms, dt is {dt:.3g} ms: {lost:%} of the steps of "
+        "{ran} were not run, or not logged",
+        "call the runner every {dt:.3g} ms, log every command and run {ran} again; or set [task] "
+        "dt to what the robot can",
+        hides=OUTCOME,
+    ),
+    "late": Entry(
+        "aside",
+        "its program sent the commands of {ran} {steps:step} late: the robot moved with them as "
+        "they are in the log, as in {others}",
+        "pass `runner.action` the latest states and the seconds since the run began, send what it "
+        "returns at once, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "older": Entry(
+        "aside",
+        "its commands are what {ran} sends on states that are {age:size} old, at the present time; "
+        "earlier runs acted on the newest",
+        "pass `runner.action` the newest sample, and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "ahead": Entry(
+        "aside",
+        "its commands are what {ran} sends on states {age:size} newer than those in the log; the "
+        "plan allows for {effects} already",
+        "let its program act on the samples as logged or, if only the log is late, set delay_s in "
+        "[log] in place of these effects; and run {ran} again",
+        hides=OUTCOME,
+    ),
+    "samples": Entry(
+        "note",
+        "its program acted on samples that were {age:size} old[[, {ran} was planned for "
+        "{planned:size}]]: {state} had moved on by {moved:size} (its error: {error:size} rms)",
+        "pass newer samples, or send each command when a sample arrives; the next candidates allow "
+        "for an age that stays",
+    ),
+    # the robot
+    "reversed": Entry(
+        "aside",
+        OF + "{about} acted the other way round[[: so the model predicts {state} {times:.2g} times "
+        "as well]][[, with -{share:%} of its modelled effect]][[, unlike in {others}]][[, as in "
+        "{alike}]]",
+        "is it wired the wrong way round, or its sign wrong in the model or the log[[ ({column} "
+        "reads another column now)]]? Then[[ `discard {trial}`,]] mend it and run again; "
+        "otherwise `propose` goes on",
+        hides=(*OUTCOME[1:-1], "log.limits"),
+    ),
+    "astray": Entry(
+        "aside",
+        "it [[missed its prediction by {missed:,.3g}]][[cost {cost:,.3g}]], {times:,.2g} times "
+        "what runs do otherwise[[ ({others})]]",
+        "did it run as it should? If not (a motor, a sensor, somebody in the way), `discard "
+        "{trial}` and run {ran} again; if it did, `propose` goes on",
+        hides=OUTCOME[2:-1],
+    ),
+    "early": Entry(
+        "aside",
+        "all states are known for {steps} of {horizon} steps only[[, {silent} not after that]]; "
+        "the robot was as near to its prediction there as before[[ ({ran} ran to the end in "
+        "{complete})]]: was the recording cut off, or the robot stopped?",
+        "`discard {trial}` and run {ran} again; if it crashed, `propose` goes on",
+        hides=OUTCOME[3:],
+    ),
+    "failed": Entry(
+        "warn",
+        "the run ended after {steps} of {horizon} steps: a failed candidate[[ ({silent} unknown "
+        "after that)]][[, though {complete} ran to the end]]",
+        "`discard {trial}` if you stopped it for another reason, or if only the recording was cut",
+    ),
+    "fell": Entry(
+        "warn",
+        OF + "{about} left [safety] {bound} at {at} (it was {was}, {predicted} was predicted), and "
+        "then the commands were no longer those of {ran}: a failed run, cut at {until}",
+        "if something disturbed it, `discard` it",
+        hides=("run.early", "run.failed", "run.safety"),
+    ),
+    "asked": Entry(
+        "aside",
+        "it did not run {ran} as it should, as `ingest` told",
+        "`discard {trial}`, unless it ran {ran}; then `propose` goes on",
+    ),
+    "swings": Entry(
+        "warn",
+        "its feedback made {inputs} swing about the plan[[ ({input}: {swings} swings of more than "
+        "{size})]][[, {irregular:True=at no one frequency}, as sensor noise does]][[, but not in "
+        "{calm}: did the program or the robot differ?]]",
+        "the next candidates get weaker feedback, or say if they can't",
+    ),
+    # its start
+    "start_spoils": Entry(
+        "aside",
+        "the run started with {state} = {began}, the task's start is {start}: {off} off, more than "
+        "its noise[[; by the model its whole start changes its utility by {change:+.3g}]]",
+        "`discard {trial}`, place the robot nearer and run {ran} again; if it can't be placed "
+        "nearer, `propose` goes on; if it always starts there, set it in [task] start",
+        hides=OUTCOME,
+    ),
+    "start": Entry(
+        "warn",
+        "the run started with {state} = {began}, the task's start is {start}: {off} off[[, as "
+        "those of {runs} other runs, off by {rms} (rms)]][[; by the model that changes its utility "
+        "by {change:+.3g}]]: the run counts[[, and is to be run once {again:True=more}]]",
+        "place the robot nearer to the start next time",
+    ),
+    "start_always": Entry(
+        "warn",
+        "the run started with {state} = {began}, {off} off the task's start, and so did {others}",
+        "if the robot always starts there, write {values} in [task] start and propose again: the "
+        "search begins again, all logs stay for fit and diagnose",
+    ),
+    # its end
+    "safety": Entry(
+        "warn",
+        "the run left [safety] {about} = {bound} at {at}: it came to {most}, where {predicted} was "
+        "predicted",
+    ),
+    "after_safety": Entry(
+        "warn",
+        "{after} after its end the robot left [safety] {about} = {bound}: it was {most}",
+        "stop it in time, or let the target end at rest inside",
+    ),
+    "moved_on": Entry(
+        "warn",
+        "{after} after the run {what} was {far:size} from its target, at its end {near:size}",
+        "to make the robot stay, let the target rest at its end (`target --hold`), and weigh the "
+        "rates there ([reward] terminal)",
+    ),
+    "let_go": Entry(
+        "warn",
+        "{after} after the run {what} was {far:size} from its target, at its end {near:size}: the "
+        "runner sends {held}, which does not hold it there[[ ({would} would)]]",
+        "hold it with another controller as soon as `runner.done(t)` is true",
+    ),
+    "note": Entry("note", "{text}"),
+}

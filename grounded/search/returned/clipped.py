@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import listed, number, percent
+from grounded.result import number
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import LEAST, Commanded, commanded
 from grounded.trial import Trial
@@ -39,17 +40,10 @@ class Clipped:
             low[j], high[j] = ends.get(-1, low[j]), ends.get(1, high[j])
         return low, high
 
-    def told(self, own: Candidate) -> str:
-        """Return what its commands are and the remedy, as the end of a sentence."""
-        each = [
-            f"{name} at {listed([number(v) for v in ends.values()])}"
-            for name, ends in self.cuts.items()
-        ]
-        return (
-            f"those of {own.id} cut inside [limits] in {percent(self.share)} of the steps "
-            f"({'; '.join(each)}), and the log has them as cut. If the robot takes no more, set "
-            "[limits] to that and propose again; if it does, remove the cut"
-        )
+    def finding(self, own: Candidate) -> Finding:
+        """Return that its commands are those of a candidate, cut inside their limits."""
+        at = tuple(f"{n} = {number(v)}" for n, ends in self.cuts.items() for v in ends.values())
+        return found("run.clipped", *self.cuts, ran=own.id, share=self.share, at=at)
 
 
 def clipped(own: Candidate, trial: Trial) -> Clipped | None:

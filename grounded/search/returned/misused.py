@@ -15,10 +15,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from grounded.accounts.table import unit_named
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import multiplied
 from grounded.search.returned.other_scale import CENTI, NEARLY, units_tried
@@ -38,16 +38,7 @@ SAME = 2.0  # ratio of the differences left by two misuses that explain a log eq
 LEAVES = 0.25  # largest share of the original difference that a misuse may leave
 TELLS = 0.1  # smallest difference of two commands, relative to their size, that tells them apart
 NEARER, NEARLY_ALL = 0.5, 0.95  # a misuse must be so much nearer in that share of these steps
-WITHOUT = (
-    "without its feedback: send what `runner.action(t, state)` returns, not "
-    "`runner.policy.feedforward`, for a state that holds numbers only (`runner.blind` counts the "
-    "calls without), and for the states that the log has"
-)
 BESIDE = 0.95  # share of a run's commands that are the feed-forward's of that step or a neighbour
-ELSEWHERE = (
-    "with feedback on states that lie nearer to its plan than those of the log: does the program "
-    "read another message, estimate or frame? Pass `runner.action` the signals that are logged"
-)
 DIGITS = 1e-4  # largest difference of commands, relative to their size, that rounding makes
 Found = TypeVar("Found", bound=tuple[Any, ...])
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
@@ -58,7 +49,7 @@ class Way:
     """One way in which a program may misuse a candidate."""
 
     policy: Policy  # as it acts on what the program passes
-    said: str  # what that means, and the remedy
+    finding: Finding
     names: tuple[str, ...] = ()  # states that are passed multiplied, or in another's place
     factor: float = 1.0
     order: tuple[str, ...] = ()  # all states, as they are passed; () if in the right order
@@ -69,11 +60,6 @@ class Way:
             return multiplied(trial, self.names, self.factor) if self.names else trial
         order = [trial.state_names.index(name) for name in self.order]
         return replace(trial, states=trial.states[:, order])
-
-    @property
-    def changed(self) -> int:
-        """The number of states that it changes."""
-        return len(self.names)
 
 
 def misused(
@@ -91,7 +77,7 @@ def misused(
     Returns:
         What is left of the commands, relative to their size, and the way that leaves it.
     """
-    late, most, found = latest(task), min(LEAVES * plain.error, NEARLY), []
+    late, most, some = latest(task), min(LEAVES * plain.error, NEARLY), list[tuple[float, Way]]()
     held = np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
     over, moved = bool(held.all()) and not acts, np.abs(trial.inputs - own.policy.past).max(axis=0)
     for way in ways(task.model, own, unsent=bool(held[0]), over=over):
@@ -100,10 +86,10 @@ def misused(
             continue
         if evidence(plain, fit) > DECISIVE and _tells(plain, fit):
             if way.policy.gain is None and own.policy.gain is not None and not _beside(trial, fit):
-                way = replace(way, said=f"they are near the feed-forward of {own.id}, {ELSEWHERE}")
-            found.append((error, way))
-    least = min((error for error, _ in found), default=0.0)
-    near = [(error, way) for error, way in found if error <= SAME * least + FINE]
+                way = replace(way, finding=found("run.other_states", ran=own.id))
+            some.append((error, way))
+    least = min((error for error, _ in some), default=0.0)
+    near = [(error, way) for error, way in some if error <= SAME * least + FINE]
     return likeliest(near) if near else None
 
 
@@ -126,12 +112,12 @@ def without_feedback(own: Candidate, trial: Trial, ran: Following) -> bool:
     return bool(alone.max(initial=0.0) < DIGITS and apart > 10 * DIGITS)
 
 
-def likeliest(found: Sequence[Found]) -> Found:
+def likeliest(some: Sequence[Found]) -> Found:
     """Return the likeliest of (what is left of the commands, the way that leaves it, ...).
 
     At the limits one state may explain as much as all, but a program passes all in one unit.
     """
-    return min(found, key=lambda one: (-one[1].changed, one[0]))
+    return min(some, key=lambda one: (-len(one[1].names), one[0]))
 
 
 def _share(fit: Following, moved: Array) -> float:
@@ -177,61 +163,28 @@ def ways(model: Model, own: Candidate, *, unsent: bool, over: bool = False) -> I
         unsent: whether the first command is the one held before the run, so that none was sent.
         over: whether all are.
     """
-    policy, name = own.policy, own.id
+    policy, right, ran = own.policy, model.state_names, own.id
     for unit, factor in TIMES.items():
         if factor < 1 or not unsent:
-            yield Way(
-                _at_times(policy, factor),
-                f"they are what {name} sends if the time is passed to `runner.action` in {unit}: "
-                "pass t in seconds since the start of the run",
-            )
+            yield Way(_at_times(policy, factor), found("run.passed", ran=ran, time=unit))
     if over:
-        yield Way(
-            _at_times(policy, np.inf),
-            f"all are the {_held(model, policy)} that {name} sends once its time is past the end: "
-            "pass `runner.action` the seconds since the start of the run, not those of a clock",
-        )
-    yield Way(
-        _at_times(policy, 0.0),
-        f"they are what {name} sends if the time stays at 0: pass `runner.action` the seconds "
-        "since the start of the run",
-    )
+        yield Way(_at_times(policy, np.inf), found("run.passed", ran=ran, time="a clock"))
+    yield Way(_at_times(policy, 0.0), found("run.passed", ran=ran, time="no unit: it stays 0"))
     if policy.gain is None:
         return
-    yield Way(
-        replace(policy, gain=None, reference=None),
-        f"they are the feed-forward of {name} alone, {WITHOUT}",
-    )
-    tried = set[tuple[tuple[str, ...], float]]()
+    yield Way(replace(policy, gain=None, reference=None), found("run.unfed", ran=ran))
     tries = [*units_tried(model)]  # of logs: none is in hundreds of metres, but programs use cm
     tries += [(group, 1 / factor) for group, factor in tries if factor == CENTI]
-    for group, factor in tries:
-        if (names := tuple(group), factor) in tried or not {*names} <= {*model.state_names}:
-            continue
-        tried.add((names, factor))
-        units = " and ".join(dict.fromkeys(model.states[one] for one in names))
-        if factor == -1.0:
-            units = f"{'it' if len(names) == 1 else 'them'} with the sign that the log has"
-        yield Way(
-            policy,
-            f"they are what {name} sends if {listed(list(names))} "
-            f"{'is' if len(names) == 1 else 'are'} passed to `runner.action` "
-            f"{_unit(model, names, factor)}: pass {units}",
-            names,
-            factor,
-        )
-    right = model.state_names
+    for group, factor in dict.fromkeys((tuple(group), factor) for group, factor in tries):
+        if {*group} <= {*right}:
+            unit = unit_named((model.states[one] for one in group), factor)
+            how: dict[str, Any] = {"unit": unit} if unit else {"times": factor}
+            passed = found("run.passed", ran=ran, states=group, order=right, **how)
+            yield Way(policy, passed, group, factor)
     for order in _orders(right):
         moved = tuple(was for was, now in zip(right, order, strict=True) if was != now)
-        passed = f"the states are passed to `runner.action` in the order {', '.join(order)}"
-        if len(moved) == 2:
-            passed = f"{listed(moved)} are passed to `runner.action` in each other's place"
-        yield Way(
-            policy,
-            f"they are what {name} sends if {passed}: pass them in the order {', '.join(right)}",
-            moved,
-            order=order,
-        )
+        passed = found("run.passed", ran=ran, passed=order, order=right)
+        yield Way(policy, passed, moved, order=order)
 
 
 def _orders(right: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
@@ -239,28 +192,15 @@ def _orders(right: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
 
     A program has positions before velocities where the model has them after, for example.
     """
-    found = {right}
+    known = {right}
     pairs = combinations(range(len(right)), 2)
     orders = [tuple({i: j, j: i}.get(k, k) for k in range(len(right))) for i, j in pairs]
     named = [tuple(right[k] for k in order) for order in orders]
     named += [right[k:] + right[:k] for k in range(1, len(right))]
     for order in (*named, tuple(sorted(right))):
-        if order not in found:
-            found.add(order)
+        if order not in known:
+            known.add(order)
             yield order
-
-
-def _unit(model: Model, names: Sequence[str], factor: float) -> str:
-    """Return `in degrees`, or by which number they were multiplied."""
-    if factor == -1.0:
-        return "with the opposite sign"
-    unit = unit_named((model.states[one] for one in names), factor)
-    return f"in {unit}" if unit else f"times {factor:.4g}"
-
-
-def _held(model: Model, policy: Policy) -> str:
-    pairs = zip(model.inputs.items(), policy.past + 0.0, strict=True)
-    return listed([with_unit(f"{name} = {value:.3g}", unit) for (name, unit), value in pairs])
 
 
 def _at_times(policy: Policy, factor: float) -> Policy:

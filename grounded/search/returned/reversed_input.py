@@ -9,12 +9,11 @@ run badly with either sign: then what its inputs do beside its friction tells, s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from grounded.accounts.commands import Acts, how_inputs_act
 from grounded.accounts.motion import Ahead
+from grounded.findings import Finding, found
 from grounded.search.planner import Planner
 from grounded.search.returned.as_predicted import multiplied
 from grounded.trial import Trial
@@ -23,23 +22,9 @@ STARTS = 120  # samples to predict from
 CLEAR = 2.0  # [nats] by which the flipped sign must lower the errors
 MUCH = 0.3  # the error of at least one state must fall to this share
 PLAIN = 0.5  # and to this share of how far the state moves: else the model explains neither
-TURNED = "acted the other way round"
 
 
-@dataclass(frozen=True)
-class Reversed:
-    """An input that acted the other way round.
-
-    Args:
-        input: its name.
-        said: that it did, and what shows it: one clause.
-    """
-
-    input: str
-    said: str
-
-
-def reversed_input(planner: Planner, trial: Trial) -> Reversed | None:
+def reversed_input(planner: Planner, trial: Trial) -> Finding | None:
     """Return the input that acted the other way round in a run, or None.
 
     Args:
@@ -54,7 +39,7 @@ def reversed_input(planner: Planner, trial: Trial) -> Reversed | None:
     moved = model.difference(as_it_is.last, as_it_is.first)[:, :own]
     far = np.sqrt((moved**2).mean(axis=0))
     with np.errstate(all="ignore"):
-        before, found = as_it_is.plain(gains), None
+        before, turned = as_it_is.plain(gains), None
         least = before.score - CLEAR
         for name in known.input_names:
             after = _ahead(planner, multiplied(known, [name], -1.0)).plain(gains)
@@ -62,16 +47,13 @@ def reversed_input(planner: Planner, trial: Trial) -> Reversed | None:
             shares[after.rms[:own] > PLAIN * far] = 1.0
             i = int(np.argmin(shares))
             if after.score < least and shares[i] < MUCH:
-                state, times = planner.task.model.state_names[i], 1 / shares[i]
-                said = (
-                    f"with its sign flipped, the model predicts {state} {times:.2g} times as well"
-                )
-                found = Reversed(name, f"{name} {TURNED}: {said}")
+                state = planner.task.model.state_names[i]
+                turned = found("run.reversed", name, state=state, times=1 / shares[i])
                 least = after.score
-    return found or beside_friction(planner, known)
+    return turned or beside_friction(planner, known)
 
 
-def beside_friction(planner: Planner, trial: Trial) -> Reversed | None:
+def beside_friction(planner: Planner, trial: Trial) -> Finding | None:
     """Return the input that acted the other way round by all that is not linear in the states.
 
     Args:
@@ -83,8 +65,7 @@ def beside_friction(planner: Planner, trial: Trial) -> Reversed | None:
     if not wrong:
         return None
     name = min(wrong, key=lambda one: abs(wrong[one].share + 1))
-    share = f"{-100 * wrong[name].share:.0f} %"
-    return Reversed(name, f"{name} {TURNED}, with {share} of its modelled effect")
+    return found("run.reversed", name, share=-wrong[name].share)
 
 
 def signs_of(planner: Planner, trial: Trial) -> dict[str, int]:

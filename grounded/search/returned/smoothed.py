@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import velocities
 from grounded.policy import Policy
-from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import LEAST, states_ago
 from grounded.trial import Trial
@@ -37,14 +37,10 @@ class Smoothed:
     lag_s: float  # by which a steady motion is seen late [s]
     left: float  # rms difference of the commands on these, relative to their size
 
-    def told(self, own: Candidate) -> str:
-        """Return what its commands are and the remedy, as the end of a sentence."""
-        return (
-            f"what {own.id} sends on {listed(list(self.names))} smoothed by "
-            f"{self.share:.2g} of the last value and {1 - self.share:.2g} of the new one in each "
-            f"step, which is {float(f'{1e3 * self.lag_s:.2g}'):g} ms late, but the log has them "
-            "as measured. Pass `runner.action` what is logged, or log what it is passed"
-        )
+    def finding(self, own: Candidate) -> Finding:
+        """Return that its commands are those of a candidate on smoothed states."""
+        lag = Quantity(self.lag_s, "s")
+        return found("run.smoothed", ran=own.id, states=self.names, share=self.share, lag=lag)
 
 
 def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:

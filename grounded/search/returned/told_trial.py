@@ -11,18 +11,16 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials, in_the_log
+from grounded.accounts.reported import scaled
 from grounded.accounts.sound_trials import sound_trials
-from grounded.errors import GroundedError
+from grounded.findings import found
 from grounded.model import Model
-from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import odd_columns
 from grounded.search.returned.other_scale import other_units, unit_by_factor, units_tried
 from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-
-BEYOND = 0.1  # mean excess of an input over its limits, in ranges, that is reported as such
 
 
 def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool) -> str:
@@ -34,29 +32,22 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
         trial: the trial as it was told.
         first: whether its columns are also checked against each other and the model.
     """
-    whole = interpolate_gaps(trial).trial
+    whole, model = interpolate_gaps(trial).trial, task.model
     own = next(one for one in candidates if one.id == trial.candidate)
     if whole.finite_steps < 1 and (unknown := _unknown(trial)):
-        return f"{listed(unknown)} {'is' if len(unknown) == 1 else 'are'} NaN from the start"
+        return found("log.unknown", *unknown).what
     seen = suspicion(task, whole, own, candidates)
     names, by = ((), 1.0) if seen.other else other_units(task, whole, own, seen.ran)
-    if unit := unit_by_factor(task.model, names, by):  # the columns may agree with each other
-        ours = {**task.model.states, **task.model.inputs}
-        units = " and ".join(dict.fromkeys(ours[name] for name in names))
-        return (
-            f"{listed(names)} {'is' if len(names) == 1 else 'are'} in {unit}, not in {units}: "
-            f"times {by:.4g}, its commands are those of {own.id}"
-        )
-    columns = _odd_columns(task.model, whole) if first else ""
+    if unit := unit_by_factor(model, names, by):  # the columns may agree with each other
+        return scaled(model, names, 1 / by, unit).also(ran=own.id).what
+    columns = _odd_columns(model, whole) if first else ""
     if not columns and not names and not seen.why:
-        names, by = odd_columns(task.model, own, whole, list(units_tried(task.model)))
-        if names:
-            return f"only with {listed(names)} times {by:.4g} is it like what {own.id} was to do"
+        odd, by = odd_columns(model, own, whole, list(units_tried(model)))
+        if odd:
+            return scaled(model, odd, 1 / by).what
     if columns or not seen.why:
         return columns
-    if names:
-        return f"only with {listed(names)} times {by:.4g} are its commands those of {own.id}"
-    return _beyond_limits(task, whole, own) or seen.why
+    return (scaled(model, names, 1 / by).also(ran=own.id) if names else seen.why).what
 
 
 def crashed(task: Task, trial: Trial) -> str:
@@ -85,21 +76,5 @@ def _odd_columns(model: Model, trial: Trial) -> str:
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except UnusableTrials as error:
-        return error.in_program
-    except GroundedError as error:
-        return str(error).rstrip(".")
+        return str(error.finding.what)
     return "; ".join(f"{one.signal} {one.finding}" for one in in_the_log(looked.findings))
-
-
-def _beyond_limits(task: Task, trial: Trial, own: Candidate) -> str:
-    """Return which input is far outside its limits, which a policy's never is; or ""."""
-    inputs = trial.inputs[: task.horizon]
-    for name, sent, low, high in zip(trial.input_names, inputs.T, task.low, task.high, strict=True):
-        beyond = np.abs(sent - np.clip(sent, low, high)).mean()
-        if np.isfinite(high - low) and beyond > BEYOND * (high - low):
-            most = with_unit(f"{sent.max() + 0:.4g}", task.model.inputs[name])
-            return (
-                f"{name} is {sent.min() + 0:.4g} to {most}, outside its "
-                f"limits, {low:g} to {high:g}: it is not what {own.id} sends"
-            )
-    return ""

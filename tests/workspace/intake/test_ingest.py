@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding, holds
+from facts import holding, holds, of_code
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
@@ -93,8 +93,8 @@ def test_a_start_within_the_noise_of_its_sensor_is_no_warning(w, tmp_path, sigma
     states[:, 0] += np.random.default_rng(1).normal(0, 1, len(states)) * sigma
     states[0, 0] = 0.2  # of a range of 1: two standard deviations, or a wrong start
     write_trial(tmp_path / "t.mcap", replace(ran, states=states), {"kind": "trial"})
-    warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-    assert any("started with x = 0.2" in one for one in warnings) is told
+    found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    assert bool(of_code(found, "run.start*")) is told
 
 
 def test_a_start_is_far_off_by_what_it_costs(tmp_path):
@@ -111,8 +111,8 @@ def test_a_start_is_far_off_by_what_it_costs(tmp_path):
         moved[0] += off * states
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-        told = [one for one in found.warnings if "the run started with" in one]
-        assert [one.split()[4] for one in told] == ["x"] * states[0]
+        told = of_code(found, "run.start*")
+        assert [one.about for one in told] == [("x",)] * states[0]
         set_aside(w, "discard", [found.trial], "")  # or it says how starts scatter
         w.forget()
 
@@ -126,10 +126,9 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
         moved = np.array(ran.states)
         moved[0, 0] += off * a_step
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-        told.append([one for one in warnings if "the run started with" in one])
-    assert [len(one) for one in told] == [1, 1, 0, 0, 1]
-    assert "no need to repeat it" in told[0][0] and "`discard t0005`" in told[-1][0]
+        told.append(of_code(ingest_log(w, tmp_path / "t.mcap", "c0001"), "run.start*"))
+    codes = [[one.code for one in some] for some in told]
+    assert codes == [["run.start"], ["run.start"], [], [], ["run.start_spoils"]]
 
 
 @pytest.mark.parametrize(
@@ -153,10 +152,10 @@ def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
         if off == 0.6:  # as if the model were unstable
             monkeypatch.setattr(initial_state, "_changes", lambda *_: -part * cost)
             monkeypatch.setattr(initial_state, "_lost_by", lambda *_: lost * cost)
-        warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
-    assert not any("`discard t0003`" in one for one in warnings)
-    counts = [one for one in warnings if "starts of 2 other runs are off by" in one]
-    assert len(counts) == told and all("the run counts" in one for one in counts)
+        found = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    assert not of_code(found, "run.start_spoils")
+    counts = of_code(found, "run.start")
+    assert [one.facts.get("runs") for one in counts if "runs" in one.facts] == [2] * told
 
 
 def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
@@ -168,9 +167,8 @@ def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
     write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
     monkeypatch.setattr(initial_state, "_changes", lambda *a: -0.6 * cost * bool(a[2][0]))
     found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    (told,) = [one for one in found.warnings if "the run started with" in one]
-    assert holds(told, "x = ", "v = ", "By the model x changes", "`discard t0001`")
-    assert "counts" not in told
+    (told,) = of_code(found, "run.start*")
+    assert (told.code, told.about) == ("run.start_spoils", ("x", "v"))
 
 
 def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later(w, tmp_path):
@@ -181,10 +179,8 @@ def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later
         moved = np.array(ran.states) + 1e-6 * k
         moved[0, 1] += off * np.ptp(moved[:, 1])  # a state without weight
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-        told += [ingest_log(w, tmp_path / "t.mcap", "c0001").warnings]
-    later = "after 3 runs, a start is compared with where the others began"
-    assert [any(later in one for one in warnings) for warnings in told] == [True, True, False]
-    assert not any("started with" in one for one in told[2])
+        told += [of_code(ingest_log(w, tmp_path / "t.mcap", "c0001"), "run.start*")]
+    assert [[one.facts["unknown"] for one in some] for some in told] == [[True], [True], []]
 
 
 @pytest.mark.parametrize(("scatter", "again"), [(0.001, True), (0.2, False)])
@@ -203,8 +199,8 @@ def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
         moved[1:, 0] += scatter * off * a_step
         write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
         found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    (told,) = [one for one in found.warnings if "the run started with" in one]
-    assert ("`discard t0003`" in told) is again and ("counts" in told) is not again
+    (told,) = of_code(found, "run.start*")
+    assert (told.code == "run.start_spoils") is again
 
 
 @pytest.mark.parametrize("data", [False, True])
@@ -286,7 +282,7 @@ def test_a_recovered_trial_of_a_dead_robot_is_a_failed_candidate(w, tmp_path):
     assert done.code == 0, done.err
     (trial,) = done.json["trials"]
     assert trial["failed"] and trial["candidate"] == "c0001"
-    assert any("ended after" in warning for warning in trial["warnings"])
+    assert "run.failed" in [one["code"] for one in trial["findings"]]
 
 
 def test_a_live_trial_is_the_trial_that_was_driven(w, tmp_path):
@@ -308,7 +304,7 @@ def test_gaps_are_stored_as_they_are_and_bridged_when_read(w, tmp_path):
     trial = plain(states=states, candidate=made.id)
     write_trial(tmp_path / "t.mcap", trial, {"kind": "trial"})
     found = ingest_log(w, tmp_path / "t.mcap", made.id)
-    assert any("6 lost samples" in text for text in found.warnings) and np.isfinite(found.utility)
+    assert of_code(found, "log.gaps")[0].facts["samples"] == 6 and np.isfinite(found.utility)
     assert np.isnan(read_trial(w.store.list()[0].path)[0].states).sum() == 6
     assert np.isfinite(w.trials()[0].trial.states).all()
 
@@ -338,8 +334,8 @@ def test_data_are_taken_from_where_a_step_of_their_commands_begins(w, tmp_path):
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
     text = (w.folder / "grounded.toml").read_text() + LOG_OF_A_TABLE
     (w.folder / "grounded.toml").write_text(text)
-    done = grounded("-C", w.folder, "ingest", "--data", tmp_path / "log.csv")
-    assert done.code == 0 and "0.030 s" in done.err, done.err
+    ingest_log(w, tmp_path / "log.csv", data=True)
+    assert w.trials()[0].meta["start_ns"] == str(round(0.03e9))
     assert w.store.list()
     (kept,) = Folder(w.folder).whole_trials()
     np.testing.assert_allclose(kept.trial.inputs[:70, 0], np.sin(np.arange(70)), atol=1e-5)
@@ -452,7 +448,7 @@ def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
         assert not any("held" in one for one in told)
 
 
-@pytest.mark.parametrize("judge", ["warnings_about", "standing_in"])
+@pytest.mark.parametrize("judge", ["checked", "standing_in"])
 def test_what_can_t_be_judged_is_not_stored(w, tmp_path, monkeypatch, judge):
     """A model that failed on a log left it stored, and every later command failed with it."""
     first, second = run(w), tmp_path / "second.mcap"

@@ -77,7 +77,7 @@ def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.remarks.log_faults import log_faults
+    from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
@@ -85,7 +85,7 @@ def _instead(workspace: Folder, name: str) -> NextCommand | None:
         return None
     if "source" in meta and (
         read_otherwise(meta, workspace.log_mapping)
-        or any(one.mend for one in log_faults(workspace, interpolate_gaps(trial).trial))
+        or any(one.code in COLUMNS for one in log_faults(workspace, interpolate_gaps(trial).trial))
     ):
         own = standing_in(workspace).outstanding if trial.candidate else None
         waits = own is not None and own.id == trial.candidate

@@ -108,7 +108,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     states, inputs = assigned(report, model.states, model.inputs, model, joints)
     table = mapping_toml(states, inputs, simulated=report.simulated)
     mapping = workspace.log_mapping
-    odd = tuple(f"{name} {said}" for name, said in no_angles(model, mapping).items())
+    odd = tuple(one.sentence for one in no_angles(model, mapping))
     odd += tuple(one.sentence for one in perhaps_degrees(states, model, joints).values())
     known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
     mapped = {*model.states, *model.inputs} <= known

@@ -39,7 +39,7 @@ def where_to_mend(
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
         strange = no_angles(workspace.base_model, workspace.log_mapping)
-        odd = [Finding(name, said, "mismatch") for name, said in strange.items()]
+        odd = [Finding(one.about[0], one.clause, "mismatch") for one in strange]
         findings = (*odd, *findings)
         whole = (replace(one, log=_whole(one, read[-1])) for one in findings)
         return tuple(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import of_code
 from grounded.errors import GroundedError
 from grounded.plant import Plant
 from grounded.trial import Trial
@@ -56,10 +56,10 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
     done = w.next(tmp_path / "t.mcap")
     assert (done.proposed, done.exported, done.to_json()["propose"]) == (None, None, None)
     assert (done.taken.then.verb, done.taken.then.arguments) == ("discard", ("t0002",))
-    told = done.taken.warnings[0]
-    assert holds(told, "force", "the other way round", "`discard t0002`", "c0002", "`propose`")
+    (told,) = of_code(done.taken, "run.reversed")
+    assert told.about == ("force",) and told.facts["trial"] == "t0002"
     now = w.status()
-    assert now.then == done.taken.then and now.notes[0] == f"t0002: {told}"
+    assert now.then == done.taken.then and now.notes[0] == f"t0002: {told.sentence}"
     w.discard("t0002")
     assert w.status().then.verb != "discard"
     assert w.propose().candidate.id == "c0002"
@@ -97,8 +97,8 @@ def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w)
     file = run(w, "a.force + 80.0")
     out = grounded("-C", w.folder, "next", file).out
     done = w.ingest(file)
-    assert any(holds(one, "did it run as it should", "`discard t0002`") for one in done.warnings)
-    assert not any("other way round" in one for one in done.warnings)
+    assert of_code(done, "run.astray")[0].facts["trial"] == "t0002"
+    assert not of_code(done, "run.reversed")
     assert done.then.verb == "discard"
     said = out.partition("next:")[2].replace("\\", "").split()
     assert said[-2:] == ["discard", "t0002"] and "Run c0" not in out
@@ -109,9 +109,9 @@ def test_a_run_that_cost_ten_times_what_its_candidate_s_others_did_is_asked_abou
     """-49 beside -1.8 and -2.1 of the same candidate: it was no longer the best, and on it went."""
     w.ingest(run(w, "a.force"))
     found = w.ingest(run(w, force), candidate="c0002")
-    told = [one for one in found.warnings if "times as much as the other run of c0002" in one]
+    told = of_code(found, "run.astray")
     assert bool(told) == asked == (found.then.verb == "discard")
-    assert all(holds(one, "(t0002)", "did it run as it should", "`discard t0003`") for one in told)
+    assert all(one.facts["others"] == ("t0002",) for one in told)
     assert (w.status().then.verb == "discard") == asked
 
 
@@ -119,7 +119,7 @@ def test_a_run_that_cost_ten_times_what_its_candidate_s_others_did_is_asked_abou
 def test_a_run_of_a_robot_that_the_model_knows_little_of_is_not(w, force):
     found = w.ingest(run(w, force))
     assert found.then.verb == "propose"
-    assert not any("discard" in one for one in found.warnings)
+    assert not [one for one in found.findings if one.weight == "aside"]
 
 
 @pytest.mark.parametrize(("off", "again"), [(0.6, True), (0.02, False)])
@@ -131,9 +131,8 @@ def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
     write_trial(file, replace(trial, candidate="c0002"), {"kind": "trial", "task": w.task.hash})
     out = grounded("-C", w.folder, "next", file).out
     found = w.ingest(file)
-    told = [one for one in found.warnings if f"started with x = {off}" in one]
-    assert len(told) == 1 and ("`discard t0002`" in told[0]) is again
-    assert ("the run counts" in told[0].lower()) is not again
+    (told,) = of_code(found, "run.start*")
+    assert told.code == ("run.start_spoils" if again else "run.start")
     assert (found.then.verb == "discard") is again
     assert ("bad luck" in out or "Run c0" in out) is not again
 
@@ -152,8 +151,7 @@ def test_the_start_of_a_run_that_left_safety_is_judged_by_what_came_before(w):
     fallen = replace(trial, states=states, inputs=sent, candidate="c0002")
     write_trial(file, fallen, {"kind": "trial", "task": w.task.hash})
     found = w.ingest(file)
-    told = [one for one in found.warnings if "started with x = 0.6" in one]
-    assert len(told) == 1 and "`discard t0002`" in told[0] and found.then.verb == "discard"
+    assert of_code(found, "run.start_spoils") and found.then.verb == "discard"
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])
@@ -169,9 +167,9 @@ def test_a_loop_slower_than_dt_is_told(w, every):
     write_trial(file, held, {"kind": "trial", "task": w.task.hash})
     found = w.ingest(file)
     dt = 1e3 * policy.dt
-    told = [one for one in found.warnings if f"dt is {dt:g} ms" in one]
+    told = of_code(found, "run.skipped")
     assert len(told) == (every > 1) == (found.then.verb == "discard")
-    assert all(holds(one, f"every {every * dt:g} ms", "c0002", "[task] dt") for one in told)
+    assert all(one.facts["every"] == pytest.approx(every * dt) for one in told)
 
 
 def by_hand(w, wired, drag=3.0):
@@ -195,8 +193,8 @@ def by_hand(w, wired, drag=3.0):
 def test_a_log_that_contradicts_the_model_is_told_and_the_next_contradicts_it(tmp_path):
     w = Workspace(make(tmp_path / "w").folder)
     first = by_hand(w, -1.0)
-    assert holds(first.warnings[0], "force", "the other way round", "in the model", "`diagnose`")
+    assert [(one.code, one.about) for one in first.findings] == [("run.reversed", ("force",))]
     assert first.then.verb == "diagnose"
     by_hand(w, 1.0)
-    with pytest.raises(GroundedError, match="trial t0001"):
+    with pytest.raises(GroundedError, match="t0001"):
         w.diagnose()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import holds, of_code
 from grounded.accounts.inputs import beyond_limits
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
@@ -14,7 +14,6 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates import at_rest
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.after_run import _to_stay
 from grounded_trials.workspace.where_to_mend import where_to_mend
 from recorded import LOGGED, record, waiting
 from workspaces import CONFIG, MODEL, make
@@ -38,10 +37,9 @@ def w(tmp_path):
 @pytest.mark.parametrize("most, said", [(2.15, True), (1.17, False), (1.175, False)])
 def test_data_beyond_the_limits_are_told_how_far(w, tmp_path, most, said):
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
-    found = w.ingest(tmp_path / "d.mcap", data=True).warnings
-    told = [one for one in found if "[limits]" in one]
-    assert len(told) == said
-    assert all(holds(one, "force", f"{most:.4g}", "0 to 1.17 N", "widen") for one in told)
+    told = of_code(w.ingest(tmp_path / "d.mcap", data=True), "log.limits")
+    assert [(one.about, one.facts["how"]) for one in told] == [(("force",), "widen")] * said
+    assert all(holds(one.sentence, "force", f"{most:.4g}", "0 to 1.17 N") for one in told)
 
 
 def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
@@ -149,11 +147,9 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
     states = np.column_stack([theta, np.full(len(T), np.nan)])
     trial = Trial(states, np.sin(T[:-1])[:, None], w.task.dt, *names)
     write_trial(tmp_path / "d.mcap", trial, {"kind": "data"})
-    found = [one for one in w.ingest(tmp_path / "d.mcap", data=True).warnings if "degrees" in one]
-    assert len(found) == said
-    assert all(
-        holds(one, "program that writes the trials", "write rad", "`discard ") for one in found
-    )
+    told = of_code(w.ingest(tmp_path / "d.mcap", data=True), "log.unit")
+    assert [one.about for one in told] == [("theta",)] * said
+    assert all(one.facts["writes"] == ("rad",) and one.facts["trials"] for one in told)
 
 
 def driven_on(w, folder):
@@ -172,9 +168,8 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
     end = table[beyond <= 0, 1][-1]
     table[beyond > 0, 1] = end + rolls * beyond[beyond > 0]
     np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
-    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after the run" in one]
-    assert len(told) == (rolls > 0)
-    assert not told or holds(told[0], " mm from its target", "--hold")
+    told = of_code(Workspace(w.folder).ingest(file), "run.moved_on")
+    assert [one.facts["far"].unit for one in told] == ["m"] * (rolls > 0)
 
 
 def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_farther(tmp_path):
@@ -190,11 +185,11 @@ def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_fa
         table[beyond > 0, 1] = end + speed * beyond[beyond > 0]
         table[:, 1] += 1e-6 * k
         np.savetxt(again, table, "%.7f", ",", header="t,x,v,force", comments="")
-        said = Workspace(w.folder).ingest(again, candidate="c0002").warnings
-        told.append(any("after the run" in one for one in said))
+        said = Workspace(w.folder).ingest(again, candidate="c0002")
+        told.append(bool(of_code(said, "run.moved_on", "run.let_go")))
     assert told == [True, False, True]
-    same = Workspace(w.folder).ingest(tmp_path / "again0.csv").warnings
-    assert any("after the run" in one for one in same)  # of the log that it was told of
+    same = Workspace(w.folder).ingest(tmp_path / "again0.csv")
+    assert of_code(same, "run.moved_on", "run.let_go")  # of the log that it was told of
 
 
 @pytest.mark.parametrize(("knows", "holds_it"), [(True, True), (False, True), (True, False)])
@@ -216,14 +211,9 @@ def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, k
         np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
     if not holds_it:
         monkeypatch.setattr(at_rest, "resting", lambda *_: None)
-    (told,) = (
-        one for one in Workspace(made.folder).ingest(file).warnings if "after the run" in one
-    )
-    assert holds(told, "force = 0 N", "runner.done(t)")
-    assert ("[task] start" in told) is holds_it
-    assert ("no constant input holds all" in told) is not holds_it
-    assert ("force = 1.5 N would" in told) is (knows and holds_it)
-    assert "terminal" not in told and "--hold" not in told
+    (told,) = of_code(Workspace(made.folder).ingest(file), "run.let_go")
+    assert told.facts["held"] == ("force = 0 N",)
+    assert (told.facts["would"] == ("force = 1.5 N",)) is (knows and holds_it)
 
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])
@@ -237,25 +227,8 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
     config = w.folder / "grounded.toml"
     config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
-    told = [one for one in Workspace(w.folder).ingest(file).warnings if "after its end" in one]
-    assert len(told) == (rolls > 0)
-    assert not told or holds(told[0], "[safety] x = [-9,", "m.")
-
-
-@pytest.mark.parametrize("rests", [False, True])
-@pytest.mark.parametrize("weighed", [False, True])
-def test_what_a_task_has_already_is_not_advised(tmp_path, rests, weighed):
-    """`--hold` and terminal weights were advised to a task with both."""
-    task = make(tmp_path / "w").task
-    target = np.zeros_like(task.target)  # both states are given
-    target[:, 0] = np.linspace(0, 1, len(target))
-    if rests:
-        target[-len(target) // 4 :, 0] = 1.0
-    reward = replace(task.reward, terminal=np.array([1.0, float(weighed)]))
-    said = _to_stay(replace(task, target=target, reward=reward), [0])
-    assert ("let the target rest at its end" in said) == (not rests)
-    assert ("[reward] terminal" in said) == (not weighed)
-    assert ("for longer" in said) == (rests and weighed)
+    told = of_code(Workspace(w.folder).ingest(file), "run.after_safety")
+    assert [one.about for one in told] == [("x",)] * (rolls > 0)
 
 
 @pytest.mark.parametrize("scale", [-1, 1])
@@ -267,7 +240,5 @@ def test_limits_of_a_log_whose_sign_was_wrong_are_to_be_turned_too(tmp_path, sca
     states, log = trial.states[:-1], tmp_path / "d.csv"
     rows = np.column_stack([T, states + 0.01 * np.sin(T)[:, None], trial.inputs / scale])
     np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
-    told = [one for one in w.ingest(log, data=True).warnings if "beyond its [limits]" in one]
-    assert len(told) == 1
-    assert ("multiply these limits by -1" in told[0]) == (scale < 0)
-    assert ("widen" in told[0]) == (scale > 0)
+    (told,) = of_code(w.ingest(log, data=True), "log.limits")
+    assert told.facts["how"] == ("flip" if scale < 0 else "widen")

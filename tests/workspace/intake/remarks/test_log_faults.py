@@ -37,7 +37,7 @@ CAR = Model(
 )
 def test_which_paths_are_no_angles(name, path, scale, instead):
     found = no_angles(CAR, LogMapping({name: SignalSpec(path, scale=scale)}, {}))
-    assert [holds(text, path, instead) for text in found.values()] == [True] * bool(instead)
+    assert [holds(one.sentence, path, instead) for one in found] == [True] * bool(instead)
 
 
 def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
@@ -78,9 +78,9 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
     y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
     trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
     (fault,) = column_faults(SimpleNamespace(base_model=boat), trial)
-    assert (fault.inputs, fault.factor) == (("rudder",), pytest.approx(57.29578))
-    assert fault.said.startswith("rudder ")
-    assert holds(fault.mend, "[log.input.rudder]", "0.017453293") and "rad" in fault.program
+    assert (fault.code, fault.about) == ("log.unit", ("rudder",))
+    assert fault.facts["by"] == pytest.approx(1 / 57.29578)
+    assert holds(fault.sentence, "[log.input.rudder]", "0.017453293")
 
 
 def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
@@ -88,5 +88,5 @@ def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
     sound, odd = (logged(BOAT, *fault)[0] for fault in ((), (folded,)))
     assert not column_faults(SimpleNamespace(base_model=BOAT), sound)
     (fault,) = column_faults(SimpleNamespace(base_model=BOAT), odd)
-    assert holds(fault.said, "psi", "degrees", "unwrapped")
-    assert holds(fault.mend, "[log.state.psi]", "0.017453293")
+    assert (fault.code, fault.about) == ("log.folded", ("psi",))
+    assert holds(fault.sentence, "[log.state.psi]", "0.017453293")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import of_code
 from grounded.result import with_error
 from grounded.search.starts import worth_of_start
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -40,8 +40,7 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     """Runs 7 and 9 cm off were to be discarded, one after the other, by a rig that does 5 cm."""
     ran, *_ = read_trial(run(w))
     monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.9 * w.task.utility(ran))
-    first = placed(w, tmp_path, ran, 0.15)
-    assert any("`discard t0001`" in one and "`propose` goes on" in one for one in first.warnings)
+    assert of_code(placed(w, tmp_path, ran, 0.15), "run.start_spoils")
     for off in (-0.13, 0.11):
         set_aside(w, "discard", [placed(w, tmp_path, ran, off).trial], "")
         w.forget()
@@ -49,8 +48,9 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     assert known.runs.tolist() == [3, 3]
     assert known.rms[0] == pytest.approx(np.sqrt(np.mean(np.square([0.15, -0.13, 0.11]))))
     found = placed(w, tmp_path, ran, -0.14)
-    (told,) = [one for one in found.warnings if "the run started with" in one]
-    assert holds(told, "starts of 3 other runs are off by 0.13 m in x (rms)", "the run counts")
+    (told,) = of_code(found, "run.start*")
+    assert (told.code, told.facts["runs"]) == ("run.start", 3)
+    assert told.facts["rms"].value == pytest.approx(0.13, rel=0.02)
     assert found.then.verb == "propose"
 
 
@@ -61,9 +61,9 @@ def test_a_first_start_that_changes_part_of_its_cost_counts(w, tmp_path, monkeyp
     monkeypatch.setattr(initial_state, "_changes", lambda *_: changes)
     for off in (0.2, -0.15):
         found = placed(w, tmp_path, ran, off)
-        (told,) = [one for one in found.warnings if "the run started with" in one]
-        assert holds(told, f"its whole start changes its utility by {changes:+.3g}. The run counts")
-        assert "after 3 runs" in told and found.then.verb != "discard"
+        (told,) = of_code(found, "run.start*")
+        assert (told.code, told.facts["change"]) == ("run.start", pytest.approx(changes))
+        assert told.facts["unknown"] and found.then.verb != "discard"
         w.forget()
 
 
@@ -80,28 +80,12 @@ def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_pa
     """A heading 0.030 rad off was to be discarded, after 0.019, 0.015 and 0.019 rad."""
     ran, *_ = read_trial(run(w))
     monkeypatch.setattr(initial_state, "_changes", lambda *_: 5 * w.task.utility(ran))
-    monkeypatch.setattr(initial_state, "_always_there", lambda *_: "")
+    monkeypatch.setattr(initial_state, "_always_there", lambda *_: None)
     monkeypatch.setattr(initial_state, "_scatter", lambda *_: 0.0)
     for off in (0.19, 0.15, 0.20):
         placed(w, tmp_path, ran, off)
     told, far = (placed(w, tmp_path, ran, off) for off in (-0.30, -0.90))
-    assert any("the run counts" in one for one in told.warnings)
-    assert any("`discard t0005`" in one for one in far.warnings)
-
-
-def test_states_that_began_off_and_cost_less_are_named_too(w, tmp_path, monkeypatch):
-    """Of a boat y = 34 mm was told, and x = 52 mm was not."""
-    ran, *_ = read_trial(run(w))
-    off = np.array([0.15, -0.02])
-    assert initial_state._less_far(w.task, off, []) == ""
-    two = "; x by +0.15 m and v by -0.02 m/s, which matter less"
-    assert initial_state._less_far(w.task, off, [0, 1]) == two
-    far = initial_state._far_off
-    monkeypatch.setattr(
-        initial_state, "_far_off", lambda *given: replace(far(*given), beyond_noise=[0, 1])
-    )
-    (told,) = [one for one in placed(w, tmp_path, ran, 0.15).warnings if "started with" in one]
-    assert holds(told, "x = 0.150 m", "; v by +0 m/s, which matters less, more than")
+    assert of_code(told, "run.start") and of_code(far, "run.start_spoils")
 
 
 def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
@@ -111,14 +95,10 @@ def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
     moved[0] += [0.6, 0.3]
     write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
     found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    (told,) = [one for one in found.warnings if "the run started with" in one]
+    (told,) = of_code(found, "run.start_spoils")
     policy = w.candidate("c0001")[0].policy
-    of_x, whole = (
-        worth_of_start(w.planner, policy, moved[0] * part - w.task.start * part)
-        for part in (np.array([1, 0]), np.array([1, 1]))
-    )
-    assert f"{whole:+.3g}" in told
-    assert "x changes" not in told or f"x changes its utility by {of_x:+.3g}" in told
+    whole = worth_of_start(w.planner, policy, moved[0] - w.task.start)
+    assert told.facts["change"] == pytest.approx(whole)
 
 
 def test_runs_of_an_earlier_task_count_by_their_own_start(w, tmp_path):

@@ -437,8 +437,7 @@ def status_in(workspace: Folder) -> Status:
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
     now = undecided(standing_in(workspace), then.arguments[0])
-    notes = [found("search.asked", then.arguments[0], why=why) for why in asked]
-    return replace(status_of(workspace, now, notes), then=then)
+    return replace(status_of(workspace, now, asked), then=then)
 
 
 def undecided(now: Standing, trial: str) -> Standing:

@@ -9,15 +9,18 @@ second ingest finds the first.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Tried
 from grounded.search.safety import COASTS
+from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
@@ -35,6 +38,7 @@ from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
+    as_finding,
     copied,
     read_log_file,
     read_own_trial,
@@ -42,22 +46,22 @@ from grounded_trials.workspace.intake.opening.reading import (
 from grounded_trials.workspace.intake.opening.stored_before import (
     as_stored,
     estimated_otherwise,
+    others_differ,
     repeated,
-    what_repeats,
 )
 from grounded_trials.workspace.intake.recognising.recognise import best_run_again, recognised
 from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.lagging import lagging
-from grounded_trials.workspace.intake.remarks.log_faults import log_faults
-from grounded_trials.workspace.intake.remarks.trial_check import warnings_about
+from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
+from grounded_trials.workspace.intake.remarks.trial_check import checked
 from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 FARTHER = 2.0  # times as far as was told: a robot that moves on after its run is told again
+FAULTS = (*COLUMNS, "run.exchanged")  # the next plan would be based on wrong columns
 ASIDE = "set aside"  # the verdict on a run that does not count
 
 
@@ -71,17 +75,32 @@ class Ingested(Result):
     candidate: str  # "" for data
     utility: float | None  # None for data; -inf for a run that failed
     accepted: bool | None  # None for data, or if not decided yet
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]  # on the log and the run, the heaviest first
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
-    notes: tuple[str, ...] = ()  # where in a longer log the run was found
     to_settle: str = ""  # the candidate to be run again, if the verdict is "in doubt"
     mean: float = math.nan  # utility of the candidate's runs, by which it is judged
     runs: int = 0  # how many these are
     off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
-    faults: tuple[str, ...] = ()  # those warnings that say that columns of the log are wrong
     then: NextCommand = PROPOSE
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The sentences of the findings that may change what a person does."""
+        return tuple(one.sentence for one in self.findings if one.weight is not Weight.NOTE)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences of the others."""
+        return tuple(one.sentence for one in self.findings if one.weight is Weight.NOTE)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """The sentences of those that say that columns of the log are wrong."""
+        return tuple(
+            one.sentence for one in self.findings if one.code in (*COLUMNS, "run.exchanged")
+        )
 
     def summary(self) -> str:
         """Return the trial, what it ran and the verdict."""
@@ -100,6 +119,7 @@ class Ingested(Result):
             "verdict": self.verdict or None,
             "crashed": list(self.crashed),
             "off_target": [one.to_json() for one in self.off_target],
+            "findings": [one.to_json() for one in self.findings],
             "warnings": list(self.warnings),
             "faults": list(self.faults),
             "notes": list(self.notes),
@@ -136,8 +156,8 @@ def ingest_log(
             read = best_run_again(workspace, path, error)
     read = copied(workspace, path, read, "" if data else candidate)
     read = recognised(workspace, path, read, candidate)
-    if read.log and (other := estimated_otherwise(workspace, read.log)):
-        read = replace(read, notes=(*read.notes, *other))
+    if read.log:
+        read = read.telling(*estimated_otherwise(workspace, read.log))
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
@@ -155,62 +175,37 @@ def ingest_log(
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
-    """Return the result for a trial that was just stored: warnings, verdict, next command."""
+    """Return the result for a trial that was just stored: findings, verdict, next command."""
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
-    faults = log_faults(workspace, interpolate_gaps(trial).trial)
-    odd = tuple(one.told(trial, own=read.own) for one in faults)
-    scaled = [name for one in faults for name in one.inputs]
-    elsewhere = begun_elsewhere(workspace, trial)
-    lag = lagging(workspace, trial)
-    other = "" if read.doubted else ran_otherwise(workspace, trial, lag)
-    checked = warnings_about(workspace, trial, read.last_s, read.fell, scaled)
-    if lag and not other:
-        checked = (*checked, lag.told())
-    counts = elsewhere is not None and not elsewhere.again  # as the words say
-    begun = [elsewhere.told] if elsewhere and not (counts and (read.aside or odd)) else []
-    warnings = (*read.warnings, *odd, *begun, *checked)
-    if before:
-        warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     now = standing_in(workspace) if trial.candidate else None
-    waits = now.outstanding if now and now.phase == "await-trial" else None
-    if aside := added.id in workspace.discarded():
-        then = f"; if you don't want that, run {waits.id} and record another log" if waits else ""
-        stays = f"{added.id} stays set aside and does not count: {_undo(added.id)}{then}"
-        warnings = (*warnings, stays)
     history = now.history if now else ()
     tried = next((t for t in history if t.candidate.id == trial.candidate), None)
+    aside = added.id in workspace.discarded()
+    waits = now.outstanding if now and now.phase == "await-trial" else None
+    some = [*read.findings]
+    if before:
+        some.append(found("log.repeats", before, copy=others_differ(workspace)))
+    if aside:
+        some.append(found("log.aside", added.id, waits=waits.id if waits else ""))
+    if read.before:
+        some.append(read.before.finding(used=not aside))
+    some += _of_trial(workspace, read, trial)
+    some += filter(None, _of_run(workspace, read, added, trial, tried, history))
+    if now:
+        some += _of_search(workspace, read, added, tried, now)
+    told = settle(some)
     verdict = ASIDE if aside else _verdict(workspace, trial, tried)
-    warnings = (*filter(None, [other]), *warnings)
-    wrong = bool(other or read.aside) or (elsewhere is not None and elsewhere.again)
-    if not (odd or wrong or aside):
-        asked = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-        if asked:
-            warnings, wrong = (asked.said, *warnings), asked.aside
-    early = None if read.fell or aside or wrong else ended_early(workspace, trial, read.silent)
-    if early:
-        said = (early.said,)  # after what is doubtful about the log, which may be why
-        if early.aside and counts:
-            warnings = tuple(one for one in warnings if one not in begun)
-        warnings, wrong = (*warnings, *said) if read.doubted else (*said, *warnings), early.aside
-    if trial.candidate and not wrong and (whole := _whole(read, workspace.task)):
-        left = left_afterwards(workspace.task, whole)
-        warnings = (*warnings, *(left or _told_once(workspace, added, whole)))
-    if not (odd or wrong or aside):
-        warnings = (*warnings, *swung(workspace.task, tried, trial, history))
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
+    _ask(workspace, read, added)
     judged = [interpolate_gaps(trial).trial] if trial.candidate else []
-    rest = [one for one in history if one is not tried and one.accepted]
-    outdone = max(rest, key=lambda one: one.utility, default=None)
-    if read.aside and not aside:  # `status` can't tell it from the stored trial
-        note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": read.aside}
-        with suppress(GroundedError):  # a folder that can't be written
-            workspace.notes.add(note, again=False)
-        vars(workspace).pop("noted", None)
-    best = tried is not None and now is not None and now.incumbent is tried
-    farther = traded(workspace.task, tried, outdone) if best and tried and outdone else None
-    told = farther.sentence if farther else ""
+    if any(one.weight is Weight.ASIDE for one in told) and not aside:
+        then = NextCommand("discard", (added.id,))
+    elif now and waits and aside:
+        then = another_trial(workspace, now)
+    else:
+        then = after_log(workspace, verdict, now)
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -218,37 +213,73 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         candidate=trial.candidate,
         utility=workspace.task.utility(judged[0]) if judged else None,
         accepted=tried.accepted if tried else None,
-        warnings=warnings,
-        faults=odd,
+        findings=told,
         signals=read.signals,
         verdict=verdict,
         to_settle=tried.to_settle if tried else "",
         mean=tried.utility if tried else math.nan,
         runs=len(tried.trials) if tried else 0,
         crashed=tried.failed if tried and verdict == "crashed" else (),
-        notes=(
-            *([read.before.told(used=not aside)] if read.before else []),
-            *filter(None, [*read.notes, *(() if odd or wrong or lag else read.aged), told]),
-            *(
-                one.sentence
-                for one in (no_longer(workspace, added.id, now) if now and not added.known else ())
-            ),
-            *(
-                one.sentence
-                for one in (
-                    odd_run(workspace, now, added.id, aside=bool(read.aside))
-                    if now and read.doubted and not aside
-                    else ()
-                )
-            ),
-        ),
         off_target=off_target_of(workspace.task, judged),
-        then=NextCommand("discard", (added.id,))
-        if (odd or wrong) and not aside
-        else another_trial(workspace, now)
-        if now and waits and aside
-        else after_log(workspace, verdict, now),
+        then=then,
     )
+
+
+def _of_trial(workspace: Folder, read: Read, trial: Trial) -> Iterator[Finding]:
+    """Yield what the columns and the start of a trial show, and what it lacks."""
+    yield from log_faults(workspace, interpolate_gaps(trial).trial, own=read.own)
+    if begun := begun_elsewhere(workspace, trial):
+        yield begun
+    yield from checked(workspace, trial, read.last_s)
+
+
+def _of_run(
+    workspace: Folder,
+    read: Read,
+    added: Added,
+    trial: Trial,
+    tried: Tried | None,
+    history: Sequence[Tried],
+) -> Iterator[Finding | None]:
+    """Yield how a candidate was run, and how its run went."""
+    task = workspace.task
+    if not read.doubted:
+        yield ran_otherwise(workspace, trial)
+    yield gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
+    yield ended_early(workspace, trial, read.silent)
+    if trial.candidate and (whole := _whole(read, task)):
+        yield left_afterwards(task, whole) or _told_once(workspace, added, whole)
+    yield swung(task, tried, trial, history)
+
+
+def _of_search(
+    workspace: Folder, read: Read, added: Added, tried: Tried | None, now: Standing
+) -> Iterator[Finding]:
+    """Yield what a run changed in the search."""
+    said = [] if added.known else [*no_longer(workspace, added.id, now)]
+    if read.doubted and added.id not in workspace.discarded():
+        said += odd_run(workspace, now, added.id, aside=_aside(read))
+    rest = [one for one in now.history if one is not tried and one.accepted]
+    outdone = max(rest, key=lambda one: one.utility, default=None)
+    if tried is not None and now.incumbent is tried and outdone:
+        said.append(traded(workspace.task, tried, outdone))
+    yield from (as_finding(one, "run.note") for one in said if one)
+
+
+def _aside(read: Read) -> bool:
+    """Return whether a log that ran no candidate as it should was taken as its run."""
+    return read.doubted and any(one.weight is Weight.ASIDE for one in read.findings)
+
+
+def _ask(workspace: Folder, read: Read, added: Added) -> None:
+    """Note that such a run is to be set aside: `status` can't tell it from the stored trial."""
+    if not _aside(read) or added.id in workspace.discarded():
+        return
+    why = next(one.code for one in read.findings if one.weight is Weight.ASIDE)
+    note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why}
+    with suppress(GroundedError):  # a folder that can't be written
+        workspace.notes.add(note, again=False)
+    vars(workspace).pop("noted", None)
 
 
 def _whole(read: Read, task: Task) -> Trial | None:
@@ -260,30 +291,28 @@ def _whole(read: Read, task: Task) -> Trial | None:
     return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
 
 
-def _told_once(workspace: Folder, added: Added, whole: Trial) -> list[str]:
+def _told_once(workspace: Folder, added: Added, whole: Trial) -> Finding | None:
     """Return how the robot moved on after its run, unless a run of this task told it before.
 
     What is then to be changed is the target, [reward] or the robot's program, not the run. It is
     told again if other states moved on, or much farther.
     """
-    found, own = moved_on(workspace.planner, whole), added.sha256[:DIGITS]
-    if found is None:
-        return []
-    about = f"moved on, {workspace.task.hash}, {found.states}, "
+    one, own = moved_on(workspace.planner, whole), added.sha256[:DIGITS]
+    if one is None:
+        return None
+    far = one.facts["far"]
+    assert isinstance(far, Quantity)
+    about = f"moved on, {workspace.task.hash}, {one.facts['what']}, "
     told = {w: trial for w, trial in workspace.noted.told.items() if w.startswith(about)}
     most = max((float(what.removeprefix(about)) for what in told), default=0.0)
     if own not in told.values():
-        if found.far < FARTHER * most:
-            return []
-        what = f"{about}{found.far:.6g}"
+        if far.value < FARTHER * most:
+            return None
+        what = f"{about}{far.value:.6g}"
         with suppress(GroundedError):  # a folder that can't be written: it is told again
             workspace.notes.add({"note": "told", "trial": own, "what": what}, again=False)
         vars(workspace).pop("noted", None)
-    return [found.said]
-
-
-def _undo(identity: str) -> str:
-    return f"`restore {identity}` undoes that"
+    return one
 
 
 def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:

@@ -85,11 +85,6 @@ class ActedOn:
         """The median difference of the commands, which is robust to lost packets."""
         return float(np.median(self.off[self.told])) if self.told.any() else np.inf
 
-    @property
-    def percent(self) -> str:
-        """The median difference as a text."""
-        return f"{max(100 * self.left, 0.01):.2g} %"
-
 
 def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     """Compare the commands of a log with a policy's, at the ages of samples that fit best.

@@ -9,28 +9,21 @@ candidate's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import FINE, LEAST, SAME, Following
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.wording import with_unit
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 
 
-@dataclass(frozen=True)
-class Fall:
-    """Where a run failed, and the warning for the user."""
-
-    steps: int  # steps of the run before it failed
-    told: str
-
-
-def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> Fall | None:
+def fall_in(
+    task: Task, own: Candidate, trial: Trial, ran: Following | None
+) -> tuple[int, Finding] | None:
     """Find where a run left [safety], if its commands ceased to be the candidate's about then.
 
     Args:
@@ -40,6 +33,7 @@ def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> 
         ran: the comparison of its commands with the candidate's.
 
     Returns:
+        The steps of the run before it failed, and the finding.
         None if the commands are the candidate's to the end, or never were; if the run was inside
         [safety] for `LEAST` steps before and after they ceased to be; or if it was almost complete.
     """
@@ -61,18 +55,20 @@ def fall_in(task: Task, own: Candidate, trial: Trial, ran: Following | None) -> 
     steps = min(first, ceased)
     if steps < LEAST or steps + LAST >= task.horizon:
         return None
-    i, name = int(np.argmax(beyond[first])), own.id
+    i = int(np.argmax(beyond[first]))
     state, unit = list(task.model.states.items())[i]
-    was, predicted = (with_unit(f"{x[first, i]:.3g}", unit) for x in (states, own.predicted_states))
-    low, high = task.safety_low[i], task.safety_high[i]
-    return Fall(
-        steps,
-        f"{state} left [safety] = [{low:g}, {high:g}] at {first * task.dt:.2f} s (it was {was}, "
-        f"where {predicted} was predicted), and the commands are those of {name} only up to "
-        f"{ceased * task.dt:.2f} s: this counts as a failed run of {name}, cut at "
-        f"{steps * task.dt:.2f} s; the part before is kept for fit and diagnose, the rest is "
-        "not judged. If something disturbed it, `discard` it",
+    was, predicted = float(states[first, i]), float(own.predicted_states[first, i])
+    fell = found(
+        "run.fell",
+        state,
+        ran=own.id,
+        bound=Quantity(float(np.clip(was, task.safety_low[i], task.safety_high[i])), unit),
+        was=Quantity(was, unit),
+        predicted=Quantity(predicted, unit),
+        at=Quantity(first * task.dt, "s"),
+        until=Quantity(steps * task.dt, "s"),
     )
+    return steps, fell
 
 
 def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:

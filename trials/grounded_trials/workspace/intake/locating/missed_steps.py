@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import listed
+from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import LEAST, commanded, follows
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import count, with_unit
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 
 if TYPE_CHECKING:
@@ -32,16 +33,16 @@ WAITS = 3.5  # steps without a change of commands at the beginning of a log, bef
 BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
 
 
-def missed_steps(log: Recording, policy: Policy, first: float, found: float) -> int:
+def missed_steps(log: Recording, policy: Policy, first: float, otherwise: float) -> int:
     """Return how many steps of a policy's run lie before the log's first command; 0 if unclear.
 
     Args:
         log: the log with the run.
         policy: the policy, for the states and inputs of the log.
         first: the time of the first command, moved to where a step begins [s].
-        found: where the run seems to begin otherwise [s].
+        otherwise: where the run seems to begin if none were missed [s].
     """
-    usual = acted_on(log, policy, found)
+    usual = acted_on(log, policy, otherwise)
     if usual is not None and usual.exact:
         return 0
     k = min(range(1, MOST + 1), key=lambda k: _left(log, policy, first, k))
@@ -87,16 +88,17 @@ def begins_late(log: Recording, policy: Policy) -> tuple[int, float]:
     return (0, 1.0) if _waits(log) else _step_at(log, policy, log.first)
 
 
-def other_clock(log: Recording, policy: Policy) -> tuple[str, int, float] | None:
+def other_clock(log: Recording, own: Candidate) -> tuple[Finding, int, float] | None:
     """Return that a program began with a later step, since its clock ran before; or None.
 
     Args:
-        log: the log in which no run of the policy was found, which begins before it.
-        policy: the policy, for the states and inputs of the log.
+        log: the log in which no run of the candidate was found, which begins before it.
+        own: the candidate, for the states and inputs of the log.
 
     Returns:
-        A clause about its commands, and what to pass; the step; and what is left of the commands.
+        The finding, the step, and what is left of the commands.
     """
+    policy = own.policy
     if not _waits(log) or not log.openings:
         return None
     begins = log.on_step(policy, log.openings[0])
@@ -104,15 +106,7 @@ def other_clock(log: Recording, policy: Policy) -> tuple[str, int, float] | None
     fit = acted_on(log, policy.after(step), begins) if step else None
     if fit is None or not fit.throughout:
         return None
-    since = "it was started"
-    if abs(begins - step * policy.dt) < 1.5 * policy.dt:
-        since = "the log began"
-    said = (
-        f"its first command, {begins:.2f} s after the log began, is that of step {step} "
-        f"({step * policy.dt:.3g} s), and the others follow: pass `runner.action` the seconds "
-        f"since the run began, not since {since}"
-    )
-    return said, step, fit.left
+    return found("run.clock", ran=own.id, step=step, seconds=step * policy.dt), step, fit.left
 
 
 def _step_at(log: Recording, policy: Policy, begins: float) -> tuple[int, float]:
@@ -152,16 +146,8 @@ def _waits(log: Recording) -> bool:
     return held and changed - log.first > WAITS * log.dt
 
 
-def not_sent(task: Task, ran: str, missed: int) -> str:
-    """Return the warning about missed steps."""
-    held = listed(
-        f"{name} = {with_unit(f'{value:g}', unit)}"
-        for (name, unit), value in zip(task.model.inputs.items(), task.past, strict=True)
-    )
-    gone = "step 0 was" if missed == 1 else f"steps 0 to {missed - 1} were"
-    return (
-        f"the first command in the log is that of step {missed} of {ran}: {gone} not sent, or not "
-        f"logged. The run begins {count(missed, 'step')} ({missed * task.dt:.3g} s) before it, "
-        f"with {held} held until then. Make the program send from step 0 on (a timer that fires "
-        "late skips it), and start recording before that"
-    )
+def not_sent(task: Task, ran: str, missed: int) -> Finding:
+    """Return that the first steps of a run were not sent."""
+    pairs = zip(task.model.inputs.items(), task.past, strict=True)
+    held = tuple(with_unit(f"{name} = {value:g}", unit) for (name, unit), value in pairs)
+    return found("run.missed", ran=ran, steps=missed, held=held)

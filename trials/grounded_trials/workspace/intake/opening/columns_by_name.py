@@ -12,10 +12,10 @@ import re
 from collections.abc import Mapping
 from itertools import combinations
 
+from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, unit_of
-from grounded_trials.workspace.user_files.config import FILE
 
 UNNAMED = ("data", "value")  # field names without meaning: the topic is the name
 PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
@@ -23,8 +23,8 @@ ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest
 SMALL = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
 
 
-def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
-    """Return warnings on signals that are read from each other's columns, or lengths from angles.
+def crossed(model: Model, mapping: LogMapping) -> list[Finding]:
+    """Return signals that are read from each other's columns, or lengths from angles.
 
     Axes of a position are exempt, since their names vary.
 
@@ -35,29 +35,26 @@ def crossed(model: Model, mapping: LogMapping) -> tuple[str, ...]:
     paths = {name: one.path for name, one in {**mapping.states, **mapping.inputs}.items()}
     units = {**model.states, **model.inputs}
     angles = [n for n, s in mapping.states.items() if is_angle(s.path) and s.scale == 1]
-    lengths = [name for name in angles if units[name] in LENGTHS]
     axes = model.roles.get("position", ())  # north may be the x of one and the y of another
+    lengths = [
+        found("log.path", n, path=paths[n], what="an angle") for n in angles if units[n] in LENGTHS
+    ]
     by = {
         (a, b): "units" if _of_the_other(a, b, paths, units) else "names"
         for a, b in combinations(paths, 2)
         if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
     }
-    no_lengths = tuple(
-        f"{n} [{units[n]}] is read from {paths[n]}, an angle by its name: check {FILE}'s [log]"
-        for n in lengths
-    )
-    return no_lengths + tuple(
-        f"{a} is read from {paths[a]} and {b} from {paths[b]}: by their {what} they are exchanged "
-        f"in {FILE}'s [log]"
+    return lengths + [
+        found("log.crossed", a, b, paths=(paths[a], paths[b]), by=what)
         for (a, b), what in by.items()
         if not {a, b} <= set(axes)
-    )
+    ]
 
 
 def _of_the_other(a: str, b: str, paths: Mapping[str, str], units: Mapping[str, str]) -> bool:
     """Return whether each path's number is in the other signal's unit, and not in its own."""
-    found = unit_of(paths[a]), unit_of(paths[b])
-    return found == (units[b], units[a]) != (units[a], units[b])
+    read = unit_of(paths[a]), unit_of(paths[b])
+    return read == (units[b], units[a]) != (units[a], units[b])
 
 
 def _crossed(a: str, b: str, paths: Mapping[str, str]) -> bool:
@@ -76,12 +73,12 @@ def _alike(name: str, path: str) -> float:
     """
     words = re.split(r"[./]", bare_command(path).strip('"'))
     last = next((one for one in reversed(words) if one and one not in UNNAMED), "")
-    own, found = (set(re.findall(r"[a-z]+|\d+", one.lower())) for one in (name, last))
-    return len(own & found) / max(len(own | found), 1)
+    own, other = (set(re.findall(r"[a-z]+|\d+", one.lower())) for one in (name, last))
+    return len(own & other) / max(len(own | other), 1)
 
 
-def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
-    """Return states in rad or deg that are read from a component of a quaternion, with a message.
+def no_angles(model: Model, mapping: LogMapping | None) -> list[Finding]:
+    """Return states in rad or deg that are read from a component of a quaternion.
 
     The z of an orientation is sin(yaw / 2): as smooth as a yaw, about half as large, but different
     beyond a quarter turn. The data can't distinguish it from a gain, but the path can.
@@ -90,14 +87,12 @@ def no_angles(model: Model, mapping: LogMapping | None) -> Mapping[str, str]:
         model: the model with the states.
         mapping: the column of each signal; None if there is no [log].
     """
-    found = {}
+    some = []
     for name, one in (mapping.states if mapping else {}).items():
         part = PART.search(one.path)
         angle = name in model.angles or model.states.get(name) in ("rad", "deg")
         if part and angle and abs(one.scale) != SMALL:
             instead = f"{one.path[: part.end(1)]}.@rpy.{ABOUT[part[2]]}"
-            found[name] = (
-                f"is read from {one.path}, a part of a quaternion, which is not an angle: "
-                f"use {instead} in {FILE}'s [log.state.{name}]"
-            )
-    return found
+            what = "a part of a quaternion"
+            some.append(found("log.path", name, path=one.path, what=what, instead=instead))
+    return some

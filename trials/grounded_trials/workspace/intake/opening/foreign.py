@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
-from grounded.result import listed
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_log import inspect_log
@@ -103,51 +103,40 @@ class ForeignLog:
         on = any(end > least for end in last.values())
         return tuple(name for name, end in last.items() if on and end < least and name in states)
 
-    def refuse_late(self, found: Gridded) -> None:
+    def refuse_late(self, grid: Gridded) -> None:
         """Refuse a candidate's run if its beginning was not recorded.
 
         Raises:
             GroundedError: if a state is not known when the run begins.
         """
         dt = self.workspace.config.task.dt
-        if found.late_s > dt / 2:
-            put_off = [
+        if grid.late_s > dt / 2:
+            put_off = tuple(
                 f"[log.state.{name}] delay_s = {one.spec.delay_s:g}"
                 for name, one in self.series.items()
-                if name in self.mapping.states and one.spec.delay_s < dt - found.late_s
-            ]
-            mend = "Start recording before the run"
-            if put_off:
-                mend = (
-                    f"{listed(put_off)} shift{'s' * (len(put_off) == 1)} states later by about as "
-                    "much: remove that, unless the clocks really differ; otherwise start recording "
-                    "before the run"
-                )
+                if name in self.mapping.states and one.spec.delay_s < dt - grid.late_s
+            )
+            late = Quantity(grid.late_s, "s")
             raise GroundedError(
-                f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
-                f"the trial's time would not be the candidate's. {mend}, or ingest it with --data"
+                found("log.late_states", log=str(self.path), late=late, put_off=put_off)
             )
 
     @property
-    def unlike_units(self) -> tuple[str, ...]:
-        """Warnings on columns in a multiple of the model's unit without a scale in [log]."""
+    def unlike_units(self) -> tuple[Finding, ...]:
+        """The columns in a multiple of the model's unit without a scale in [log]."""
         from grounded_trials.logs.stated_units import Stated
 
-        model, found = self.workspace.base_model, []
-        said = Stated.by(log_files(self.path))
-        units = {**model.states, **model.inputs}
+        model, said = self.workspace.base_model, Stated.by(log_files(self.path))
+        units, some = {**model.states, **model.inputs}, []
         for name, one in self.series.items():  # including that of [log.span]
             path, wanted = one.spec.path, units.get(name, "")
-            kind = "input" if name in model.inputs else "state"
-            factor = said.factor(path, wanted)
+            kind, factor = "input" if name in model.inputs else "state", said.factor(path, wanted)
             if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
-                named = f"whose name says {said.unit(path)}"
-                column = f"in {said.unit(path)}" if path in said.heads else named
-                found.append(
-                    f"{name} is read without a scale from a column {column}, but the model has "
-                    f"{wanted}: scale = {factor:.6g} in [log.{kind}.{name}] would convert it"
+                table, unit = f"[log.{kind}.{name}]", said.unit(path)
+                some.append(
+                    found("log.stated", name, unit=unit, own=wanted, table=table, by=factor)
                 )
-        return tuple(found)
+        return tuple(some)
 
     @cached_property
     def stored(self) -> tuple[StoredTrial, ...]:
@@ -181,8 +170,8 @@ class ForeignLog:
         return tuple(n for n in names if n in self.mapping.states and n not in measured)
 
     @property
-    def unread(self) -> tuple[str, ...]:
-        """Warnings that such states only identify a run, while its trial has estimates.
+    def unread(self) -> tuple[Finding, ...]:
+        """Such states, which only identify a run, while its trial has estimates.
 
         That is so by the set-up, so it is told of the first log that was read like this.
         """
@@ -194,9 +183,7 @@ class ForeignLog:
         last = known[-1] if known else {}
         guessed, columns = last.get("estimated", "").split(","), last.get(READ_BY, "")
         return tuple(
-            f"{name} is in [log], but not in [estimate] measured: it is used to identify a run, "
-            f"but the trial has an estimate in its place, and `diagnose` can't find how late the "
-            f"logged one is. To use that one add {name} = its scatter at standstill there"
+            found("log.unread", name)
             for name in self._beside
             if name not in guessed or f"{json.dumps(name)}:" not in columns
         )
@@ -343,28 +330,13 @@ def rates_of(model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.state_names if name in found)
 
 
-def begun(found: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[str]:
-    """Yield notes on where data begin, the timing of their commands, and a dt that does not fit."""
-    at = f"it is used from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
-    if found.moved_s > dt:
-        yield (
-            f"{at}: what was sent before the first command is not in the log, and the robot was "
-            "not at rest"
-        )
-    elif found.moved_s > 0:
-        yield f"{at}, where a step of the commands begins"
-    slow = [
-        one for one in found.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER
-    ]
+def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
+    """Yield where data begin, the timing of their commands, and a dt that does not fit."""
+    if grid.moved_s > dt:
+        yield found("log.from", at=(grid.start_ns - grid.origin_ns) * 1e-9)
+    slow = [one for one in grid.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER]
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
-        yield (
-            f"the commands of {listed(one.name for one in slow)} come every {every:.3g} s, but "
-            f"[task] dt is {dt:g} s: did you mean dt = {every:.3g}?"
-        )
-    if found.row_s > dt / 20:
-        yield (
-            f"its rows come every {found.row_s:.3g} s and repeat the commands: a row does not say "
-            f"if its command was sent just then or up to {found.row_s:.3g} s before, so a delay is "
-            f"known to +- {found.row_s / 2:.3g} s only"
-        )
+        yield found("log.slow", *(one.name for one in slow), every=every, dt=dt)
+    if grid.row_s > dt / 20:
+        yield found("log.rows", every=grid.row_s, half=grid.row_s / 2)

@@ -11,9 +11,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, found
 from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.formats.text_tables import table_remarks
@@ -59,19 +60,19 @@ class Read:
 
     trial: Trial
     data: bytes
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     signals: tuple[SignalReport, ...] = ()
-    notes: tuple[str, ...] = ()
-    aged: tuple[str, ...] = ()  # notes on the age of its samples, told if nothing else is wrong
     copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
-    aside: str = ""  # why it is to be set aside unless the user goes on
     before: Aside | None = None  # the trial that was made from the log before and is set aside
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
-    fell: bool = False  # it failed before the log ends, as a warning says
     last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]
+
+    def telling(self, *findings: Finding) -> Read:
+        """Return it with further findings."""
+        return replace(self, findings=(*self.findings, *findings))
 
     @property
     def own(self) -> bool:
@@ -87,15 +88,17 @@ class Read:
         return self.log.silent_from(ends)
 
     @property
-    def hole(self) -> str:
-        """A sentence on the longest gap in a log; "" if there is no long one."""
+    def hole(self) -> dict[str, Any]:
+        """The longest gap in a log, if it is long, as facts."""
         longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)
         if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
-            return ""
-        return (
-            f" It has no sample of {longest.name} for {longest.largest_gap_s:.2g} s, from "
-            f"{longest.largest_gap_at_s:.2f} s on: that may be why."
-        )
+            return {}
+        return {"unknown": longest.name, "gap": Quantity(longest.largest_gap_s, "s")}
+
+
+def as_finding(said: Finding | str, code: str) -> Finding:
+    """Return what another room says as a finding, under a code if it is a text still."""
+    return found(code, text=said) if isinstance(said, str) else said
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
@@ -107,13 +110,13 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
     content = read_file(path, FILE_LIMIT)
     trial, meta, policy = read_trial(content, str(path))
     model, dt = workspace.base_model, workspace.config.task.dt
-    for what, found, own in (
+    for what, theirs, own in (
         ("states", trial.state_names, model.state_names),
         ("inputs", trial.input_names, model.input_names),
     ):
-        if found != own:
+        if theirs != own:
             raise GroundedError(
-                f"{path} has the {what} {', '.join(found)}, but this workspace's model has "
+                f"{path} has the {what} {', '.join(theirs)}, but this workspace's model has "
                 f"{', '.join(own)}: it is a trial of another robot"
             )
     if other := list(_other_units(workspace, meta)):
@@ -132,9 +135,9 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, LASTED, READ_BY)
         about = {k: v for k, v in meta.items() if k in kept}
         about |= {"kind": "data", "ran": trial.candidate}
-        notes = _elsewhere(workspace, trial.candidate, policy)
+        some = _elsewhere(workspace, trial.candidate, policy)
         trial = replace(trial, candidate="")
-        return Read(trial, _encode(workspace, trial, about), notes=notes)
+        return Read(trial, _encode(workspace, trial, about), some)
     if candidate is not None and trial.candidate not in ("", candidate):
         raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
     if trial.candidate:
@@ -154,12 +157,12 @@ def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
                 yield f"{name} is in {unit}, but the model has it in {own[name]}"
 
 
-def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[str, ...]:
-    """Return a note if the policy in a trial is not this workspace's candidate."""
+def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[Finding, ...]:
+    """Return that the policy in a trial is not this workspace's candidate, if so."""
     known = candidate in workspace.candidate_ids()
     if policy is None or (known and policy == workspace.candidate_bytes(candidate)):
         return ()
-    return (f"the {candidate} that it ran is from another workspace, or was made again since",)
+    return (found("log.elsewhere", candidate),)
 
 
 def _check_candidate(
@@ -221,46 +224,44 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
     from grounded_trials.workspace.intake.opening.foreign import begun
 
-    trial, found = log.cut(candidate, start)
+    trial, grid = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
-    about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
-    early = found.interpolated_s / trial.dt > SLIGHT
-    about |= {INTERPOLATED: f"{found.interpolated_s:.3g}"} if early else {}
-    encoded = _encode(log.workspace, trial, about, found.start_ns)
+    about |= {ROWS: f"{grid.row_s:.6g}"} if grid.row_s and not candidate else {}
+    early = grid.interpolated_s / trial.dt > SLIGHT
+    about |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
+    encoded = _encode(log.workspace, trial, about, grid.start_ns)
+    remarks = [text for file in log_files(log.path) for text in table_remarks(file)]
     return Read(
         trial,
         encoded,
         (
-            *(one.sentence for file in log_files(log.path) for one in table_remarks(file)),
             *misread(log),
             *log.unlike_units,
             *log.unread,
-            *found.warnings,
+            *(as_finding(one, "log.reading") for one in (*remarks, *grid.warnings)),
+            *(() if candidate else begun(grid, trial.dt, trial.input_names)),
         ),
-        found.reports,
-        notes=() if candidate else tuple(begun(found, trial.dt, trial.input_names)),
+        grid.reports,
         log=log,
-        cut=found,
-        last_s=(found.last_ns - found.start_ns) * 1e-9,
+        cut=grid,
+        last_s=(grid.last_ns - grid.start_ns) * 1e-9,
     )
 
 
-def cut_short(read: Read, steps: int, told: str) -> Read:
-    """Cut a run in a foreign log after `steps`, with the warning `told`, if it is longer."""
+def cut_short(read: Read, steps: int, fell: Finding | None = None) -> Read:
+    """Cut a run in a foreign log after `steps`, where it failed, if it is longer."""
     if read.log is None or read.cut is None or read.trial.steps <= steps:
         return read
     trial, workspace = read.trial.until(steps), read.log.workspace
     about = _about(workspace, trial.candidate) | read.log.source
     data = _encode(workspace, trial, about, read.cut.start_ns)
-    warnings = (*read.warnings, told) if told else read.warnings
-    return replace(read, trial=trial, data=data, warnings=warnings, fell=bool(told))
+    return replace(read, trial=trial, data=data).telling(*([fell] if fell else []))
 
 
-def misread(log: ForeignLog) -> tuple[str, ...]:
-    """Return warnings on signals read from each other's column, or angles from something else."""
+def misread(log: ForeignLog) -> list[Finding]:
+    """Return the signals that are read from each other's column, or angles from something else."""
     model = log.workspace.base_model
-    odd = no_angles(model, log.mapping)
-    return (*crossed(model, log.mapping), *(f"{name} {said}" for name, said in odd.items()))
+    return [*crossed(model, log.mapping), *no_angles(model, log.mapping)]
 
 
 class NoneWaits(GroundedError):
@@ -312,8 +313,8 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
     refuse_as_another(workspace, path, (one,), wanted)
-    note = f"its rows are those of {one.stored.id}: it is the same recording, or a part of it"
-    return Read(one.trial, workspace.store.read(one.stored), notes=(note,), copy=True)
+    same = found("log.copy", one.stored.id)
+    return Read(one.trial, workspace.store.read(one.stored), (same,), copy=True)
 
 
 def is_stored(workspace: Folder, data: bytes) -> bool:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import listed
+from grounded.findings import Finding, found
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.resample import ABSOLUTE_S
@@ -90,13 +90,10 @@ class Aside:
     id: str
     candidate: str  # "" for data
 
-    def told(self, *, used: bool) -> str:
-        """Return the note that the log is used as before, or not, and how to change that."""
-        before = f"it was stored before, as {self.id}, {_what(self.candidate)}, which is set aside"
-        if not used:
-            return f"{before}. If it ran another candidate, name that with --candidate ID"
-        used_as = f"it is used as {_what(self.candidate)} again"
-        return f"{before}: {used_as}. To change that, use --candidate ID"
+    def finding(self, *, used: bool) -> Finding:
+        """Return that the log is used as before, or not."""
+        as_ = self.candidate or "data"
+        return found("log.before" if used else "log.not_used", self.id, ran=as_)
 
 
 def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
@@ -143,8 +140,8 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     raise _read_otherwise(log.path, names)
 
 
-def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
-    """Return a note if the latest estimated trials were estimated with another model."""
+def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[Finding, ...]:
+    """Return that the latest estimated trials were estimated with another model, if so."""
     if (now := log.source.get(ESTIMATED_WITH)) is None:
         return ()
     known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
@@ -152,13 +149,10 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[str, ...]:
     if not other or known[-1] is not other[-1]:
         return ()
     before = other[-1].meta.get(ESTIMATED_WITH, "")
-    names, states = listed(t.stored.id for t in other), log.source["estimated"].split(",")
-    now, before = (listed(s.split(",")) if s else "no effect" for s in (now, before))
-    return (
-        f"the model that estimates {listed(states)} has {now}; for {names} it had {before}. To "
-        f"have all estimates from one model, discard {names} and ingest "
-        f"{'that log' if len(other) == 1 else 'those logs'} again",
-    )
+    has, had = (tuple(s.split(",")) if s else ("no effect",) for s in (now, before))
+    trials = tuple(one.stored.id for one in other)
+    states = log.source["estimated"].split(",")
+    return (found("log.estimated", *states, now=has, before=had, trials=trials),)
 
 
 def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
@@ -275,13 +269,7 @@ def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
     return known[-1].id if fresh and waiting and waiting.id == trial.candidate else ""
 
 
-def what_repeats(workspace: Folder) -> str:
-    """Explain an exact repeat: no noise, or a copy if other trials of a candidate differ."""
+def others_differ(workspace: Folder) -> bool:
+    """Return whether other trials of one candidate differ, so that an exact repeat is a copy."""
     ran = [trial for trial in workspace.task_trials() if trial.candidate]
-    if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
-        return (
-            "other trials of one candidate differ, so it is probably a copy, or from a program "
-            "with a fixed seed: `discard` it and run again"
-        )
-    taken = "the system is treated as deterministic"
-    return f"{taken}, and no candidate is run a second time from now on"
+    return bool(scattered([trial.whole(workspace.task.horizon) for trial in ran]))

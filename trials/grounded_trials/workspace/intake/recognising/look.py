@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
+from grounded.findings import found
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
@@ -61,22 +60,22 @@ class Look:
         self.log = log.recording if log else None
         if log and read.log and self.log:
             start_of = cache(partial(_start_of, self.log))
-            self.found = found = start_of(own)
+            self.found = start = start_of(own)
             sender = sender_of(self.log, own, candidates, start_of)
             self.exact = sender.own is not None and sender.own.exact
             if sender.own is not None and sender.sure:
                 self.old = sender.own.old
-            behind = _behind(self.log, own.policy, found, self.old)
+            behind = _behind(self.log, own.policy, start, self.old)
             if behind:
                 self.found, self.exact, self.old = behind, True, None
                 if abs(behind.seconds - self.log.first) > ALIGNED * self.log.interval:
                     self._cut(read.log, apart, behind, own, task)
                 seen = judged(self.whole)
-            elif found and elsewhere(self.log, found, own.policy, seen.why):
-                self._cut(read.log, apart, found, own, task)
+            elif start and elsewhere(self.log, start, own.policy, why=bool(seen.why)):
+                self._cut(read.log, apart, start, own, task)
                 seen = judged(self.whole)
             if behind or sender.sure:
-                seen = replace(seen, why="", other="")
+                seen = replace(seen, why=None, other="")
             elif sender.other:
                 seen = replace(seen, why=sender.why, other=sender.other)
             elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
@@ -84,18 +83,17 @@ class Look:
                 told = best if best.other else seen if seen.why else replace(seen, why=best.why)
                 seen = replace(told, ran=seen.ran)
             guessed = [name for name in self.log.names[0] if name not in self.log.logged]
-            doubted = found and guessed and seen.why and not sender.sure
-            if found and doubted and on_other_speeds(self.log, own, candidates, start_of):
+            doubted = start and guessed and seen.why and not sender.sure
+            if start and doubted and on_other_speeds(self.log, own, candidates, start_of):
                 if self.read is read:
-                    self._cut(read.log, apart, found, own, task)
-                seen = replace(judged(self.whole), why="", other="")
-                notes = (*self.read.notes, _other_speeds(ran, guessed))
-                self.read = replace(self.read, notes=notes)
+                    self._cut(read.log, apart, start, own, task)
+                seen = replace(judged(self.whole), why=None, other="")
+                self.read = self.read.telling(found("log.speeds", *guessed, ran=ran))
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
-                seen = replace(seen, why="", other="")
+                seen = replace(seen, why=None, other="")
         if self.log and seen.why and not seen.other and not (self.found and self.found.opens_alike):
             for at in self.log.openings[:1]:  # told beside the rest before it, any difference grows
                 trial = self.log.trial_from(self.log.on_step(own.policy, at))
@@ -105,31 +103,25 @@ class Look:
         asked = read.log and not seen.other
         self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
         if self.fell and self.log:
-            first, steps = self.found.seconds if self.found else self.log.first, self.fell.steps
+            first, steps = self.found.seconds if self.found else self.log.first, self.fell[0]
             if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):
-                self.fell, seen = None, replace(seen, other=name)
+                self.fell, seen = (
+                    None,
+                    replace(seen, other=name, why=found("log.another", ran=ran, other=name)),
+                )
         self.suspicion = seen
 
     def _cut(
-        self, log: ForeignLog, apart: ForeignLog | None, found: Start, own: Candidate, task: Task
+        self, log: ForeignLog, apart: ForeignLog | None, start: Start, own: Candidate, task: Task
     ) -> None:
-        """Cut the run from a log where it begins, with a note."""
-        ran, begins = own.id, found.seconds + (_sooner(apart, log) if apart else 0)
-        there = cut_log(log, ran, begins)
-        warnings, notes = list(there.warnings), list(self.read.notes)
-        if found.missed:
-            warnings.insert(0, not_sent(task, ran, found.missed))
+        """Cut the run from a log where it begins."""
+        ran, begins = own.id, start.seconds + (_sooner(apart, log) if apart else 0)
+        self.read = replace(cut_log(log, ran, begins), before=self.read.before)
+        if start.missed:
+            self.read = self.read.telling(not_sent(task, ran, start.missed))
         elif begins > 0:
-            notes.append(f"the log begins {begins:.3f} s before {ran} does: that part is left out")
-        else:
-            notes.append(
-                f"its first command was logged {1e3 * -begins:.3g} ms after {ran} began, by the "
-                "times of the others"
-            )
-        self.read = replace(
-            there, warnings=tuple(warnings), notes=tuple(notes), before=self.read.before
-        )
-        cut = apart.cut(ran, found.seconds)[0] if apart else self.read.trial
+            self.read = self.read.telling(found("log.earlier_rows", ran=ran, seconds=begins))
+        cut = apart.cut(ran, start.seconds)[0] if apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
 
     @property
@@ -168,30 +160,21 @@ def _behind(log: Recording, policy: Policy, found: Start | None, old: Array | No
     return late if here and not there else None
 
 
-def _other_speeds(ran: str, guessed: Sequence[str]) -> str:
-    """Return the note on a run whose program had other speeds than the smoother finds."""
-    return (
-        f"most of its commands are within a few percent of those of {ran} on the {listed(guessed)} "
-        "that [estimate] finds here; its program used its own. To have them judged exactly, let it "
-        "log its own, and map them in [log] too"
-    )
-
-
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
     """Return by how much the first sample of the stored log is earlier [s]."""
     assert log.recording is not None and stored.recording is not None
     return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 
 
-def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
+def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> bool:
     """Return whether a run begins at the start found rather than at the log's first command.
 
     The first command of a busy computer may be late. If the run began with it, all others would be
     early, and would be compared with states that the program did not have yet.
     """
-    if found.missed or (found.between_rows and found.alike):
+    if start.missed or (start.between_rows and start.alike):
         return True
-    off = abs(found.seconds - log.first)
-    if not found.opens_alike or off <= ALIGNED * log.interval:
-        return found.alike and off > PUNCTUAL * log.dt and not log.late.any()
-    return bool(why) or found.exact or found.apart < CLEARLY * log.apart_at(policy, log.first)
+    off = abs(start.seconds - log.first)
+    if not start.opens_alike or off <= ALIGNED * log.interval:
+        return start.alike and off > PUNCTUAL * log.dt and not log.late.any()
+    return why or start.exact or start.apart < CLEARLY * log.apart_at(policy, log.first)

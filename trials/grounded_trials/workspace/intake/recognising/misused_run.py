@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.findings import found
 from grounded.model import Model
-from grounded.result import figure, listed, with_unit
+from grounded.result import figure, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import Clipped, clipped
@@ -43,22 +44,22 @@ SMOOTHED = 1.0  # [nats] that a filter costs before a log is seen
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
 
-def misuses(log: Recording, task: Task, own: Candidate, found: Start | None) -> Iterator[Story]:
+def misuses(log: Recording, task: Task, own: Candidate, start: Start | None) -> Iterator[Story]:
     """Yield the stories by which a program misused its candidate.
 
     Args:
         log: a log whose commands are not the candidate's.
         task: the task with the control step.
         own: the candidate.
-        found: the start that fits best, if any.
+        start: the start that fits best, if any.
     """
     yield from exactly_misused(log, task, own)
-    if clock := other_clock(log, own.policy):
-        said, step, error = clock
+    if clock := other_clock(log, own):
+        finding, step, error = clock
         rest = replace(own, predicted_states=own.predicted_states[step:])
         if run := log.trial_from(log.on_step(own.policy, log.openings[0])):
-            yield scored(Kind.PROGRAM, said, rest, run, error)
-    yield from cut_in(log, own, found)
+            yield scored(Kind.PROGRAM, finding, rest, run, error)
+    yield from cut_in(log, own, start)
     if log.whole.inputs.any():
         yield from misused_in(log, task, own)
     yield from other_origin(log, task.model, own)
@@ -75,15 +76,15 @@ def exactly_misused(log: Recording, task: Task, own: Candidate) -> Iterator[Stor
     first, every = _steps_of(log, own)
     misuses = ways(task.model, own, unsent=False)
     tried = [(*one, way) for way in misuses for one in _begins(every, way)]
-    found = list[tuple[float, Way, Trial]]()
+    some = list[tuple[float, Way, Trial]]()
     for _, k, way in sorted(tried, key=lambda one: one[0])[:ALL]:
         at = first + k * log.dt
         left, run = _left(log, own, way, at), log.trial_from(at)
         if left < EXACT and run and apart(own, run) <= apart(own, way.passed(run)):
-            found.append((left, way, run))  # else rather the log is wrong
-    if found:
-        left, way, run = likeliest(found)
-        yield scored(Kind.PROGRAM, way.said, own, run, left)
+            some.append((left, way, run))  # else rather the log is wrong
+    if some:
+        left, way, run = likeliest(some)
+        yield scored(Kind.PROGRAM, way.finding, own, run, left)
 
 
 def misused_in(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
@@ -100,10 +101,10 @@ def misused_in(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
             run = trial.until(min(trial.finite_steps, task.horizon))
             plain = follows(own.policy, run, latest(task))
             if plain and not plain.beyond and (one := misused(task, own, run, plain, acts=acts)):
-                yield scored(Kind.PROGRAM, one[1].said, own, run, one[0])
-            if found := smoothed(task.model, own, run):
-                said = f"they are {found.told(own)}"
-                yield scored(Kind.PROGRAM, said, own, run, found.left, price=SMOOTHED)
+                yield scored(Kind.PROGRAM, one[1].finding, own, run, one[0])
+            if smooth := smoothed(task.model, own, run):
+                told = smooth.finding(own)
+                yield scored(Kind.PROGRAM, told, own, run, smooth.left, price=SMOOTHED)
 
 
 def other_origin(log: Recording, model: Model, own: Candidate) -> Iterator[Story]:
@@ -146,20 +147,13 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> Iterator[Story
         does = np.abs(gains * by).max(axis=0) > ORIGIN * np.abs(off).max()
         if does.sum() < 2:  # of one state, its sensor's zero may differ as well
             continue
-        told = [
-            f"{name} {with_unit(figure(by[i], 2), unit)}"
-            for i, (name, unit) in enumerate(model.states.items())
-            if does[i]
-        ]
-        said = (
-            f"they are what {own.id} sends on states from another origin, {listed(told)} beside "
-            "those in the log: does its program set a zero of its own, or take them from another "
-            "frame? Pass `runner.action` the states as they are logged"
-        )
-        yield scored(Kind.PROGRAM, said, own, trial, left, price=0.5 * does.sum())
+        shares = zip(model.states.items(), by, does, strict=True)
+        beside = tuple(f"{n} {with_unit(figure(x, 2), u)}" for (n, u), x, is_ in shares if is_)
+        told = found("run.origin", ran=own.id, off=beside)
+        yield scored(Kind.PROGRAM, told, own, trial, left, price=0.5 * does.sum())
 
 
-def cut_in(log: Recording, own: Candidate, found: Start | None) -> Iterator[Story]:
+def cut_in(log: Recording, own: Candidate, start: Start | None) -> Iterator[Story]:
     """Yield that a program cut its candidate's commands inside their limits, wherever it began.
 
     Multiplied by any large number, commands that a cut holds at one value are at their limit, as
@@ -168,9 +162,9 @@ def cut_in(log: Recording, own: Candidate, found: Start | None) -> Iterator[Stor
     Args:
         log: a log whose commands are not the candidate's.
         own: the candidate.
-        found: the start that fits best, if any.
+        start: the start that fits best, if any.
     """
-    starts = [*([found.seconds] if found else []), log.first, *log.openings[:TRIED]]
+    starts = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
     for begins in dict.fromkeys(log.on_step(own.policy, one) for one in starts):
         if (trial := log.trial_from(begins)) and (cut := clipped(own, trial)):
             if not _was_sent(own, cut, log):
@@ -181,8 +175,8 @@ def cut_in(log: Recording, own: Candidate, found: Start | None) -> Iterator[Stor
             sent, fit = commanded(within, run), follows(within, run, 0)
             off = (np.abs(sent.asked - sent.sent) / sent.size).max(axis=1)
             if (off <= NEAR).mean() >= MOSTLY or (fit and fit.alike):
-                said, error = f"they are {cut.told(own)}", float(np.median(off))
-                yield scored(Kind.PROGRAM, said, own, run, error)
+                error = float(np.median(off))
+                yield scored(Kind.PROGRAM, cut.finding(own), own, run, error)
                 return
 
 

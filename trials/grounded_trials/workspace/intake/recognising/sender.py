@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.findings import Finding, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import (
@@ -30,6 +31,7 @@ LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower ga
 THEIRS = 0.05  # largest median difference, relative to size, of another that is said to have run
 CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
 LATEST = 3  # steps by which commands may be logged late
+EXACT_TO = 1e-4  # of a command: smaller differences count as this
 ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 
 
@@ -53,7 +55,7 @@ class Sender:
 
     own: ActedOn | None  # None if the log is too short
     other: str = ""  # another candidate whose commands they are, or ""
-    why: str = ""  # the reason
+    why: Finding | None = None  # the reason
 
     @property
     def sure(self) -> bool:
@@ -75,8 +77,8 @@ def sender_of(
         candidates: candidates that may have been run instead.
         start_of: returns where a candidate's run seems to begin in the log.
     """
-    found = start_of(own)
-    begins = log.first if found is None else found.seconds
+    start = start_of(own)
+    begins = log.first if start is None else start.seconds
     mine = acted_on(log, own.policy, begins)
     if mine is None or mine.exact:
         return Sender(mine)
@@ -85,7 +87,7 @@ def sender_of(
     late = ran is not None and ran.alike and ran.late != 0  # late commands belong to other steps
     for one in reversed(candidates):
         at = begins
-        if (found is None or not found.alike) and (begun := start_of(one)) and begun.opens_alike:
+        if (start is None or not start.alike) and (begun := start_of(one)) and begun.opens_alike:
             at = begun.seconds
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
         if fit is None or _one(mine, fit):
@@ -98,13 +100,9 @@ def sender_of(
             break
     if not name:
         return Sender(mine)
-    are = "are" if theirs.exact else "seem to be"
-    why = (
-        f"on the samples that it had, half of its commands are within {theirs.percent} of what "
-        f"{name} sends, but only within {mine.percent} of what {own.id} sends: they {are} those of "
-        f"{name}. Was {own.id} copied to the robot?"
-    )
-    return Sender(mine, name, why)
+    why = found("log.another", ran=own.id, other=name, nats=best)
+    left = {"theirs": max(theirs.left, EXACT_TO), "mine": max(mine.left, EXACT_TO)}
+    return Sender(mine, name, why.also(**left))
 
 
 def on_other_speeds(
@@ -125,8 +123,8 @@ def on_other_speeds(
         candidates: candidates that may have been run instead.
         start_of: returns where a candidate's run seems to begin in the log.
     """
-    found = start_of(own)
-    mine = acted_on(log, own.policy, log.first if found is None else found.seconds)
+    start = start_of(own)
+    mine = acted_on(log, own.policy, log.first if start is None else start.seconds)
     if mine is None or not mine.usually:
         return False
     for one in candidates:
@@ -144,12 +142,12 @@ def rival_in(
     start_of: Callable[[Candidate], Start | None],
 ) -> Trial | None:
     """Return the log cut where another candidate fits much better than the own one anywhere."""
-    found = start_of(own)
-    best, bound = None, SAME * found.apart if found and found.alike else np.inf
+    start = start_of(own)
+    best, bound = None, SAME * start.apart if start and start.alike else np.inf
     for one in candidates:
-        start = start_of(one) if one.id != own.id else None
-        if start is not None and start.alike and start.apart < bound:
-            best, bound = log.trial_from(start.seconds), start.apart
+        begun = start_of(one) if one.id != own.id else None
+        if begun is not None and begun.alike and begun.apart < bound:
+            best, bound = log.trial_from(begun.seconds), begun.apart
     return best
 
 

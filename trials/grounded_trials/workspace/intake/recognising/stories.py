@@ -14,6 +14,7 @@ from enum import Enum
 from math import log
 from typing import Any
 
+from grounded.findings import Finding
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.who_drove import FINE
@@ -26,7 +27,6 @@ class Kind(Enum):
     """What a story is about, which decides how it is told."""
 
     UNIT = "columns of the log times a factor"
-    PACE = "the stamps of the log times a factor"
     LOG = "another fault of the log"
     PROGRAM = "the program misused its candidate"
     ROBOT = "the robot acted otherwise than it was told"
@@ -42,7 +42,7 @@ class Story:
 
     Args:
         kind: what it is about.
-        said: what it is, and what to do about it: a clause.
+        finding: what it is, and what to do about it; None for columns times a factor.
         commands: what it leaves of the commands [nats], the logarithm of their relative error.
         motion: how far the robot is from its prediction then [nats].
         price: what it costs before a log is seen [nats].
@@ -52,7 +52,7 @@ class Story:
     """
 
     kind: Kind
-    said: str = ""
+    finding: Finding | None = None
     commands: float = 0.0
     motion: float = 0.0
     price: float = 0.0
@@ -66,21 +66,23 @@ class Story:
         return self.commands + self.motion + self.price
 
 
-def scored(kind: Kind, said: str, own: Candidate, run: Trial, error: float, **other: Any) -> Story:
+def scored(
+    kind: Kind, finding: Finding | None, own: Candidate, run: Trial, error: float, **other: Any
+) -> Story:
     """Return a story with its score.
 
     Args:
         kind: what it is about.
-        said: the clause.
+        finding: what to tell of it.
         own: the candidate whose commands these are.
         run: the trial as it was by the story.
         error: what is left of the commands, relative to their size.
         other: further fields of `Story`.
     """
-    return Story(kind, said, log(error + FINE), apart(own, run), **other)
+    return Story(kind, finding, log(error + FINE), apart(own, run), **other)
 
 
 def likeliest(stories: Iterable[Story | None], as_logged: Story) -> Story:
     """Return the story that explains a log best; `as_logged` unless one leads it clearly."""
-    found = [one for one in stories if one and one.left < as_logged.left - CLEAR]
-    return min(found, key=lambda one: one.left, default=as_logged)
+    some = [one for one in stories if one and one.left < as_logged.left - CLEAR]
+    return min(some, key=lambda one: one.left, default=as_logged)

@@ -10,48 +10,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import listed, measured_alike
 from grounded.search.planner import Planner
 from grounded.search.safety import coasting
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.off_target import (
-    position_axes,
     rates_among,
     reaches,
-    roles_of,
     weighed_groups,
 )
 
 AWAY = 0.02  # drift after a run, relative to the target's extent, above which it is reported
 DEAR = 0.2  # of the run's cost: what its end would cost more where the robot came to be after it
 SURE = 3.0  # standard deviations of the noise by which the farthest of some samples is off
-REACHED = 0.05  # of the target's extent: a plan that ends farther away does not reach it
-LAST_STEPS, AT_LIMIT = 3, 1e-3  # steps of a kick; distance from a limit, as a share of the range
 SETTLED = 5.0  # [s] for which an input is held until the memory of effects has settled
 CAUSED = 0.5  # share of the drift that the model must predict from rest, under the input held
 GROWS = 1.5  # of a push, not of a speed: the second half of the drift exceeds the first by this
 FASTER = 2.0  # and the drift exceeds by this what the speed at the end gives
 
 
-@dataclass(frozen=True)
-class Drift:
-    """What a robot did after its run: the warning, which states moved, and how far at most."""
+def _drifted(
+    task: Task, name: str, what: str, far: float, near: float, steps: int
+) -> dict[str, Any]:
+    """Return how far what was, and when, as facts."""
+    unit = task.model.states[name]
+    later, then = Quantity(float(far), unit), Quantity(float(near), unit)
+    return {"what": what, "far": later, "near": then, "after": Quantity(steps * task.dt, "s")}
 
-    said: str
-    states: str
-    far: float
 
-
-def moved_on(planner: Planner, whole: Trial) -> Drift | None:
-    """Return a warning if a robot that was to reach a point drifts away from it after the run.
+def moved_on(planner: Planner, whole: Trial) -> Finding | None:
+    """Return that a robot that was to reach a point drifts away from it after the run, or None.
 
     Only if the inputs are constant after the run, so that nobody drove it. What counts is how far
     the first group of states moved, and what the end of the run would cost more where any group
@@ -76,18 +73,12 @@ def moved_on(planner: Planner, whole: Trial) -> Drift | None:
             break
     else:
         return None
-    later, then = measured_alike([far[worst], far[end]], task.model.states[groups[k][0][0]])
-    was = (
-        f"{(worst - end) * task.dt:.2g} s after the run {groups[k][1]} was {later} from its "
-        f"target, at its end {then}: "
-    )
-    drift = off[worst] - off[end]
-    if away and let_go(planner, whole, states, worst - end, drift):
-        said = _to_hold(planner, whole, held[-1])
-    else:
-        stay = _to_stay(task, states)
-        said = f"[reward] only judges the run. To make the robot stay there, {stay}"
-    return Drift(was + said, groups[k][1], float(far[worst]))
+    names, what = groups[k]
+    facts = _drifted(task, names[0], what, far[worst], far[end], worst - end)
+    if away and let_go(planner, whole, states, worst - end, off[worst] - off[end]):
+        sent, would = _told(task.model, held[-1]), _to_hold(planner, whole)
+        return found("run.let_go", *names, held=sent, would=would, **facts)
+    return found("run.moved_on", *names, **facts)
 
 
 def _from_target(task: Task, run: Array, states: Sequence[int]) -> tuple[Array, float]:
@@ -140,66 +131,37 @@ def _at_rest(planner: Planner, whole: Trial) -> Trial:
     return planner.lift(replace(whole, states=states, inputs=inputs, start_inputs=u))
 
 
-def _to_hold(planner: Planner, whole: Trial, held: Array) -> str:
-    """Return that the input sent after a run does not hold the robot, and what would."""
-    from grounded_trials.workspace.candidates.at_rest import moves_by, resting
+def _to_hold(planner: Planner, whole: Trial) -> tuple[str, ...]:
+    """Return the constant input that would hold the robot where its run ended; () if unknown."""
+    from grounded_trials.workspace.candidates.at_rest import resting
 
     model, memory = planner.task.model, np.arange(planner.plan.model.n) >= planner.task.model.n
     rest = _at_rest(planner, whole)
-    there = replace(planner.plan, start=rest.states[-1], past=held)
-    with np.errstate(all="ignore"):
-        found = resting(there, memory, replace(planner.loose, start=there.start, past=held))
-        lost = found is None and moves_by(there, memory) > 0
-
-    own = "" if found is None else _told(model, found[len(memory) :], 2)
-    would = f" (by the model {own} would)" * bool(own)
-    then = "Switch to a controller that holds it as soon as `runner.done(t)` is true"
-    if lost:  # such as a boat in a current from the side
-        would = " (and by the model no constant input holds all its states as they were then)"
-    else:
-        then += (
-            "; or, if the robot may have the input that holds it before the run too, set that in "
-            "[task] start"
-        )
-    return (
-        f"after it the runner sends {_told(model, held)}, which does not hold it there{would}. "
-        f"{then}. No weight in [reward] changes this"
+    there = replace(
+        planner.plan, start=rest.states[-1], past=whole.inputs[planner.task.horizon + 1]
     )
+    with np.errstate(all="ignore"):
+        own = resting(there, memory, replace(planner.loose, start=there.start, past=there.past))
+    return () if own is None else _told(model, own[len(memory) :], 2)
 
 
-def _told(model: Model, inputs: Array, digits: int = 3) -> str:
-    """Return the inputs (m,) as `force = 0 N and steer = 0.1 rad`."""
+def _told(model: Model, inputs: Array, digits: int = 3) -> tuple[str, ...]:
+    """Return the inputs (m,) as `force = 0 N` and `steer = 0.1 rad`."""
     pairs = zip(model.inputs.items(), inputs + 0.0, strict=True)
-    return listed(with_unit(f"{name} = {value:.{digits}g}", unit) for (name, unit), value in pairs)
+    return tuple(with_unit(f"{name} = {v:.{digits}g}", unit) for (name, unit), v in pairs)
 
 
-def _to_stay(task: Task, states: Sequence[int]) -> str:
-    """Return what would make a robot stay at the end of its target that the task lacks."""
-    from grounded.places import integrals
-
-    end = task.target[-max(2, len(task.target) // 20) :, states]
-    rates = [one.j for one in integrals(task.model) if one.exact and one.i in states]
-    if {*states} & {*position_axes(task.model)}:
-        rates += roles_of(task.model).get("speed", [])  # of a boat or car, along its own axes
-    ways = ["let the target rest at its end (target --hold)"] * bool(np.ptp(end, axis=0).any())
-    if not rates or not (task.reward.terminal[rates] > 0).all():
-        ways.append("weigh the rates at the end ([reward] terminal)")
-    return ", or ".join(ways) or "let the target rest for longer (target --hold)"
-
-
-def left_afterwards(task: Task, whole: Trial) -> list[str]:
-    """Return a warning if the robot left [safety] after a run that stayed inside."""
+def left_afterwards(task: Task, whole: Trial) -> Finding | None:
+    """Return that the robot left [safety] after a run that stayed inside, or None."""
     assert task.safety_low is not None and task.safety_high is not None
     states = whole.states[: whole.finite_steps + 1]
     out = np.maximum(task.safety_low - states, states - task.safety_high)
     if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
-        return []
+        return None
     t, i = np.unravel_index(int(np.argmax(out)), out.shape)
     first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
     name, unit = list(task.model.states.items())[int(i)]
-    low, high = task.safety_low[i], task.safety_high[i]
-    return [
-        f"{first * whole.dt:.2g} s after its end the robot left [safety] {name} = [{low:g}, "
-        f"{high:g}]: {name} was {with_unit(f'{states[t, i]:.3g}', unit)}. Stop it in time, or let "
-        "the target end at rest inside"
-    ]
+    most = float(states[t, i])
+    bound = Quantity(float(np.clip(most, task.safety_low[i], task.safety_high[i])), unit)
+    after = Quantity(first * whole.dt, "s")
+    return found("run.after_safety", name, after=after, bound=bound, most=Quantity(most, unit))

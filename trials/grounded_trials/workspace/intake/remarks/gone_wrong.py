@@ -16,33 +16,29 @@ discarded, or restored, or a candidate was handed out after it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.errors import NextCommand
-from grounded.result import listed
+from grounded.findings import Finding, Weight, found, settle
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import like_predicted
 from grounded.search.returned.who_drove import LEAST
 from grounded.search.step.mispredictions import STRAYED
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.wording import ranges
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.lagging import lagging
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.read_before import paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
-    from grounded.search.returned.reversed_input import Reversed
 
 FAR = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 NEAR = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
@@ -50,27 +46,16 @@ GROWN = 1.5  # times as far from the prediction at the end as before: farther of
 END = LEAST // 2  # last steps, in most of which a state has to be that far off: noise is not
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A question about a trial, and whether it is to be set aside unless the answer is no."""
-
-    said: str
-    aside: bool = True
-
-
 def gone_wrong(
     workspace: Folder, trial: Trial, tried: Tried | None, history: Sequence[Tried]
-) -> Asked | None:
-    """Return a question about a trial with an input reversed, or a run that went far astray.
+) -> Finding | None:
+    """Return what seems wrong with a trial: an input reversed, or a run that went far astray.
 
     Args:
         workspace: the workspace with the model.
         trial: the trial as stored, with short gaps bridged.
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
-
-    Returns:
-        None if nothing is wrong with it.
     """
     from grounded.search.returned.reversed_input import beside_friction, reversed_input
 
@@ -78,35 +63,19 @@ def gone_wrong(
     missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
     astray = missed > FAR * usual
     run = trial.until(workspace.task.horizon) if trial.candidate else trial
-    found = (reversed_input if astray else beside_friction)(workspace.planner, run)
-    if found:
-        return _is_it_wired(workspace, trial, found)
-    odd = _unlike_its_runs(workspace, trial, tried) if tried is not None else ""
-    if odd:
-        return Asked(odd)
-    if tried is None or not (others and astray and STRAYED * usual < missed < math.inf):
+    if turned := (reversed_input if astray else beside_friction)(workspace.planner, run):
+        return _is_it_wired(workspace, trial, turned)
+    if tried is None:
         return None
-    return Asked(
-        f"it missed its prediction by {missed:,.3g}, {missed / usual:,.3g} times what runs miss or "
-        "cost otherwise: did it run as it should? If not (a motor, a sensor, somebody in the way), "
-        f"`discard {trial.id}` and run {tried.candidate.id} again; if it did, `propose` goes on"
-    )
-
-
-def _unlike_its_runs(workspace: Folder, trial: Trial, tried: Tried) -> str:
-    """Return the question about a run that cost many times what its candidate's others did; ""."""
-    each = zip(tried.trials, tried.utilities, strict=True)
-    others = {one.id: -u for one, u in each if one.id != trial.id and math.isfinite(u)}
-    cost, most = -workspace.task.utility(trial), max(others.values(), default=math.inf)
-    if not (most > 0 and FAR * most < cost < math.inf):
-        return ""
-    name, runs = tried.candidate.id, "other run" if len(others) == 1 else "worst other run"
-    return (
-        f"it cost {cost:,.3g}, {cost / most:,.2g} times as much as the {runs} of {name} "
-        f"({ranges([*others])}): did it run as it should? If not (the program, a motor, a sensor, "
-        f"somebody in the way), `discard {trial.id}` and run {name} again; if it did, `propose` "
-        "goes on"
-    )
+    ran, each = tried.candidate.id, zip(tried.trials, tried.utilities, strict=True)
+    same = {one.id: -u for one, u in each if one.id != trial.id and math.isfinite(u)}
+    cost, most = -workspace.task.utility(trial), max(same.values(), default=math.inf)
+    if most > 0 and FAR * most < cost < math.inf:
+        one = found("run.astray", ran=ran, trial=trial.id, cost=cost, times=cost / most)
+        return one.also(others=tuple(same))
+    if others and astray and STRAYED * usual < missed < math.inf:
+        return found("run.astray", ran=ran, trial=trial.id, missed=missed, times=missed / usual)
+    return None
 
 
 def _missed(
@@ -122,36 +91,20 @@ def _missed(
     return tried.promised - workspace.task.utility(trial), usual
 
 
-def _is_it_wired(workspace: Folder, trial: Trial, found: Reversed) -> Asked:
-    """Return the question about an input that acted the other way round, given the other trials."""
+def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
+    """Return that an input acted the other way round, given the other trials."""
     from grounded.search.returned.reversed_input import signs_of
 
     each = [
-        (one.id, signs_of(workspace.planner, one)[found.input])
+        (one.id, signs_of(workspace.planner, one)[turned.about[0]])
         for one in diagnosable(workspace)
         if one.id != trial.id
     ]
-    right, wrong = ([name for name, sign in each if sign == s] for s in (1, -1))
-    again = f"mend it and run {trial.candidate} again" if trial.candidate else "mend it"
-    if right and trial.candidate and _elsewhere(workspace, found.input, right):
-        return Asked(
-            f"{found.said}. [log.input.{found.input}] reads another column now than for "
-            f"{ranges(right)}: is that right? If not, `discard {trial.id}`, correct it and ingest "
-            "the log again; if it is, `propose` goes on"
-        )
-    if right:
-        wired = f"Is it wired, or its sign switched, otherwise than in {ranges(right)}?"
-        if not trial.candidate:
-            return Asked(f"{found.said}. {wired} Then `discard {trial.id}` and {again}")
-    elif trial.candidate:
-        wired = "Is it wired the wrong way round, or is its sign in the model wrong?"
-    else:
-        told = "Is its sign in the log or in the model wrong? `diagnose` says what to change"
-        return Asked(f"{found.said}. {told}", aside=False)
-    like = f", as in {ranges(wrong)}" if wrong and not right else ""
-    return Asked(
-        f"{found.said}{like}. {wired} Then `discard {trial.id}`, {again}; if not, `propose` goes on"
-    )
+    right, wrong = (tuple(name for name, sign in each if sign == s) for s in (1, -1))
+    said = turned.also(others=right, alike=() if right else wrong, trial=trial.id)
+    if right and trial.candidate and _elsewhere(workspace, turned.about[0], right):
+        return said.also(column=f"[log.input.{turned.about[0]}]")
+    return said if right or trial.candidate else said.weighing(Weight.WARN)
 
 
 def _elsewhere(workspace: Folder, name: str, trials: Sequence[str]) -> bool:
@@ -163,8 +116,8 @@ def _elsewhere(workspace: Folder, name: str, trials: Sequence[str]) -> bool:
     return all(paths_of(metas[one], [name]) not in ((), own) for one in trials if one in metas)
 
 
-def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Asked | None:
-    """Return what a run that ended early counts as, and what to do; None if it did not.
+def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Finding | None:
+    """Return that a run ended early; None if it did not.
 
     Args:
         workspace: the workspace with the task and the candidates.
@@ -175,28 +128,19 @@ def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> 
     if not run.candidate or run.steps >= task.horizon or run.whole(task.horizon) is not run:
         return None
     own, _ = workspace.candidate(run.candidate)
-    name, part = own.id, f"{run.steps} of {task.horizon} steps ({run.steps * run.dt:.2f} s)"
-    ends = f"all states are known for {part} only"
-    why = "Was the recording cut off, or the robot stopped?"
-    if silent:
-        has = "has" if len(silent) == 1 else "have"
-        ends += f", as {listed(silent)} {has} no values after that, though the log goes on"
-        why = (
-            f"Did the sensor of {listed(silent)} fail or lose the robot, or was the robot stopped?"
-        )
-    complete = _complete(workspace, run)
-    before = f"{name} ran to the end before ({complete}). " if complete else ""
-    if as_before(task, own, run):
-        return Asked(
-            f"{ends}; the robot was as near to its prediction there as before. {before}{why} Then "
-            f"`discard {run.id}`, run {name} again and record it to its end. If it crashed there, "
-            f"`propose` goes on: {name} counts as failed"
-        )
-    return Asked(
-        f"the run ended after {part}: a failed candidate; its data stay usable for fit and "
-        f"diagnose. {before}Use `discard {run.id}` if you stopped it for another reason, or if "
-        "only the recording was cut off",
-        aside=False,
+    complete = tuple(
+        one.id
+        for one in workspace.task_trials()
+        if one.candidate == own.id and one.whole(task.horizon).finite_steps >= task.horizon
+    )
+    return found(
+        "run.early" if as_before(task, own, run) else "run.failed",
+        ran=own.id,
+        trial=run.id,
+        steps=run.steps,
+        horizon=task.horizon,
+        silent=tuple(silent),
+        complete=complete,
     )
 
 
@@ -224,18 +168,8 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     return bool(all(inside) and (end <= known).all())
 
 
-def _complete(workspace: Folder, run: Trial) -> str:
-    """Return the runs of the same candidate that were complete, as text."""
-    horizon = workspace.task.horizon
-    return ", ".join(
-        one.id
-        for one in workspace.task_trials()
-        if one.candidate == run.candidate and one.whole(horizon).finite_steps >= horizon
-    )
-
-
-def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
-    """Return why the last trial should be discarded, a sentence each, and the command for it.
+def unanswered(workspace: Folder) -> tuple[tuple[Finding, ...], NextCommand | None]:
+    """Return why the last trial should be discarded, and the command for it.
 
     Args:
         workspace: the workspace with the trials.
@@ -247,27 +181,28 @@ def unanswered(workspace: Folder) -> tuple[tuple[str, ...], NextCommand | None]:
     last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
     if last is None or "~" in last.trial.candidate or _decided(workspace, last):
         return (), None
-    trial, own, name = last.trial, "source" not in last.meta, last.stored.id
-    if said := workspace.noted.asked.get(last.stored.digest, ""):
-        unless = f"`discard {name}`, unless it ran {trial.candidate}; then `propose` goes on"
-        why = f"{name}: {said}{'' if said.endswith('?') else '.'} {unless}"
-        return (why,), NextCommand("discard", (name,))
-    told = [one.told(trial, own=own) for one in log_faults(workspace, trial)]
-    told += filter(
-        None, [ran_otherwise(workspace, last.measured, lagging(workspace, last.measured))]
-    )
-    begun = begun_elsewhere(workspace, last.measured)
-    told += [begun.told] if begun and begun.again else []
-    if not told:
-        from grounded_trials.workspace.candidates.search_state import standing_in
+    some = settle(_open(workspace, last))
+    aside = tuple(one for one in some if one.weight is Weight.ASIDE)
+    return aside, NextCommand("discard", (last.stored.id,)) if aside else None
 
-        history = standing_in(workspace).history
-        tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-        wrong = gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-        early = ended_early(workspace, last.measured)
-        told = [one.said for one in (wrong, early) if one and one.aside][:1]
-    then = NextCommand("discard", (name,)) if told else None
-    return tuple(f"{name}: {one}" for one in told), then
+
+def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding]:
+    """Yield what a stored trial shows that may be a reason to discard it, dear checks last."""
+    if last.stored.digest in workspace.noted.asked:
+        yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
+        return
+    some = [*log_faults(workspace, last.trial, own="source" not in last.meta)]
+    some += filter(None, [ran_otherwise(workspace, last.measured)])
+    some += filter(None, [begun_elsewhere(workspace, last.measured)])
+    yield from some
+    if any(one.weight is Weight.ASIDE for one in some):
+        return
+    from grounded_trials.workspace.candidates.search_state import standing_in
+
+    history = standing_in(workspace).history
+    tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
+    wrong = gone_wrong(workspace, interpolate_gaps(last.trial).trial, tried, history)
+    yield from filter(None, [wrong, ended_early(workspace, last.measured)])
 
 
 def _decided(workspace: Folder, last: StoredTrial) -> bool:

@@ -6,27 +6,24 @@ s_0. A run whose utility it changes much says nothing about its candidate, and m
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
-from grounded.result import listed
 from grounded.search.difference import student
 from grounded.search.returned.who_drove import LEAST
 from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.wording import in_digits_apart, with_unit
 from grounded_trials.workspace.candidates.standing_without import standing_without
 from grounded_trials.workspace.candidates.standstill import SAME, standstills
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import began_elsewhere
 from grounded_trials.workspace.placing import FEWEST, Placing, placing
-from grounded_trials.workspace.user_files.config import FILE
 
 # share of the mean cost of a step above which a start away from s_0 brings a warning; for a state
 # without weight along the way, share of its range in the run
@@ -38,24 +35,10 @@ WORSE = 10.0  # times the promised cost: beside a worse run every offset would s
 SPOILT = 0.2  # share of the run's cost by which the start changes it too much,
 UNKNOWN = 0.5  # and by which it does while too few other runs tell how the robot is placed
 TOLD = 0.05  # the same from which the change is told of a start that spoils nothing
-ALIKE = 0.05  # difference of two changes of a utility, relative, that is not told
 ALWAYS = 3  # runs that begin alike, from which on they always do
 
 
-@dataclass(frozen=True)
-class Begun:
-    """A run that started elsewhere.
-
-    Args:
-        told: the warning: the states, and one verdict on the run.
-        again: whether the run must be discarded and run again.
-    """
-
-    told: str
-    again: bool
-
-
-def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
+def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     """Return in which states a run did not start at s_0, beyond sensor noise; None if in none.
 
     It spoils the utility if by the model it changes much of it, or by more than the run lost to the
@@ -75,7 +58,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
         return None
     off = task.model.difference(trial.began, task.start)
     if always := _always_there(workspace, trial, off):
-        return Begun(always, again=False)
+        return always
     if (far := _far_off(workspace, trial, off)) is None:
         return None
     cost = abs(task.utility(trial))
@@ -85,45 +68,31 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Begun | None:
     placed, repeats = placing(workspace, but=trial.id), _to_repeat(workspace, trial)
     unknown, perhaps = max(placed.runs) < FEWEST, _perhaps(off, placed)
     within = np.abs(off) <= SURE * np.nan_to_num(placed.rms)
-    spoils, tolerated, usual = list[int](), list[int](), list[int]()
+    spoils, counts, usual = list[int](), list[int](), False
     for i in far.states:
         changes = _changes(workspace, trial, off * (np.arange(len(off)) == i))
         explains = 0 < lost < -changes and not repeats
         if abs(changes) > scatter and (abs(changes) > SPOILT * cost or explains):
             open_ = (unknown or perhaps[i]) and abs(changes) < UNKNOWN * cost
-            as_others = within[i] or (open_ and not unknown)
-            (usual if as_others else tolerated if open_ else spoils).append(i)
+            as_others = bool(within[i]) or (open_ and not unknown)
+            usual |= as_others
+            (counts if as_others or open_ else spoils).append(i)
         elif not within[i] or far.share[i] > MUCH:
-            tolerated.append(i)
-    if not (spoils or tolerated or usual):
+            counts.append(i)
+    if not (spoils or counts):
         return None
-    named = (*spoils, *usual, *tolerated)
-    where = "; ".join(_placed(task, trial, i, off[i]) for i in named)
-    where += _less_far(task, off, [i for i in far.beyond_noise if i not in named])
     whole = _changes(workspace, trial, off)
-    by_model = f"By the model its whole start changes its utility by {whole:+.3g}"
-    does = "The run counts, no need to repeat it. Place the robot nearer to the start next time"
+    i = (*spoils, *counts)[0]
+    facts = {"ran": trial.candidate, "trial": trial.id, **_placed(task, trial, i, off[i])}
+    if abs(whole) > max(scatter, TOLD * cost):
+        facts["change"] = whole
+    names = tuple(task.model.state_names[k] for k in (*spoils, *counts))
     if spoils:
-        of = _changes(workspace, trial, off * np.isin(np.arange(len(off)), spoils))
-        does = _to_discard(trial, listed(task.model.state_names[i] for i in spoils), of, whole)
-    elif repeats:
-        why = "that explains" if lost > 0 else "where its runs began explains"
-        does = (
-            f"The run counts; by the model {why} much of what {trial.candidate} lost, so it is to "
-            "be run once more. Place the robot nearer to the start"
-        )
-    elif usual:
-        does = _as_others_began(task, placed, usual, sure=bool(within[usual].all()))
-        does = f"{does}. {by_model}: place the robot more exactly, or average runs ([search] "
-        does += "repeats), to see smaller gains"
-    else:
-        if unknown:
-            does += f" (after {FEWEST + 1} runs, a start is compared with where the others began)"
-        if abs(whole) > max(scatter, TOLD * cost):
-            does = f"{by_model}. {does}"
-    return Begun(
-        f"the run started with {where}, more than the noise in the log. {does}", bool(spoils)
-    )
+        return found("run.start_spoils", *names, **facts)
+    if usual and not repeats:
+        unit = list(task.model.states.values())[i]
+        facts |= {"runs": int(placed.runs[i]), "rms": Quantity(float(placed.rms[i]), unit)}
+    return found("run.start", *names, again=repeats, unknown=unknown, **facts)
 
 
 @dataclass(frozen=True)
@@ -132,7 +101,6 @@ class _Far:
 
     states: list[int]
     share: Array  # (n,) of the cost of a mean step; without weight, of the range in the run
-    beyond_noise: list[int]  # states that cost at each step, and are off by more than noise
     failed: bool  # the run left [safety]
 
 
@@ -161,32 +129,7 @@ def _far_off(workspace: Folder, trial: Trial, off: Array) -> _Far | None:
     clear = np.abs(off) > np.maximum(SURE * noise, 1e-9)
     told = (share > FAR) & clear
     order = sorted(np.flatnonzero(told).tolist(), key=lambda i: (weight[i] == 0, -share[i]))
-    beyond = np.flatnonzero(clear & (weight > 0)).tolist()
-    return _Far(order, share, beyond, len(states) <= trial.finite_steps) if order else None
-
-
-def _to_discard(trial: Trial, names: str, changes: float, whole: float) -> str:
-    """Return why a run is to be discarded: what those states, and all, change its utility by."""
-    change = f"{names} change{'s' * (' and ' not in names)} its utility by {changes:+.3g}"
-    if not math.isclose(changes, whole, rel_tol=ALIKE):
-        change += f", its whole start by {whole:+.3g}"
-    return (
-        f"By the model {change}: `discard {trial.id}`, place the robot nearer to the start and run "
-        f"{trial.candidate} again; if it can't be placed nearer, `propose` goes on with this run. "
-        "If it always starts there, set it in [task] start"
-    )
-
-
-def _as_others_began(task: Task, placed: Placing, which: list[int], *, sure: bool) -> str:
-    """Return how far other runs began off in these states, and that this one counts."""
-    units = list(task.model.states.values())
-    off = listed(
-        f"{with_unit(f'{placed.rms[i]:.2g}', units[i])} in {task.model.state_names[i]}"
-        for i in which
-    )
-    why = "this is no unusual one" if sure else "they are too few to call this one unusual"
-    count = min(placed.runs[which])
-    return f"The starts of {count} other runs are off by {off} (rms): {why}, and the run counts"
+    return _Far(order, share, len(states) <= trial.finite_steps) if order else None
 
 
 def _perhaps(off: Array, placed: Placing) -> Array:
@@ -199,26 +142,15 @@ def _perhaps(off: Array, placed: Placing) -> Array:
     return np.array([r > 0 and student(x / r, float(n)) <= CHANCE for x, r, n in pairs], bool)
 
 
-def _less_far(task: Task, off: Array, states: Sequence[int]) -> str:
-    """Return by how much other states are off, of which a step costs less; or ""."""
-    both = list(task.model.states.items())
-    each = [f"{both[i][0]} by {with_unit(f'{off[i]:+.2g}', both[i][1])}" for i in states]
-    return f"; {listed(each)}, which matter{'s' * (len(each) == 1)} less" if each else ""
-
-
-def _placed(task: Task, trial: Trial, i: int, off: float) -> str:
+def _placed(task: Task, trial: Trial, i: int, off: float) -> dict[str, Any]:
     """Return where one state started, and by how much that is off."""
     name, unit = list(task.model.states.items())[i]
-    began, start = in_digits_apart(float(trial.began[i]), float(task.start[i]))
-    turned = f" ({np.rad2deg(off):+.2g} degrees)" if unit == "rad" else ""
-    return (
-        f"{name} = {with_unit(began, unit)}, the task's start is {start}: "
-        f"{with_unit(f'{off:+.2g}', unit)}{turned} off"
-    )
+    began, start = (Quantity(float(x), unit) for x in (trial.began[i], task.start[i]))
+    return {"state": name, "began": began, "start": start, "off": Quantity(float(off), unit)}
 
 
-def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
-    """Return a warning if the robot never begins at a value that [task] start has; or "".
+def _always_there(workspace: Folder, trial: Trial, off: Array) -> Finding | None:
+    """Return that the robot never begins at a value that [task] start has; or None.
 
     All other logs of runs, and of driving from a standstill, then begin where this run did. One in
     which it stood is enough to show that, else `ALWAYS` runs are: two may begin alike by chance.
@@ -234,7 +166,7 @@ def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
     stood = {one.trial: one.states for one in standstills(workspace) if one.trial not in began}
     stood.pop(trial.id, None)
     if not stood and len(began) + 1 < ALWAYS:
-        return ""
+        return None
     first = trial.began
     apart = [task.model.difference(x, first) for x in (*began.values(), *stood.values())]
     same = np.all(np.abs(apart) <= SAME * np.abs(off), axis=0).tolist()
@@ -243,14 +175,13 @@ def _always_there(workspace: Folder, trial: Trial, off: Array) -> str:
     names = task.model.state_names
     odd = [i for i, name in enumerate(names) if same[i] and name in clearly and name in given]
     if not odd:
-        return ""
+        return None
     whole = {**given, **{names[i]: float(first[i]) for i in odd}}
-    start = ", ".join(f"{name} = {value:.4g}" for name, value in whole.items())
-    where = "; ".join(_placed(task, trial, i, off[i]) for i in odd)
-    return (
-        f"the run started with {where}, and so did {listed([*stood, *began])}. "
-        f"If the robot always starts there, write start = {{ {start} }} in [task] of {FILE} and "
-        "propose again: the search begins again, and all logs stay for fit and diagnose"
+    values = tuple(f"{name} = {value:.4g}" for name, value in whole.items())
+    facts = _placed(task, trial, odd[0], off[odd[0]])
+    others_too = (*stood, *began)
+    return found(
+        "run.start_always", *(names[i] for i in odd), others=others_too, values=values, **facts
     )
 
 

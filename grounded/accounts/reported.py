@@ -1,0 +1,113 @@
+"""An account as a finding of the catalogue: its facts, its evidence, and the keys of [log]."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from grounded.accounts.table import WORDS, Account
+from grounded.findings import Finding, Quantity, found
+from grounded.model import Model
+
+if TYPE_CHECKING:
+    from grounded.accounts.judge import Told
+
+
+def names_of(model: Model, columns: Iterable[int]) -> tuple[str, ...]:
+    """Return the names of some columns: states, then inputs."""
+    every = (*model.state_names, *model.input_names)
+    return tuple(every[k] for k in columns)
+
+
+def tables(model: Model, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the tables of [log] that some columns are read by."""
+    return tuple(f"[log.{'state' if n in model.states else 'input'}.{n}]" for n in names)
+
+
+def scaled(model: Model, names: Iterable[str], factor: float, unit: str = "") -> Finding:
+    """Return that columns are in another unit or of the other sign.
+
+    Args:
+        model: with the units.
+        names: of the columns.
+        factor: how many times too large they are; -1: of the other sign.
+        unit: in which they are, "" if unknown.
+    """
+    names, units = tuple(names), {**model.states, **model.inputs}
+    facts: dict[str, Any] = {"tables": tables(model, names), "by": 1 / factor}
+    if factor == -1:
+        return found("log.sign", *names, **facts)
+    facts["own"] = tuple(dict.fromkeys(units[name] for name in names))
+    if unit:
+        turning = unit == "deg" and all(units[name].endswith("/s") for name in names)
+        return found(
+            "log.unit",
+            *names,
+            unit="degrees a second" if turning else WORDS.get(unit, unit),
+            **facts,
+        )
+    size = abs(factor) if abs(factor) > 1 else 1 / abs(factor)
+    large = "large" if abs(factor) > 1 else "small"
+    negative = "the other sign" if factor < 0 else ""
+    return found("log.unit", *names, times=size, size=large, negative=negative, **facts)
+
+
+def folded(model: Model, i: int) -> Finding:
+    """Return that an angle in degrees was unwrapped as if it were in radians."""
+    names = names_of(model, [i])
+    unit = model.states[names[0]]
+    return found("log.folded", *names, own=unit, tables=tables(model, names), by=np.pi / 180)
+
+
+def reported(model: Model, told: Told, column: int | None = None) -> list[Finding]:
+    """Return an account, and those that explain the trials as well.
+
+    Args:
+        model: with the names and units.
+        told: the account.
+        column: name only this one of several columns.
+    """
+    first = _reported(model, told, told.account, column)
+    evidence: dict[str, Any] = {}
+    if told.by_motion:
+        i, logged, mended, seconds = told.by_motion
+        unit = model.states[model.state_names[i]]
+        evidence = {"state": model.state_names[i], "ahead": seconds}
+        evidence |= {"logged": Quantity(logged, unit), "mended": Quantity(mended, unit)}
+    others = [_reported(model, told, one, None).also(tied=first.about) for one in told.others]
+    return [first.also(**evidence), *others]
+
+
+def _reported(model: Model, told: Told, account: Account, column: int | None) -> Finding:
+    columns = account.columns if column is None else (column,)
+    names, code = names_of(model, columns), f"log.{account.kind}"
+    if account.kind == "exchange":
+        pairs = names_of(model, (k for pair in account.pairs for k in pair))
+        return found(code, *pairs, reversed=names)
+    if account.kind == "dead" and told.moved:
+        i, mean, moved = told.moved
+        name = model.state_names[i]
+        return found(code, *names, mean=mean, state=name, moved=Quantity(moved, model.states[name]))
+    if account.kind == "offset":
+        return found(code, *names, angle=-float(np.rad2deg(account.offset)))
+    if account.kind == "axes":
+        psi, *speeds = names
+        return found(code, *speeds, heading=psi)
+    if account.kind == "pace":
+        return found(code, by=account.factor)
+    if account.fitted and model.states.get(names[0]) == "rad":
+        angle = float(np.rad2deg(account.offset))
+        return found("log.compass", *names, angle=angle, tables=tables(model, names))
+    return scaled(model, names, account.factor, account.unit)
+
+
+def keys(model: Model, account: Account, column: int) -> str:
+    """Return the keys of a column's table of [log] that correct it."""
+    if account.kind == "unit":
+        return f"scale = {1 / account.factor:.8g}"
+    if account.kind != "sign":
+        return ""
+    angle = {**model.states, **model.inputs}[names_of(model, [column])[0]] == "rad"
+    return "scale = -1" + f", offset = {account.offset:.8g}" * bool(account.fitted and angle)
