@@ -13,7 +13,6 @@ another story; silent: nothing; wrong: another kind), and how many honest runs w
 from __future__ import annotations
 
 import argparse
-import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +21,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded import Model, Param
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
 
@@ -466,44 +464,28 @@ KINDS = {
     "mismatch": "mismatch",
 }
 QUIET = {"saturated", "beyond", "constant", "copy", "quantised", "missing", "smoothed", "time step"}
-TEXTS = {
-    "exchange": r"exchanged",
-    "sign": r"opposite sign|sign looks|other way round",
-    "clock": r"before .* command|stamps",
-    "unit": r"degrees|times too|in knots|in km/h|in mph|in ft/s|in feet",
-    "axes": r"in the axes of",
-    "dead": r"shows? no motion|shows? only noise|sensor is off",
-}
+CODES = {"folded": "unit", "compass": "sign", "reversed": "sign"}
 
 
 def named(model: Model, trials: Sequence[Trial]) -> tuple[list[tuple[str, frozenset[str]]], bool]:
     """Return kinds and signals of what `sound_trials` names, and whether it refused."""
+    from grounded.accounts.finding import UnusableTrials
     from grounded.accounts.sound_trials import sound_trials
 
     try:
         found = sound_trials(model, trials).findings
-    except GroundedError as error:
-        return [_refused(model, str(error))], True
+    except UnusableTrials as error:
+        kinds = [one.code.partition(".")[2] for one in error.findings if "tied" not in one.facts]
+        signals = frozenset(name for one in error.findings for name in one.about)
+        return [(CODES.get(kinds[0], kinds[0]), signals)], True
     every: dict[str, set[str]] = defaultdict(set)
     for finding in found:
         if finding.kind not in QUIET:
             kind = KINDS.get(finding.kind, finding.kind)
-            if finding.kind == "stuck" and not re.search("jumps", finding.finding):
+            if finding.kind == "stuck" and np.isnan(finding.share):
                 kind = "dead"
             every[kind] |= {*finding.signal.split("+")}
     return [(kind, frozenset(some)) for kind, some in every.items()], False
-
-
-def _refused(model: Model, text: str) -> tuple[str, frozenset[str]]:
-    """Return kind and signals of a refusal, from what it says before its remedy and evidence."""
-    text = re.split(r"\. (?:Correct|Multiply|Put|Check|Rotate|Reverse|Subtract|Was)", text)[0]
-    kind = next((k for k, how in TEXTS.items() if re.search(how, text)), "other")
-    names = "|".join(sorted([*model.states, *model.inputs], key=len, reverse=True))
-    text = re.sub(rf"^(in )?(every )?trials? .*?(?=the columns|\b(?:{names})\b)", "", text)
-    found = re.findall(rf"(?<![\w.])(?:{names})(?!\w)", re.split(r"[:(]| shows| stays", text)[0])
-    if kind == "unit" and "as fast as" in text:
-        found = re.findall(rf"says: ({names}) looks", text)
-    return kind, frozenset(found)
 
 
 def verdict(fault: Fault, found: Sequence[tuple[str, frozenset[str]]]) -> str:

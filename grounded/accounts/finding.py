@@ -175,18 +175,22 @@ class Preflight:
 
 
 class UnusableTrials(GroundedError):
-    """Raised for trials that must be corrected; `finding` says why, and in which.
+    """Raised for trials that must be corrected; `findings` say why, and in which.
 
     Args:
         trials: all of them.
         odd: indices of those affected.
-        finding: what is wrong with them.
+        findings: what is wrong with them.
     """
 
-    def __init__(self, trials: Sequence[Trial], odd: Sequence[int], finding: told.Finding) -> None:
+    def __init__(
+        self, trials: Sequence[Trial], odd: Sequence[int], *findings: told.Finding
+    ) -> None:
         which = tuple(trials[k].id or f"trial number {k + 1}" for k in odd)
         named = trials[odd[0]].id != ""
-        facts: dict[str, told.Fact] = {"source": "log", "trials": which} if named else {}
-        super().__init__(
-            finding.also(which=which, **facts), NextCommand("discard", which) if named else None
-        )
+        *others, last = findings
+        last = last.also(which=which, **({"source": "log", "trials": which} if named else {}))
+        self.findings = (*others, last)
+        text = ". ".join(one.sentence for one in self.findings)
+        super().__init__(text, NextCommand("discard", which) if named else None)
+        self.finding = self.findings[0]

@@ -116,7 +116,9 @@ def refuse(model: Model, trials: Sequence[Trial], verdict: Verdict) -> None:
     stop_at_folded(model, trials, verdict.folded)
     stops = [one for one in verdict.told if not (one.certain or one.account.kind == "offset")]
     if stops:
-        raise UnusableTrials(trials, stops[0].trials, reported(model, stops[0])[0])
+        odd = stops[0].trials
+        some = [one for stop in stops if stop.trials == odd for one in reported(model, stop)]
+        raise UnusableTrials(trials, odd, *some)
 
 
 def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[Finding]:

@@ -209,8 +209,8 @@ def test_a_refusal_names_the_trials_the_table_and_the_next_command(logs):
         sound_trials(model, trials)
     error = refused.value
     assert error.then is not None and error.then.arguments == ("t0", "t1")
-    assert holds(error.mend, "[log.state.x]", "[log.state.y]", "0.001")
-    assert "[log" not in error.in_program and holds(error.in_program, "x", "y", "1000")
+    assert error.finding.about == ("x", "y") and error.finding.facts["by"] == 0.001
+    assert "[log" not in error.finding.what and "[log.state.x]" in str(error)
 
 
 def test_what_is_certain_is_corrected_and_keeps_its_key_of_log(logs):

@@ -76,5 +76,5 @@ def _odd_columns(model: Model, trial: Trial) -> str:
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except UnusableTrials as error:
-        return str(error.finding.what)
+        return "; ".join(one.what for one in error.findings)
     return "; ".join(f"{one.signal} {one.finding}" for one in in_the_log(looked.findings))
