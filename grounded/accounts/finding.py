@@ -189,7 +189,9 @@ class UnusableTrials(GroundedError):
         which = tuple(trials[k].id or f"trial number {k + 1}" for k in odd)
         named = trials[odd[0]].id != ""
         *others, last = findings
-        last = last.also(which=which, **({"source": "log", "trials": which} if named else {}))
+        last = last.also(which=which)
+        if named:
+            last = last.also(source="log", trials=which)
         self.findings = (*others, last)
         text = ". ".join(one.sentence for one in self.findings)
         super().__init__(text, NextCommand("discard", which) if named else None)

@@ -19,7 +19,7 @@ def holds(text: str, *facts: object) -> bool:
 
 
 def of_code(found: Any, *codes: str) -> list[Any]:
-    """Return the findings of a result, or of a collection, that have one of these codes (`*`: any)."""
+    """Return the findings of a result, or of a collection, with one of these codes."""
     some: Iterable[Any] = getattr(found, "findings", found)
     return [one for one in some if any(fnmatchcase(one.code, code) for code in codes)]
 

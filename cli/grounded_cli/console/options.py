@@ -1,4 +1,4 @@
-"""Options that several commands share: --json, --details, --anyway, --trials, and those of parallel work."""
+"""Options that several commands share: --json, --details, --anyway, --trials, parallel work."""
 
 from __future__ import annotations
 
