@@ -134,7 +134,7 @@ ENTRIES: dict[str, Entry] = {
         "the model that estimates {about} has {now}; for {trials} it had {before}",
         "to have all from one model, discard {trials} and ingest the logs again",
     ),
-    "reading": Entry("warn", "{text}"),
+    "reading": Entry("warn", "{about}"),
     "limits": Entry(
         "warn",
         "{about} goes from {logged} in this log, beyond its [limits], {limits}",
@@ -224,11 +224,12 @@ ENTRIES: dict[str, Entry] = {
     # whose run it is
     "not_run": Entry(
         "refuse",
-        OF + "its commands are not what {ran} sends on the logged states: {about} differs by {rms} "
+        "[[{log} did not run {ran}: ]]its commands are not what {ran} sends on the logged states: {about} differs by {rms} "
         "(rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike up to {until}]][[; no "
         "{unknown} for {gap}]][[; only {lasts} of commands]]"
         "[[; {guessed} by [estimate] may be why]][[ (no copy of {bare} in it)]]",
-        "who drove, or got `runner.action` other states or times? Ingest it with --data",
+        "who drove, or got `runner.action` other states or times? Ingest it with --data, or with "
+        "--candidate {ran} anyway",
         hides=("log.start_doubt", "log.start_loose", "run.start"),
     ),
     "silent": Entry(
@@ -240,13 +241,13 @@ ENTRIES: dict[str, Entry] = {
     ),
     "another": Entry(
         "refuse",
-        OF + "did not run {ran}: its commands are those of {other}[[ to {theirs:%}, of {ran} only "
+        "[[{log} ]]did not run {ran}: its commands are those of {other}[[ to {theirs:%}, of {ran} only "
         "to {mine:%}]]",
         "was {ran} copied to the robot? Ingest it with --candidate {other}, or with --data",
     ),
     "earlier": Entry(
         "refuse",
-        OF + "ran {ran}, which was made for an earlier task ({was}): its utility can't be compared",
+        "[[{log} ]]ran {ran}, which was made for an earlier task ({was}): its utility can't be compared",
         "ingest it with --data; or change the task back",
     ),
     "bare": Entry(

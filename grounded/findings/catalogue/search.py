@@ -97,7 +97,6 @@ ENTRIES: dict[str, Entry] = {
     ),
     "adopt_first": Entry("note", "a better model may gain more: adopt what this one lacks"),
     # what status tells beside it
-    "asked": Entry("note", "{why}"),
     "no_log": Entry(
         "note",
         "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "

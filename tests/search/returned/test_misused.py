@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import holds
 from grounded.onboard import Runner
 from grounded.search.ask_tell import Search
 from grounded.search.returned.misused import misused
@@ -36,20 +35,17 @@ def driven(task, made, states=lambda x: x, times=lambda t: t, seed=0):
 
 
 WAYS = {
-    "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, ("psi", "degrees", "pass rad")),
-    "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, ("x", "y", "mm", "pass m")),
-    "cm": ({"states": lambda x: x * [100, 100, 1]}, ("x and y", "in cm", "pass m")),
-    "compass": (
-        {"states": lambda x: x * [1, 1, -1]},
-        ("psi is passed", "opposite sign: pass it with the sign that the log has"),
-    ),
-    "order": ({"states": lambda x: x[[1, 0, 2]]}, ("x and y", "order")),
-    "last first": ({"states": lambda x: x[[2, 0, 1]]}, ("order psi, x, y", "order x, y, psi")),
-    "ms": ({"times": lambda t: 1e3 * t}, ("in ms", "seconds")),
-    "minutes": ({"times": lambda t: t / 60}, ("in minutes", "seconds")),
-    "clock": ({"times": lambda t: 1.7e9 + t}, ("speed = 0.5 m/s", "a clock")),
-    "nothing": ({"states": lambda x: x * np.nan}, ("feed-forward of c0001 alone", "runner.blind")),
-    "zero": ({"times": lambda t: 0 * t}, ("stays at 0", "seconds")),
+    "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, {"unit": "degrees"}),
+    "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, {"unit": "mm"}),
+    "cm": ({"states": lambda x: x * [100, 100, 1]}, {"unit": "cm", "states": ("x", "y")}),
+    "compass": ({"states": lambda x: x * [1, 1, -1]}, {"states": ("psi",), "times": -1.0}),
+    "order": ({"states": lambda x: x[[1, 0, 2]]}, {"passed": ("y", "x", "psi")}),
+    "last first": ({"states": lambda x: x[[2, 0, 1]]}, {"passed": ("psi", "x", "y")}),
+    "ms": ({"times": lambda t: 1e3 * t}, {"time": "ms"}),
+    "minutes": ({"times": lambda t: t / 60}, {"time": "minutes"}),
+    "clock": ({"times": lambda t: 1.7e9 + t}, {"time": "a clock"}),
+    "nothing": ({"states": lambda x: x * np.nan}, {"ran": "c0001"}),
+    "zero": ({"times": lambda t: 0 * t}, {"time": "no unit: it stays 0"}),
 }
 
 
@@ -60,7 +56,8 @@ def test_what_the_program_passed_is_named(waiting, way):
     wrong, named = WAYS[way]
     trial = driven(task, made, **wrong)
     found = suspicion(task, trial, made, [made])
-    assert holds(found.why, *named, "runner.action")
+    assert found.why.code == ("run.unfed" if way == "nothing" else "run.passed")
+    assert {key: found.why.facts[key] for key in named} == named
 
 
 def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
@@ -69,7 +66,7 @@ def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
     trial = driven(task, made, times=lambda t: 1.7e9 + t)
     plain = follows(made.policy, trial, latest(task))
     _, way = misused(task, made, trial, plain)
-    assert "past the end" in way.said
+    assert way.finding.facts["time"] == "a clock"
     assert misused(task, made, trial, plain, acts=True) is None
 
 
@@ -88,17 +85,16 @@ def test_feedback_on_another_pose_is_not_called_no_feedback(waiting):
     names = model.state_names, model.input_names
     trial = Trial(np.array([*rows, x]), np.array(sent), task.dt, *names, candidate=made.id)
     found = suspicion(task, trial, made, [made])
-    assert holds(found.why, "near the feed-forward of c0001", "another message", "logged")
-    assert "alone" not in found.why
+    assert found.why.code == "run.other_states"
 
 
 def test_other_commands_are_no_misuse(waiting):
     task, made = waiting
-    assert suspicion(task, driven(task, made), made, [made]).why == ""
+    assert suspicion(task, driven(task, made), made, [made]).why is None
     for seed in range(4):
         noise = np.random.default_rng(seed).normal(size=(task.horizon + 9, 2))
         smooth = np.array([np.convolve(column, np.ones(10) / 4, "valid") for column in noise.T]).T
         trial = replace(driven(task, made), inputs=np.clip(smooth, task.low, task.high))
         plain = follows(made.policy, trial)
         assert not plain.alike and misused(task, made, trial, plain) is None
-        assert holds(suspicion(task, trial, made, [made]).why, "other units", "not in s")
+        assert suspicion(task, trial, made, [made]).why.code == "log.not_run"

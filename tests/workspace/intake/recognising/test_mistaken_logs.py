@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import holds, of_code
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Quantity
+from grounded.findings import found as finding
 from grounded.onboard import Runner
 from grounded.plant import Plant
+from grounded.search.returned import reversed_input
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
@@ -93,14 +96,9 @@ def test_a_sound_log_is_taken_in_without_a_word(w, tmp_path):
 def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
     for k in range(2):
         path = log(w, tmp_path / f"{k}.csv", columns=("starboard", "port"), seed=k)
-        (warning,) = w.ingest(path, data=True).warnings
-        assert holds(
-            warning,
-            "port and starboard",
-            "exchanged",
-            "paths in [log]",
-            f"then discard t000{k + 1}",
-        )
+        (told,) = w.ingest(path, data=True).findings
+        assert (told.code, told.about) == ("log.exchange", ("port", "starboard"))
+        assert told.facts["trials"] == (f"t000{k + 1}",)
     done = grounded("-C", w.folder, "diagnose")
     said = " ".join(done.err.replace("\\\n", " ").split())  # wherever the command was wrapped
     assert done.code == 1 and holds(said, "port and starboard", "discard t0001 t0002")
@@ -112,9 +110,9 @@ def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
     """`Correct the paths in [log]`: every later run would have been misread."""
     w.ingest(log(w, tmp_path / "a.csv"), data=True)
     other = log(w, tmp_path / "b.csv", columns=("starboard", "port"), seed=1)
-    (warning,) = w.ingest(other, data=True).warnings
-    assert holds(warning, "with port what was sent as starboard", "t0001", "no exchange")
-    assert holds(warning, "`discard t0002` and record it again") and "[log]" not in warning
+    (told,) = w.ingest(other, data=True).findings
+    assert (told.code, told.about) == ("run.exchanged", ("port", "starboard"))
+    assert told.facts["proven"] == ("t0001",) and told.facts["parts"] == "wires"
     assert w.discard("t0002").then.verb != "ingest"
 
 
@@ -123,9 +121,9 @@ def test_states_that_earlier_logs_have_in_their_columns_are_exchanged_on_the_rob
     path = log(w, tmp_path / "b.csv", seed=1)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0].replace("v,r,psi", "psi,r,v"), *lines[1:]]))
-    (warning,) = w.ingest(path, data=True).warnings
-    assert holds(warning, "v", "psi", "t0001", "sensors", "`discard t0002`")
-    assert "paths in [log]" not in warning
+    (told,) = w.ingest(path, data=True).findings
+    assert (told.code, set(told.about)) == ("run.exchanged", {"v", "psi"})
+    assert told.facts["proven"] == ("t0001",) and told.facts["parts"] == "sensors"
     w.discard("t0001")
     lone = Workspace(w.folder).status().notes[0]
     assert holds(lone, "[log]", "discard t0002") and "sensors" not in lone
@@ -150,9 +148,8 @@ def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_ta
     table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs])
     np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,m1,m2", comments="")
     found = w.ingest(path)
-    (told,) = (one for one in found.warnings if "what was sent as" in one)
-    assert found.then.verb == "discard" and "Correct the paths" not in told
-    assert holds(told, "no exchange" if before else "[log] is right", f"run {plan.id} again")
+    (told,) = of_code(found, "run.exchanged")
+    assert found.then.verb == "discard" and ("proven" in told.facts) == before
     assert w.discard(found.trial).then == NextCommand("run")  # by its [system]
     known = w.ingest(path)
     assert known.then == w.status().then and any(f"run {plan.id}" in s for s in known.warnings)
@@ -161,7 +158,7 @@ def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_ta
     toml.write_text(text.replace("/csv.A", "/csv.m2"))
     with pytest.raises(GroundedError) as refused:
         Workspace(w.folder).ingest(path)
-    assert holds(str(refused.value), "commands those of", "swap its wires", f"run {plan.id} again")
+    assert refused.value.finding.code == "run.exchanged"
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
@@ -171,8 +168,9 @@ def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[:, 3] = np.rad2deg(rows[:, 3])
     np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
-    (warning,) = w.ingest(path, data=True).warnings
-    assert holds(warning, "psi", "degrees", "[log.state.psi]", "0.017453293")
+    (told,) = w.ingest(path, data=True).findings
+    assert (told.code, told.about) == ("log.unit", ("psi",))
+    assert told.facts["by"] == pytest.approx(np.pi / 180)
 
 
 @pytest.mark.parametrize(("most", "wrong"), [(100.0, True), (1.0, False)])
@@ -180,8 +178,9 @@ def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path
     """Once the scale was corrected, limits from the log in degrees allowed a steer of 22.9 rad."""
     config = CONFIG.replace("[-1.0, 1.0]", f"[-{most}, {most}]")
     w = Workspace(make(tmp_path / "w", config=config, model=MODEL, target=TARGET).folder)
-    (warning,) = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).warnings
-    assert ("write port = [-1, 1], starboard = [-1, 1] there, then discard" in warning) is wrong
+    (told,) = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).findings
+    right = ("port = [-1, 1]", "starboard = [-1, 1]")
+    assert told.facts["limits"] == (right if wrong else ())
 
 
 @pytest.mark.parametrize("here", [True, False])
@@ -209,8 +208,8 @@ def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
 
 def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
     path = log(w, tmp_path / "a.csv", scale=100.0)
-    (warning,) = w.ingest(path, data=True).warnings
-    assert holds(warning, "100 times", "percent", "[log.input.port]", "by 0.01", "[limits]")
+    (told,) = w.ingest(path, data=True).findings
+    assert (told.code, told.facts["unit"], told.facts["by"]) == ("log.unit", "percent", 0.01)
     with pytest.raises(GroundedError) as stopped:
         w.diagnose()
     assert stopped.value.then is not None and stopped.value.then.verb == "discard"
@@ -229,9 +228,9 @@ def test_percent_far_beyond_limits_is_told_where_the_model_tells_nothing(w, tmp_
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[:, 1:4] = 0.0  # its motors are off
     np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
-    still, *told = w.ingest(path, data=True).warnings
-    assert holds(still, "no state changes")
-    assert len(told) == 2 and all(holds(one, "-1 to 1", "percent", "0.01") for one in told)
+    found = w.ingest(path, data=True)
+    assert of_code(found, "log.still")
+    assert [one.facts["how"] for one in of_code(found, "log.limits")] == ["percent"] * 2
 
 
 def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
@@ -244,7 +243,7 @@ def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
     np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), plan.id, "port and starboard 100", "in percent", "by 0.01")
+    assert holds(str(refused.value), plan.id, "port and starboard", "in percent", "by 0.01")
 
 
 @pytest.mark.parametrize("crossed", [False, True])
@@ -252,7 +251,9 @@ def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
     w, tmp_path, monkeypatch, crossed
 ):
     """Its saturated commands showed samples of 5 ms, true were 12: the user looked for a timer."""
-    monkeypatch.setattr(recognise, "old_samples", lambda *_: ["samples 5 ms old"])
+    age, one = Quantity(0.005, "s"), Quantity(1.0, "m")
+    note = finding("run.samples", ran="", state="v", age=age, moved=one, error=one)
+    monkeypatch.setattr(recognise, "old_samples", lambda *_: [note])
     plan, path = w.propose().candidate, tmp_path / "run.csv"
     model = w.base_model
     wired = replace(
@@ -263,7 +264,7 @@ def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
     np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
     found = w.ingest(path)
     assert (found.then.verb == "discard") == crossed
-    assert ("samples 5 ms old" in found.notes) != crossed
+    assert bool(of_code(found, "run.samples")) != crossed
 
 
 def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
@@ -281,7 +282,7 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
     recording = read_foreign(w, path, mapping_of(w, path)).recording
     found = exchanged_in(recording, w.task, plan)
-    assert found and holds(found.said, "port and starboard", "each other's column")
+    assert found and (found.finding.code, found.names) == ("log.exchange", ("port", "starboard"))
     toml = w.folder / "grounded.toml"
     toml.write_text(
         toml.read_text()
@@ -306,10 +307,8 @@ def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before):
     np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    said = str(refused.value)
-    assert holds(said, "moved as the log says", f"run {plan.id} again")
-    assert ("the log is right" in said) == before == ("[log.input" not in said)
-    assert ("t0001" in said) == before and "column" not in said
+    told = refused.value.finding
+    assert (told.code, bool(told.facts["proven"])) == ("run.exchanged", before)
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
@@ -325,8 +324,8 @@ def test_states_that_a_program_exchanged_are_mended_there(w, tmp_path):
     np.savetxt(path, rows, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "v and r", "`runner.action`", "the order", "v, r, psi")
-    assert "[log" not in str(refused.value)
+    told = refused.value.finding
+    assert (told.code, told.about, told.facts["parts"]) == ("run.exchanged", ("v", "r"), "states")
 
 
 def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_path, monkeypatch):
@@ -337,7 +336,8 @@ def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_p
     t, path = trial.dt * np.arange(trial.steps), tmp_path / "run.csv"
     table = np.column_stack([t, trial.states[:-1], trial.inputs])
     np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,starboard,port", comments="")
-    monkeypatch.setattr(recognise, "turned_in", lambda *_: "port acted the other way round")
+    turned = finding("run.reversed", "port")
+    monkeypatch.setattr(reversed_input, "reversed_input", lambda *_: turned)
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     assert holds(str(refused.value), plan.id, "exchanged") and "acted" not in str(refused.value)
@@ -371,9 +371,9 @@ def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
         return runner.action(k * dt, logged) if k >= waits else np.zeros(2)
 
     found = driven_by(w, tmp_path / "run.csv", action)
-    told = [one for one in found.warnings if "sent nothing but what was held" in one]
-    assert len(told) == (waits > 0) == (found.then.verb == "discard")
-    assert all(holds(one, "8 steps (0.4 s)", "since the run began", plan.id) for one in told)
+    told = of_code(found, "run.unsent")
+    assert [one.facts["steps"] for one in told] == [8] * (waits > 0)
+    assert (waits > 0) == (found.then.verb == "discard")
 
 
 @pytest.mark.parametrize(
@@ -389,13 +389,11 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
         return runner.action(k * dt, np.where(which, smooth[-1], logged))
 
     found = driven_by(w, tmp_path / "run.csv", action, noise=0.02)
-    told = [one for one in found.warnings if "smoothed by" in one]
+    told = of_code(found, "run.smoothed")
     assert len(told) == (share > 0) == (found.then.verb == "discard")
-    listed = " and ".join(names.replace(" ", ", ", names.count(" ") - 1).rsplit(" ", 1))
-    assert all(
-        holds(one, f"{plan.id} sends on {listed}", f"by {share:.2g} of the last") for one in told
-    )
-    assert not any("logged" in one and "late" in one for one in found.warnings if one not in told)
+    assert all(one.facts["states"] == tuple(names.split()) for one in told)
+    assert all(one.facts["share"] == pytest.approx(share) for one in told)
+    assert not of_code(found, "log.late", "run.late")
 
 
 @pytest.mark.parametrize("fault", ["program", "log"])
@@ -406,10 +404,9 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
     if fault == "program":
         with pytest.raises(GroundedError) as refused:
             driven_by(w, path, lambda k, logged, now: wrong * runner.action(k * dt, logged))
-        assert "scale" not in str(refused.value)
+        told = refused.value.finding
         assert refused.value.then == NextCommand("next", ("LOG",))
-        told = "the robot moved as the log says", "its program sends starboard times -1"
-        assert holds(str(refused.value), *told, f"run {plan.id} again")
+        assert (told.code, told.about, told.facts["times"]) == ("run.sends", ("starboard",), -1)
         return
     driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged))
     w.discard("t0001")
@@ -418,7 +415,7 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
     np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "starboard", "multiply the scale in [log.input.starboard]")
+    assert holds(str(refused.value), "starboard", "sign in [log.input.starboard]")
 
 
 def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w, tmp_path):
@@ -437,8 +434,8 @@ def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w,
     run(1.0)
     with pytest.raises(GroundedError) as refused:
         run(wrong)
-    told = "its program sends port 1.43 times too small", "earlier runs", "run c0002 again"
-    assert holds(str(refused.value), *told, "if it is the log that changed since")
+    told = refused.value.finding
+    assert (told.code, told.about, told.facts["proven"]) == ("run.sends", ("port",), ("t0001",))
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
@@ -463,22 +460,20 @@ def test_commands_that_are_sent_late_are_told_from_a_log_that_has_them_late(w, t
         return plan.id, driven_by(w, path, action, pull=0.8, shown=shown)
 
     _, found = run(by, fault)
-    told = [one for one in found.warnings if "ms) late" in one]
+    told = of_code(found, "log.late", "run.late")
     assert len(told) == (by > 0) and found.then.verb != "discard"  # no run to compare it with
-    assert all(holds(one, "its program sent", "log") for one in told) or fault == "log"
     w.discard(found.trial)
     _, found = run(0, "")
-    name, found = run(by, fault)
-    told = [one for one in found.warnings if "ms) late" in one]
-    assert len(told) == (by > 0) and (found.then.verb == "discard") == (fault == "program")
-    steps = "1 step (50 ms)" if by == 1 else f"{by} steps ({50 * by} ms)"
+    _, found = run(by, fault)
+    told = of_code(found, "log.late", "run.late")
+    assert [one.facts["steps"] for one in told] == [by] * (by > 0)
+    assert (found.then.verb == "discard") == (fault == "program")
     if fault == "program":
-        assert holds(told[0], f"sent the commands of {name} {steps} late", f"run {name} again")
-        assert "[log.span]" not in told[0] and not found.faults
+        assert told[0].code == "run.late" and not found.faults
         status = grounded("-C", w.folder, "status").out.replace("\\\n", " ")
         assert f"discard {found.trial}" in " ".join(status.split())
     elif fault == "log":
-        assert holds(told[0], f"logged {steps} late", "[log.span]") and not found.notes
+        assert (told[0].code, told[0].facts["what"]) == ("log.late", "log") and not found.notes
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -488,13 +483,13 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
     runner, path = Runner(plan.policy), tmp_path / "run.csv"
     with pytest.raises(GroundedError) as refused:
         driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged + off))
-    told = "from another origin", "v 0.30 m/s and psi -0.45 rad", "as they are logged"
     if not named:
-        assert holds(str(refused.value), *told, f"run {plan.id} again")
+        assert refused.value.finding.code == "run.origin"
+        assert refused.value.finding.facts["off"] == ("v 0.30 m/s", "psi -0.45 rad")
         assert refused.value.then == NextCommand("next", ("LOG",))
         return
     found = w.ingest(path, candidate=plan.id)
-    assert holds(found.warnings[0], *told) and found.then.verb == "discard"
+    assert found.findings[0].code == "run.origin" and found.then.verb == "discard"
 
 
 def test_other_noise_than_the_log_s_is_no_other_origin(w):
@@ -533,13 +528,11 @@ def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, m
 
     try:  # of a run that differs little from its candidate's, a warning
         found = driven_by(w, tmp_path / "run.csv", action)
-        told, rests = " ".join(found.warnings), found.then.verb != "discard"
+        told, rests = of_code(found, "run.clipped"), found.then.verb != "discard"
     except GroundedError as refused:
-        told, rests = str(refused), False
-    assert ("cut inside [limits]" in told) == (part < 1) == (not rests)
-    if part < 1:
-        assert holds(told, f"those of {plan.id}", "starboard at 0.", "set [limits] to that")
-        assert holds(told, "remove the cut", f"run {plan.id} again")
+        told, rests = of_code([refused.finding], "run.clipped"), False
+    assert bool(told) == (part < 1) == (not rests)
+    assert all("starboard" in one.about for one in told)
 
 
 @pytest.mark.parametrize("predicts", [False, True])
@@ -560,8 +553,6 @@ def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is
         return runner.action(k * dt, now if predicts else logged)
 
     found = driven_by(w, tmp_path / "run.csv", action, noise=1e-4, late=2)
-    told = [one for one in found.warnings if "predict them ahead" in one]
+    told = of_code(found, "run.ahead")
     assert len(told) == predicts == (found.then.verb == "discard")
-    assert all(
-        holds(one, "sensor_delay:psi", plan.id, "newer than those in the log") for one in told
-    )
+    assert all("sensor_delay:psi" in one.facts["effects"] for one in told)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from facts import holds
+from facts import holds, of_code
 from grounded.errors import GroundedError
 from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.who_drove import evidence, follows
@@ -97,8 +97,8 @@ def test_a_run_of_another_candidate_is_refused_and_named(ladder, ran, said, shar
     w, by_alpha = ladder
     for seed in SEEDS:
         why = refused(w, noisy(by_alpha[ran], share, seed, other=other), by_alpha[said], by_alpha)
-        named = re.search(r"those of (c\d+)$", why)
-        assert named and named[1] != by_alpha[said].id, seed
+        assert why.code == "log.another", seed
+        assert why.facts["other"] != by_alpha[said].id, seed
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01])
@@ -188,7 +188,7 @@ def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, 
     w, by_alpha = ladder
     log = drive(tmp_path / "a.mcap", w, by_alpha[ran], 1, **WAYS[way])
     seen = sender_of_log(w, log, by_alpha[said])
-    assert seen.other == by_alpha[ran].id and by_alpha[said].id in seen.why
+    assert seen.other == by_alpha[ran].id == seen.why.facts["other"]
     assert seen.own.left > 2 * acted_on(*at_start(w, log, by_alpha[ran])).left
 
 
@@ -199,7 +199,7 @@ def test_who_ran_its_candidate_on_samples_of_its_own_is_believed(ladder, tmp_pat
     for seed, alpha in enumerate(by_alpha):
         log = drive(tmp_path / f"{seed}.mcap", w, by_alpha[alpha], seed, **how)
         seen = sender_of_log(w, log, by_alpha[alpha])
-        assert seen.other == seen.why == "" and seen.sure == (way in ("held", "late"))
+        assert seen.other == "" and seen.why is None and seen.sure == (way in ("held", "late"))
 
 
 def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path):
@@ -213,7 +213,8 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     near = w.task.target[: len(run.states)].copy()
     near[:, 0] += 0.05 * np.sin(np.arange(len(near)))  # off by 35 mm, and moving fast
     (note,) = old_samples(w, made, replace(run, states=near), old)
-    assert holds(note, "22 ms old", "x by", "its error in this run: 35", "does not allow for that")
+    assert (note.code, note.facts["state"]) == ("run.samples", "x")
+    assert note.facts["age"].value == pytest.approx(0.022, abs=5e-4)
     assert not old_samples(w, made, replace(run, states=near), np.zeros(2))
     far = near + 10.0
     assert not old_samples(w, made, replace(run, states=far), old)
@@ -295,13 +296,13 @@ def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
     first = propose_in(w).candidate.id
     for _ in range(3):
         done = ingest_log(w, run_candidate(w, first).trial_file, first)
-        assert not [note for note in done.notes if "discard" in note]
+        assert not of_code(done, "run.note")
     runs = [one.trial for one in w.trials()]
     states = runs[0].states + np.linspace(0, 0.5, 41)[:, None]
     strange = replace(runs[0], states=states, inputs=runs[0].inputs[::-1])
     write_trial(tmp_path / "a.mcap", strange, {"kind": "trial", "task": w.task.hash})
     done = ingest_log(w, tmp_path / "a.mcap", first)
-    (note,) = done.notes
+    note = of_code(done, "run.note")[0].sentence
     assert first in note and f"discard {done.trial}" in note
 
 
@@ -314,5 +315,6 @@ def test_commands_far_beyond_the_limits_are_reported_as_logged(tmp_path):
     seen = suspicion(w.task, replace(trial, inputs=trial.inputs + 50), own, [own])
     low, high = trial.inputs.min() + 50, trial.inputs.max() + 50
     assert seen.ran.beyond == "force"
-    assert f"{low:.4g} to {high:.4g} N" in seen.why and "-5 to 5 N" in seen.why
+    assert seen.why.facts["logged"] == f"{low:.4g} to {high:.4g}"
+    assert seen.why.facts["limits"] == "-5 to 5 N"
     assert suspicion(w.task, trial, own, [own]).ran.beyond == ""

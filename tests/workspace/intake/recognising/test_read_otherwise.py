@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import holds, of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.workspace.intake.locating.run_start import Recording
@@ -41,9 +41,9 @@ def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, bef
         table[:, 1] += by
 
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, before, noise=(2e-4, 1e-3))
-    said = str(refused(w, edited(run, moved)))
-    assert holds(said, "[log.state.x]", "offset", "c0002") and "somebody" not in said
-    told = float(said.split("Add ")[1].split(" ")[0])
+    one = refused(w, edited(run, moved)).finding
+    assert (one.code, one.about) == ("log.zero", ("x",))
+    told = one.facts["add"]
     assert told == pytest.approx(-by, abs=0.02)
     toml = w.folder / "grounded.toml"
     toml.write_text(
@@ -61,9 +61,9 @@ def test_an_offset_that_hardly_changes_the_commands_is_named(w, tmp_path):
     def moved(table):
         table[:, 1] += by
 
-    said = str(refused(w, edited(run, moved)))
-    assert holds(said, "ran c0002", "[log.state.x]", "offset")
-    assert float(said.split("Add ")[1].split(" ")[0]) == pytest.approx(-by, rel=0.02)
+    one = refused(w, edited(run, moved)).finding
+    assert (one.code, one.about) == ("log.zero", ("x",))
+    assert one.facts["add"] == pytest.approx(-by, rel=0.02)
 
 
 def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
@@ -74,11 +74,9 @@ def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
     rows = round(8 * dt / float(np.median(np.diff(times))))
     run.write_text("\n".join([lines[0], *lines[1 + rows :]]))
     error = refused(w, run)
-    said = str(error)
-    assert holds(said, "c0002", "record from before the run") and "somebody" not in said
+    assert error.finding.code == "log.begun_late"
     assert error.then.arguments == ("LOG",)  # this one would be refused again
-    late = float(said.split("its first row is ")[1].split(" ")[0])
-    assert late == pytest.approx(8 * dt, abs=1.01 * dt)
+    assert error.finding.facts["late"].value == pytest.approx(8 * dt, abs=1.01 * dt)
 
 
 def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
@@ -86,9 +84,9 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
         table[:, [1, 2]] = table[:, [2, 1]]
 
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
-    said = str(refused(w, edited(run, exchanged)))
-    assert holds(said, "c0002", "x and v", "each other's column", "t0001", "in this log")
-    assert "[log.state" not in said  # which read t0001 rightly
+    one = refused(w, edited(run, exchanged)).finding
+    assert (one.code, one.about) == ("log.exchange", ("x", "v"))
+    assert one.facts["proven"] == ("t0001",)  # which [log] read rightly
 
 
 @pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, False), (True, True)])
@@ -108,10 +106,10 @@ def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_sa
         table[:, [1, 2]] = table[:, [2, 1]]
         np.savetxt(run, table, "%.5f", ",", header="t,x,v,force", comments="")
         error, before = refused(w, run), len(w.read().trials)
-        assert holds(str(error), "c0002", "x and v", "each other's column", "in this log")
+        assert (error.finding.code, error.finding.about) == ("log.exchange", ("x", "v"))
         assert "c0001" not in str(error) and error.then == NextCommand("ingest", (str(run),))
-        warned = " ".join(w.ingest(run, candidate="c0002").warnings)
-        assert before == 1 and "each other's column" in warned
+        warned = w.ingest(run, candidate="c0002")
+        assert before == 1 and of_code(warned, "log.exchange")
         return
     assert w.ingest(run).candidate == "c0002"
 
@@ -119,7 +117,7 @@ def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_sa
 def test_a_run_of_another_candidate_is_not_called_exchanged(w, tmp_path):
     run = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, 0.5, seed=3)
     error = refused(w, run)
-    assert "those of c0001" in str(error) and "column" not in str(error)
+    assert error.finding.code == "log.another" and error.finding.facts["other"] == "c0001"
 
 
 def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
@@ -132,8 +130,8 @@ def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
     off = np.std(waits.policy.feedforward - ran.feedforward)
     assert 1e-3 < off < 0.1 * np.abs(ran.feedforward).max()
     found = w.ingest(record(w, tmp_path / "b.csv", ran, 0.0, seed=1), candidate=waits.id)
-    said = " ".join(found.warnings)
-    assert holds(said, "c0002", f"what {waits.id} sends") and "column" not in said
+    (told,) = of_code(found, "log.another", "log.exchange", "log.not_run")
+    assert (told.code, told.facts["other"]) == ("log.another", "c0002")
 
 
 def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, tmp_path):
@@ -159,8 +157,8 @@ def test_that_a_log_of_unknown_start_is_longer_than_a_run_is_told(w, tmp_path):
         table[:, 1], table[:, 2], table[:, 3] = 0.0, 0.0, 0.01 * np.sin(20 * t)
 
     path = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 3.0), balanced)
-    said = " ".join(w.ingest(path, candidate="c0002").warnings)
-    assert holds(said, "no start of c0002", "longer than a run", "[log.span] start")
+    (told,) = of_code(w.ingest(path, candidate="c0002"), "log.start_assumed")
+    assert told.facts["longer"] > 0
 
 
 def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
@@ -168,8 +166,8 @@ def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
         table[:, 2] = 0.0
 
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
-    said = str(refused(w, edited(run, stuck)))
-    assert holds(said, "v shows no motion", "sensor") and "somebody" not in said
+    one = refused(w, edited(run, stuck)).finding
+    assert (one.code, one.about) == ("log.dead", ("v",))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -224,9 +222,8 @@ def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path
     policy = w.candidate("c0002")[0].policy
     unit = np.array([1e3, 1e3, *np.ones(policy.gain.shape[2] - 2)])
     called_in_mm = replace(policy, gain=policy.gain * unit, reference=policy.reference / unit)
-    said = str(refused(w, record(w, tmp_path / "a.csv", called_in_mm, 0.5)))
-    assert holds(said, "c0002", "x and v", "`runner.action`", "in mm", "pass m and m/s")
-    assert "somebody" not in said and "[log" not in said
+    one = refused(w, record(w, tmp_path / "a.csv", called_in_mm, 0.5)).finding
+    assert (one.code, one.facts["states"], one.facts["unit"]) == ("run.passed", ("x", "v"), "mm")
 
 
 def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, tmp_path):
@@ -242,7 +239,7 @@ def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, t
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Recording, "_by_its_samples", counted)
-        assert holds(str(refused(w, log)), "did not run c0002", "somebody, or another controller")
+        assert refused(w, log).finding.code == "log.not_run"
     assert 1 <= len(count) <= len(w.candidate_ids()) + 1
 
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from facts import holds
 from grounded import Model, Reward, Task
 from grounded.policy import Policy
 from grounded.search.returned.clipped import Clipped
@@ -124,7 +123,9 @@ def test_degrees_are_named_though_somebody_else_drove_first(seed):
     own = candidate(HAND)
     task, log = log_of(balanced(own, seed, 180 / np.pi))
     (told,) = exactly_misused(log, task, own)
-    assert holds(told.said, "tilt and rate", "degrees", "pass rad")
+    assert told.finding.code == "run.passed"
+    assert told.finding.facts["states"] == ("tilt", "rate")
+    assert told.finding.facts["unit"] == "degrees"
 
 
 @pytest.mark.parametrize("seed", range(6))

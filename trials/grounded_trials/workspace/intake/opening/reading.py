@@ -98,7 +98,7 @@ class Read:
 
 def as_finding(said: Finding | str, code: str) -> Finding:
     """Return what another room says as a finding, under a code if it is a text still."""
-    return found(code, text=said) if isinstance(said, str) else said
+    return found(code, said) if isinstance(said, str) else said
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
