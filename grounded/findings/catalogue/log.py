@@ -224,8 +224,8 @@ ENTRIES: dict[str, Entry] = {
     # whose run it is
     "not_run": Entry(
         "refuse",
-        "[[{log} did not run {ran}: ]]its commands are not what {ran} sends on the logged states: {about} differs by {rms} "
-        "(rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike up to {until}]][[; no "
+        "[[{log} did not run {ran}: ]]its commands are not what {ran} sends on the logged states: "
+        "{about} differs by {rms} (rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike up to {until}]][[; no "
         "{unknown} for {gap}]][[; only {lasts} of commands]]"
         "[[; {guessed} by [estimate] may be why]][[ (no copy of {bare} in it)]]",
         "who drove, or got `runner.action` other states or times? Ingest it with --data, or with "
@@ -241,13 +241,14 @@ ENTRIES: dict[str, Entry] = {
     ),
     "another": Entry(
         "refuse",
-        "[[{log} ]]did not run {ran}: its commands are those of {other}[[ to {theirs:%}, of {ran} only "
-        "to {mine:%}]]",
+        "[[{log} ]]did not run {ran}: its commands are those of {other}[[ to {theirs:%}, of {ran} "
+        "only to {mine:%}]]",
         "was {ran} copied to the robot? Ingest it with --candidate {other}, or with --data",
     ),
     "earlier": Entry(
         "refuse",
-        "[[{log} ]]ran {ran}, which was made for an earlier task ({was}): its utility can't be compared",
+        "[[{log} ]]ran {ran}, which was made for an earlier task ({was}): its utility can't be "
+        "compared",
         "ingest it with --data; or change the task back",
     ),
     "bare": Entry(

@@ -59,7 +59,7 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
     (told,) = of_code(done.taken, "run.reversed")
     assert told.about == ("force",) and told.facts["trial"] == "t0002"
     now = w.status()
-    assert now.then == done.taken.then and now.notes[0] == f"t0002: {told.sentence}"
+    assert now.then == done.taken.then and now.notes[0] == told.sentence
     w.discard("t0002")
     assert w.status().then.verb != "discard"
     assert w.propose().candidate.id == "c0002"
