@@ -54,7 +54,7 @@ def test_another_unit_is_told_where_speeds_are_estimated(blind, tmp_path, column
     table[:, column] *= by
     np.savetxt(tmp_path / "b.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
     name = {1: "x", 3: "force"}[column]
-    with pytest.raises(GroundedError, match=f"{name} is in m"):
+    with pytest.raises(GroundedError, match=f"{name} is "):
         blind.ingest(tmp_path / "b.csv")
 
 

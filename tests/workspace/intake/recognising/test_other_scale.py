@@ -167,7 +167,7 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
     np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
-    assert holds(str(refused.value), "c0001", "force", "57.2957", "in rad/s")
+    assert holds(str(refused.value), "c0001", "force", "57.29578", "in rad/s")
 
 
 @pytest.mark.parametrize("before", [0.0, 0.7])

@@ -38,7 +38,6 @@ from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
-    as_finding,
     copied,
     read_log_file,
     read_own_trial,
@@ -262,8 +261,8 @@ def _of_search(
     rest = [one for one in now.history if one is not tried and one.accepted]
     outdone = max(rest, key=lambda one: one.utility, default=None)
     if tried is not None and now.incumbent is tried and outdone:
-        said.append(traded(workspace.task, tried, outdone))
-    yield from (as_finding(one, "run.note") for one in said if one)
+        said += filter(None, [traded(workspace.task, tried, outdone)])
+    yield from said
 
 
 def _aside(read: Read) -> bool:
