@@ -229,7 +229,7 @@ ENTRIES: dict[str, Entry] = {
         "up to {until}]][[; no {unknown} for {gap}]][[; only {lasts} of commands]][[; {guessed} by "
         "[estimate] may be why]][[ (no copy of {bare} in it)]]",
         "who drove? Use --data, --candidate {ran} anyway, or set [log.span] start",
-        hides=("log.start_doubt", "log.start_loose", "run.start"),
+        hides=("log.start_doubt", "log.start_loose", "run.start", "run.swings", "run.reversed"),
     ),
     "silent": Entry(
         "refuse",
@@ -252,7 +252,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "bare": Entry(
         "warn",
-        "its commands are like those of {ran}, but not the same, and it holds no copy of it",
+        OF + "its commands are like those of {ran}, but not the same, and it holds no copy of it",
         "if another workspace's {ran} ran, `discard` it; to be sure, write trials with "
         "TrialWriter(..., policy=Path(candidate).read_bytes())",
     ),

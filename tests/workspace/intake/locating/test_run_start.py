@@ -323,7 +323,7 @@ def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     table[1:, 2] = np.diff(table[:, 1]) * RATE
     np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
     told = of_code(w.ingest(tmp_path / "b.csv"), "log.start_loose")
-    assert len(told) == 1 and "c0002" in told[0]
+    assert [one.facts["ran"] for one in told] == ["c0002"]
     w.propose()
     own = record(w, tmp_path / "c.csv", w.candidate("c0003")[0].policy, 1.0)
     assert not of_code(w.ingest(own), "log.start_loose")
@@ -422,7 +422,7 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("by", "told"), [(1e3, "1000 times too large"), (-1.0, "other sign")])
+@pytest.mark.parametrize(("by", "told"), [(1e3, "log.unit"), (-1.0, "log.sign")])
 def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
     w, tmp_path, by, told
 ):
@@ -434,7 +434,8 @@ def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so
     np.savetxt(path, table, delimiter=",", header=head, comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "c0002", "force", told, "scale")
+    one = refused.value.finding
+    assert (one.code, one.about, one.facts["ran"]) == (told, ("force",), "c0002")
     named = w.ingest(path, candidate="c0002")
     assert any("force" in warning and f"{1 / by:g}" in warning for warning in named.warnings)
 
@@ -544,7 +545,7 @@ def test_a_log_so_noisy_that_any_commands_follow_from_it_is_one_in_degrees(tmp_p
     write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
     with pytest.raises(GroundedError) as refused:
         w.ingest(tmp_path / "odd.mcap")
-    assert holds(str(refused.value), "psi", "degrees", "0.017453293")
+    assert holds(str(refused.value), "psi", "degrees")
     named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
     assert of_code(named, "log.unit")[0].about == ("psi",)
 
@@ -668,7 +669,7 @@ def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
     text = config.read_text().replace('path = "/csv.x"', 'path = "/csv.x"\nmax_age_s = 2')
     text = text.replace('path = "/csv.v"', 'path = "/csv.v"\nmax_age_s = 2')
     config.write_text(text)
-    with pytest.raises(GroundedError, match=holding("did not run", "for 0.41")):
+    with pytest.raises(GroundedError, match=holding("did not run", "for 0.410 s")):
         Workspace(w.folder).ingest(log)
 
 

@@ -325,7 +325,7 @@ def test_states_that_a_program_exchanged_are_mended_there(w, tmp_path):
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     told = refused.value.finding
-    assert (told.code, told.about, told.facts["parts"]) == ("run.exchanged", ("v", "r"), "states")
+    assert (told.code, told.facts["passed"]) == ("run.passed", ("r", "v", "psi"))
 
 
 def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
-from grounded.findings import found
+from grounded.findings import Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
@@ -116,7 +116,9 @@ class Look:
     ) -> None:
         """Cut the run from a log where it begins."""
         ran, begins = own.id, start.seconds + (_sooner(apart, log) if apart else 0)
-        self.read = replace(cut_log(log, ran, begins), before=self.read.before)
+        kept = [one for one in self.read.findings if one.weight is Weight.NOTE]
+        cut_there = replace(cut_log(log, ran, begins), before=self.read.before)
+        self.read = cut_there.telling(*kept)
         if start.missed:
             self.read = self.read.telling(not_sent(task, ran, start.missed))
         elif begins > 0:

@@ -347,6 +347,8 @@ def _refusal(case: Case, story: Story) -> GroundedError:
         then = NextCommand("ingest", (path, "--candidate", case.seen.other))
     elif kind is Kind.UNKNOWN:
         then, bare = data, ran if case.read.bare else ""
+        if bare and told.code == "log.another":  # which may be coincidence
+            told = found("log.bare", ran=ran)
         told = told.also(bare=bare, guessed=tuple(sorted(case.guessed)), **case.read.hole)
         if case.log and 0 < _lasting_s(case.log) < WHOLE * case.task.horizon * case.task.dt:
             told = told.also(lasts=Quantity(_lasting_s(case.log), "s"))
