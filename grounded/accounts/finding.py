@@ -189,7 +189,7 @@ class UnusableTrials(GroundedError):
         which = tuple(trials[k].id or f"trial number {k + 1}" for k in odd)
         named = trials[odd[0]].id != ""
         *others, last = findings
-        last = last.also(which=which)
+        last = last.also(which=which if named or len(trials) > 1 else ())
         if named:
             last = last.also(source="log", trials=which)
         self.findings = (*others, last)

@@ -27,7 +27,7 @@ from grounded.accounts.kinematics import (
     turned,
 )
 from grounded.accounts.motion import Ahead, Fit, horizon_of
-from grounded.accounts.table import Account, of_motion, of_rows
+from grounded.accounts.table import Account, Told, of_motion, of_rows
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
@@ -45,39 +45,6 @@ LIKE = 4.0  # factor within which an input must act as in the model
 TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 FAR = 20.0  # times as large as in other trials: a trial to be examined
-
-
-@dataclass(frozen=True)
-class Told:
-    """An account of some trials, and what shows it.
-
-    Args:
-        account: the story.
-        trials: indices of the trials that it concerns.
-        gain: by how much less is unexplained [nats].
-        others: accounts that explain the trials as well.
-        whole: whether it concerns all trials.
-        by_motion: the state that the model predicts best with it, its rms error as logged and
-            mended, and how far ahead [s]; None if kinematics show it.
-        moved: of a dead velocity: its position, its mean and how far the position moves.
-    """
-
-    account: Account
-    trials: tuple[int, ...]
-    gain: float
-    others: tuple[Account, ...] = ()
-    whole: bool = True
-    by_motion: tuple[int, float, float, float] | None = None
-    moved: tuple[int, float, float] | None = None
-
-    @property
-    def certain(self) -> bool:
-        """Whether trials are corrected, rather than refused."""
-        if self.account.kind == "dead":
-            return not self.whole
-        if self.by_motion:
-            return self.account.unit == "deg" or (self.account.kind == "unit" and not self.whole)
-        return self.account.certain
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from grounded.accounts.table import WORDS, Account
+from grounded.accounts.table import WORDS, Account, Told
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
-
-if TYPE_CHECKING:
-    from grounded.accounts.judge import Told
 
 
 def names_of(model: Model, columns: Iterable[int]) -> tuple[str, ...]:

@@ -20,11 +20,12 @@ from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials, put_right
 from grounded.accounts.inputs import judge_inputs
-from grounded.accounts.judge import Told, Verdict, judge
+from grounded.accounts.judge import Verdict, judge
 from grounded.accounts.kinematics import folded, gaps, kinematic_rows
 from grounded.accounts.reported import folded as is_folded
 from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_signal, signal_of
+from grounded.accounts.table import Told
 from grounded.accounts.time_step import judge_resolution, judge_time_step
 from grounded.model import Model
 from grounded.result import listed, per_second, with_unit

@@ -104,6 +104,39 @@ class Account:
         return replace(trial, states=z[:, :n], inputs=z[:steps, n:], start_inputs=held)
 
 
+@dataclass(frozen=True)
+class Told:
+    """An account of some trials, and what shows it.
+
+    Args:
+        account: the story.
+        trials: indices of the trials that it concerns.
+        gain: by how much less is unexplained [nats].
+        others: accounts that explain the trials as well.
+        whole: whether it concerns all trials.
+        by_motion: the state that the model predicts best with it, its rms error as logged and
+            mended, and how far ahead [s]; None if kinematics show it.
+        moved: of a dead velocity: its position, its mean and how far the position moves.
+    """
+
+    account: Account
+    trials: tuple[int, ...]
+    gain: float
+    others: tuple[Account, ...] = ()
+    whole: bool = True
+    by_motion: tuple[int, float, float, float] | None = None
+    moved: tuple[int, float, float] | None = None
+
+    @property
+    def certain(self) -> bool:
+        """Whether trials are corrected, rather than refused."""
+        if self.account.kind == "dead":
+            return not self.whole
+        if self.by_motion:
+            return self.account.unit == "deg" or (self.account.kind == "unit" and not self.whole)
+        return self.account.certain
+
+
 ANGULAR = {DEGREES, 1 / DEGREES, RPM}
 
 

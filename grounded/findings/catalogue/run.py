@@ -7,7 +7,8 @@ from grounded.findings.catalogue import Entry
 OF = "[[{log}: ]]"  # the file, where the log is refused
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
 OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.after*")
-OUTCOME += ("run.moved_on", "run.let_go", "run.swings", "run.samples", "run.start")
+OUTCOME += ("run.moved_on", "run.let_go", "run.swings", "run.samples")
+SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
 
 ENTRIES: dict[str, Entry] = {
     # the program
@@ -17,35 +18,35 @@ ENTRIES: dict[str, Entry] = {
         "[[{states} in {unit}]][[{states} times {times:.4g}]][[the states as {passed}]]",
         "pass the seconds since the run began and the states as the model has them[[: {order}]], "
         "and run {ran} again",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "unfed": Entry(
         "aside",
         OF + "its commands are the feed-forward of {ran} alone, without its feedback",
         "send what `runner.action(t, state)` returns, for a state that holds numbers only "
         "(`runner.blind` counts the calls without), and run {ran} again",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "other_states": Entry(
         "aside",
         OF + "its commands are near the feed-forward of {ran}, with feedback on states nearer to "
         "its plan than those of the log: does the program read another message or estimate?",
         "pass `runner.action` the signals that are logged, and run {ran} again",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "origin": Entry(
         "aside",
         OF + "its commands are what {ran} sends on states from another origin: {off} beside those "
         "in the log",
         "pass `runner.action` the states as they are logged, in one frame, and run {ran} again",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "clock": Entry(
         "aside",
         OF + "its first command is that of step {step} ({seconds:.3g} s) of {ran}, and the others "
         "follow: its clock began before the run",
         "pass `runner.action` the seconds since the run began, and run {ran} again",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "exchanged": Entry(
         "aside",
@@ -135,7 +136,7 @@ ENTRIES: dict[str, Entry] = {
         "is it wired the wrong way round, or its sign wrong in the model or the log[[ ({column} "
         "reads another column now)]]? Then[[ `discard {trial}`,]] mend it and run again; "
         "otherwise `propose` goes on",
-        hides=(*OUTCOME[1:-1], "log.limits"),
+        hides=(*OUTCOME[1:], "log.limits"),
     ),
     "astray": Entry(
         "aside",
@@ -143,7 +144,7 @@ ENTRIES: dict[str, Entry] = {
         "what runs do otherwise[[ ({others})]]",
         "did it run as it should? If not (a motor, a sensor, somebody in the way), `discard "
         "{trial}` and run {ran} again; if it did, `propose` goes on",
-        hides=OUTCOME[2:-1],
+        hides=OUTCOME[2:],
     ),
     "early": Entry(
         "aside",
@@ -151,7 +152,7 @@ ENTRIES: dict[str, Entry] = {
         "the robot was as near to its prediction there as before[[ ({ran} ran to the end in "
         "{complete})]]: was the recording cut off, or the robot stopped?",
         "`discard {trial}` and run {ran} again; if it crashed, `propose` goes on",
-        hides=OUTCOME[3:],
+        hides=SPOILT[3:],
     ),
     "failed": Entry(
         "warn",
@@ -185,7 +186,7 @@ ENTRIES: dict[str, Entry] = {
         "its noise[[; by the model its whole start changes its utility by {change:+.3g}]]",
         "`discard {trial}`, place the robot nearer and run {ran} again; if it can't be placed "
         "nearer, `propose` goes on; if it always starts there, set it in [task] start",
-        hides=OUTCOME,
+        hides=SPOILT,
     ),
     "start": Entry(
         "warn",

@@ -21,8 +21,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.read_before import paths_of, read_by
 
 if TYPE_CHECKING:
-    from grounded.accounts.judge import Told
-    from grounded.accounts.table import Account
+    from grounded.accounts.table import Account, Told
 
 # multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
 TURNS, WIDER = 5.0, 2.0
