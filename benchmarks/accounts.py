@@ -475,8 +475,9 @@ def named(model: Model, trials: Sequence[Trial]) -> tuple[list[tuple[str, frozen
     try:
         found = sound_trials(model, trials).findings
     except UnusableTrials as error:
-        kinds = [one.code.partition(".")[2] for one in error.findings if "tied" not in one.facts]
-        signals = frozenset(name for one in error.findings for name in one.about)
+        first = [one for one in error.findings if "tied" not in one.facts]
+        kinds = [one.code.partition(".")[2] for one in first]
+        signals = frozenset(name for one in first for name in one.about)
         return [(CODES.get(kinds[0], kinds[0]), signals)], True
     every: dict[str, set[str]] = defaultdict(set)
     for finding in found:
