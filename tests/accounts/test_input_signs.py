@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import holds
 from grounded import Model, Param
 from grounded.accounts.commands import how_inputs_act, judge_signs
+from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.sound_trials import sound_trials
 from grounded.effects import Library, wrap
-from grounded.errors import GroundedError
 from grounded.models import arm, cart_pole
 from grounded.trial import Trial
 
@@ -74,16 +73,19 @@ def test_the_trial_that_contradicts_the_others_is_named():
     judge_signs(
         AXIS, [wrong, replace(wrong, id="t0003")], range(2)
     )  # the model's sign: not their fault
-    with pytest.raises(GroundedError) as raised:
+    with pytest.raises(UnusableTrials) as raised:
         sound_trials(AXIS, [right, wrong])
-    facts = ("trial t0002", "torque", "than in t0001 and in the model", "discard this trial")
-    assert holds(str(raised.value), *facts)
+    (one,) = raised.value.findings
+    assert (one.code, one.about, one.facts["which"]) == ("log.reversed", ("torque",), ("t0002",))
+    assert one.facts["others"] == ("t0001",) and one.facts["share"] < 0 < one.facts["usual"]
     assert raised.value.then.arguments == ("t0002",)
     sound_trials(AXIS, [right, wrong], first=1)  # two robots, which are compared
     more = [replace(wrong, id=f"t000{k + 2}") for k in range(2)]
-    with pytest.raises(GroundedError) as raised:
+    with pytest.raises(UnusableTrials) as raised:
         judge_signs(AXIS, [right, *more], range(2))
-    assert holds(str(raised.value), "trial t0001", "than in t0002 and t0003", "as in the model")
+    facts = raised.value.finding.facts
+    assert (facts["which"], facts["others"]) == (("t0001",), ("t0002", "t0003"))
+    assert facts["usual"] < 0 < facts["share"]
 
 
 SWINGS = {  # model, goal, inputs there, their limit, gains, largest distance of the start

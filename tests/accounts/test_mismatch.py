@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
+from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.kinematics import Row, gaps, kinematic_rows, unheld
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.models.car import model as CAR
 from grounded.trial import Trial
@@ -190,30 +190,32 @@ def test_degrees_and_signs_are_put_right_in_the_one_signal_that_has_them(
 
 
 @pytest.mark.parametrize(
-    ("model", "fault", "first", "no"),
+    ("model", "fault", "about", "by"),
     [
-        (BOAT, times(x=1e3, y=1e3), ["[log.state.x] scale = 0.001", "[log.state.y]"], ["psi]"]),
-        (PLAIN, times(x=1e3, y=1e3), ["[log.state.x] scale = 0.001", "[log.state.y]"], ["psi]"]),
-        (BOAT, times(u=1e3), ["[log.state.u] scale = 0.001"], ["state.x]", "state.y]"]),
-        (BOAT, times(y=1e2), ["[log.state.y] scale = 0.01"], ["state.x]", "state.u]"]),
-        (BOAT, swapped("x", "y"), ["columns of x and y"], ["u and v"]),
-        (BOAT, swapped("u", "v"), ["columns of u and v"], ["x and y"]),
-        (PLAIN, swapped("x", "y"), ["columns of x and y"], []),
+        (BOAT, times(x=1e3, y=1e3), ("x", "y"), 0.001),
+        (PLAIN, times(x=1e3, y=1e3), ("x", "y"), 0.001),
+        (BOAT, times(u=1e3), ("u",), 0.001),
+        (BOAT, times(y=1e2), ("y",), 0.01),
+        (BOAT, swapped("x", "y"), ("x", "y"), None),
+        (BOAT, swapped("u", "v"), ("u", "v"), None),
+        (PLAIN, swapped("x", "y"), ("x", "y"), None),
     ],
 )
-def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(model, fault, first, no):
-    with pytest.raises(GroundedError) as error:
+def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(model, fault, about, by):
+    with pytest.raises(UnusableTrials) as error:
         preflight(model, logged(model, fault))
-    said = str(error.value).partition("or else")[0]
-    assert "every trial" in said
-    assert all(one in said for one in first) and not any(one in said for one in no)
+    first = error.value.finding
+    assert (first.code, first.about) == ("log.unit" if by else "log.exchange", about)
+    if by:
+        assert first.facts["by"] == pytest.approx(by)
+        assert first.facts["tables"] == tuple(f"[log.state.{name}]" for name in about)
     assert error.value.then is not None
     assert error.value.then.arguments == ("t0000", "t0001", "t0002")
 
 
 def test_one_trial_that_is_off_is_named_alone():
     trials = [*logged(BOAT)[:2], logged(BOAT, times(x=1e3, y=1e3))[2]]
-    with pytest.raises(GroundedError) as error:
+    with pytest.raises(UnusableTrials) as error:
         preflight(BOAT, trials)
     assert error.value.then is not None and error.value.then.arguments == ("t0002",)
     (one,) = preflight(BOAT, [*trials[:2], logged(BOAT, times(y=-1))[2]]).findings
@@ -230,15 +232,20 @@ def folded(x: Array) -> Array:
 
 
 def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
-    with pytest.raises(GroundedError, match=r"scale in \[log\.state\.psi\] by 0\.0174532"):
+    with pytest.raises(UnusableTrials) as error:
         preflight(BOAT, logged(BOAT, folded))
+    (one,) = error.value.findings
+    assert (one.code, one.about) == ("log.folded", ("psi",))
+    assert one.facts["by"] == pytest.approx(np.pi / 180)
 
 
 def test_of_several_trials_the_one_with_a_folded_heading_is_named():
     """A rover's later log alone was in degrees: `no fault found in the sensors`."""
     trials = [*logged(BOAT)[:2], logged(BOAT, folded)[2]]
-    with pytest.raises(GroundedError, match="in trial t0002 psi is in degrees") as error:
+    with pytest.raises(UnusableTrials) as error:
         preflight(BOAT, trials)
+    (one,) = error.value.findings
+    assert (one.code, one.about, one.facts["which"]) == ("log.folded", ("psi",), ("t0002",))
     assert error.value.then is not None and error.value.then.arguments == ("t0002",)
 
 
