@@ -8,7 +8,7 @@ A slot is `{name}` or `{name:how}`:
     {name:trial}       a number (or the length of a list) with a noun: "1 trial", "3 trials"
     {name:is/are}      the first word for one, the second for several
     {name:low=too low,high=too high}   the words for a value
-    {name:.3g}         a number by Python's format
+    {name:.3g}, {name:g}   a number by Python's format
 
 `[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or 0 as a number.
 `[[name? ...]]` is kept where the fact `name` is none of these, `[[!name? ...]]` where it is one.
@@ -69,7 +69,7 @@ def shaped(value: Any, how: str) -> str:
     if "/" in how:
         one, several = how.split("/")
         return one if number == 1 else several
-    if how.replace(" ", "").isalpha():
+    if len(how) > 1 and how.replace(" ", "").isalpha():
         return f"{number} {how}{'s' * (number != 1)}"
     if how:
         return f"{number:{how}}"

@@ -438,7 +438,7 @@ def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
 
     held = np.repeat(x[::5], 5)
     told, off = taken("held.csv", [f"{one:.6f}" for one in held])
-    assert [one for one in told if holds(one, "'x'", "50 Hz", "10 Hz", "0.04 s", "empty")]
+    assert [one for one in told if holds(one, "x", "50 Hz", "10 Hz", "0.04 s", "empty")]
     empty = [f"{one:.6f}" if k % 5 == 0 else "" for k, one in enumerate(held)]
     told, mended = taken("empty.csv", empty)
     assert not any("held" in one for one in told)

@@ -71,7 +71,7 @@ def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
         inputs={"port": "1", "starboard": "1"},
         derivative=lambda s, a, p: {"v": a.port + a.starboard},
     )
-    assert crossed(boat, reading(boat, "v", "port", "starboard", form=form)) == ()
+    assert not crossed(boat, reading(boat, "v", "port", "starboard", form=form))
     (told,) = crossed(boat, reading(boat, "v", "starboard", "port", form=form))
     assert told.about == ("port", "starboard")
 
