@@ -79,7 +79,7 @@ def test_a_log_whose_positions_are_a_thousand_times_too_small_is_told(w, tmp_pat
     assert len(found.faults) == 1 and found.then.verb == "discard"
     (told,) = of_code(found, "log.unit")
     assert (told.about, told.facts["by"]) == (("x", "y"), pytest.approx(1000))
-    with pytest.raises(GroundedError, match="x and y.*1000"):
+    with pytest.raises(GroundedError, match=r"x and y.*1000"):
         w.preflight()
 
 
