@@ -11,7 +11,7 @@ from grounded.findings import Quantity, Weight, catalogue, found, settle
 from grounded.findings.numbers import filled
 
 SLOT = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
-LONGEST = 320  # characters of a sentence, four lines of a terminal
+LONGEST = 400  # characters of a sentence with all its clauses, five lines of a terminal
 ENTRIES = [(code, catalogue.entry_of(code)) for code in catalogue.codes()]
 
 

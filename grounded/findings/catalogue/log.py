@@ -24,6 +24,7 @@ ENTRIES: dict[str, Entry] = {
         "[[ and of {negative}]][[: far beyond {beyond:.3g} in [safety] otherwise]]"
         + MOTION
         + RAN
+        + TIED
         + IN,
         SCALE + WRITES + "[[, and in [limits] {limits}]]" + AGAIN,
         hides=(*RUN, "log.limits", "log.stated"),
@@ -44,7 +45,7 @@ ENTRIES: dict[str, Entry] = {
     "compass": Entry(
         "aside",
         "{about} turns the other way than positions do: it is {angle:.0f} degrees less the logged "
-        "value, as on a compass" + IN,
+        "value, as on a compass" + TIED + IN,
         "[[set scale = -1 and that offset in {tables}]]" + AGAIN,
         hides=RUN,
     ),
@@ -64,6 +65,7 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         OF
         + "{about} shows no motion, only noise around {mean:.4g}, while {state} moves by {moved}"
+        + TIED
         + IN,
         "is its sensor on? If it is, look for its column in [log]" + AGAIN,
         hides=RUN,
@@ -76,14 +78,14 @@ ENTRIES: dict[str, Entry] = {
     ),
     "axes": Entry(
         "aside",
-        "{about} are in the axes of the positions, not in body axes[[ (in {which})]]",
+        "{about} are in the axes of the positions, not in body axes" + TIED + IN,
         "rotate them by -{heading}, in the log and in the robot's program, or write the model with "
         "speeds in world axes" + AGAIN,
         hides=RUN,
     ),
     "pace": Entry(
         "aside",
-        OF + "a second of its stamps is {by:g} s of the run" + MOTION + RAN + IN,
+        OF + "a second of its stamps is {by:g} s of the run" + MOTION + RAN + TIED + IN,
         "multiply the stamps by {by:g}" + AGAIN,
         hides=RUN,
     ),
