@@ -61,7 +61,7 @@ def test_the_skeleton_predicts_its_own_drone(tmp_path):
 def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):
     bag = ros_bags.drone_bag(tmp_path / "bag")
     path = f"{COMMAND}.@world_velocity.x"
-    with pytest.raises(GroundedError, match=r"needs a message with pose\.pose\.orientation"):
+    with pytest.raises(GroundedError, match=r"needs pose\.pose\.orientation"):
         read_signals((next(bag.glob("*.db3")),), {"v": SignalSpec(path)})
 
 
