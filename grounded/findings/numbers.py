@@ -3,7 +3,8 @@
 A slot is `{name}` or `{name:how}`:
 
     {name}             a text; a list as "a, b and c"; a quantity with its unit and its +-
-    {name:size}        a length, angle or time in two digits, in mm, mrad or ms where it is small
+    {name:size}        a length, angle or time in two digits, in mm, mrad or ms where it is small;
+                       several of one unit in one prefix
     {name:%}           a share in per cent
     {name:trial}       a number (or the length of a list) with a noun: "1 trial", "3 trials"
     {name:is/are}      the first word for one, the second for several
@@ -18,10 +19,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from grounded.result import figure, listed, measured, percent, with_error, with_unit
+from grounded.result import figure, listed, measured, measured_alike, percent, with_error, with_unit
 
 _CLAUSE = re.compile(r"\[\[(.*?)\]\]", re.S)
 _IF = re.compile(r"(!?)(\w+)\? ?")
@@ -44,7 +45,21 @@ def filled(text: str, facts: Mapping[str, Any]) -> str:
         names = [name for name, _ in _SLOT.findall(text)]
         return text if all(_known(facts.get(name)) for name in names) else ""
 
-    return _SLOT.sub(lambda m: shaped(facts[m[1]], m[2] or ""), _CLAUSE.sub(clause, text))
+    kept = _CLAUSE.sub(clause, text)
+    sizes = _alike(facts, [name for name, how in _SLOT.findall(kept) if how == "size"])
+    return _SLOT.sub(lambda m: sizes.get(m[1]) or shaped(facts[m[1]], m[2] or ""), kept)
+
+
+def _alike(facts: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
+    """Return sizes of one unit in one prefix, since a sentence compares them."""
+    by_unit: dict[str, list[str]] = {}
+    for name in names:
+        by_unit.setdefault(facts[name].unit, []).append(name)
+    told = {}
+    for unit, some in by_unit.items():
+        if len(some) > 1:
+            told |= zip(some, measured_alike([facts[n].value for n in some], unit), strict=True)
+    return told
 
 
 def slots(text: str) -> set[str]:

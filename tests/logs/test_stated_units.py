@@ -57,7 +57,7 @@ def test_units_in_a_table_s_first_row_become_scales(tmp_path):
     whole = (w / "grounded.toml").read_text()
     (w / "grounded.toml").write_text(whole.replace("scale = 0.001\n", "", 1))
     bare = grounded("-C", w, "ingest", "--data", tmp_path / "log.csv", "--json")
-    assert holds(bare.json["trials"][0]["warnings"][0], "x", "mm", "scale = 0.001")
+    assert holds(bare.json["trials"][0]["warnings"][0], "x", "mm", "0.001")
     grounded("-C", w, "discard", "t0001")
     (w / "grounded.toml").write_text(whole)
     done = grounded("-C", w, "ingest", "--data", tmp_path / "log.csv", "--json")

@@ -121,7 +121,8 @@ def one_thing(predictor: Predictor, index: int, effect: Effect) -> bool:
     anywhere = replace(data, commands=commands)
     track = rng.uniform(low, high, (len(data.time) + 1, data.time.shape[1], data.model.n))
     h = replace(Hypothesis().plus(effect, {q.name: q.start for q in effect.free}), spread=1.0)
-    columns = linearise(Predictor(anywhere), h, track)[1] / np.maximum(high - low, 1e-12)[:, None]
+    size = np.where(high > low, high - low, 1.0)[:, None]  # of one that is not logged: any
+    columns = linearise(Predictor(anywhere), h, track)[1] / size
     own = columns[..., 1].ravel()
     other = columns[..., 2 + int(np.flatnonzero(calibrated(data) == index)[0])].ravel()
     power = float(own @ own) * float(other @ other)
@@ -240,7 +241,7 @@ def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int])
     apart = np.maximum(most - least, 1e-9)
     x = rng.uniform(low, high, (SAMPLES, data.model.n))
     u = rng.uniform(least - apart, most + apart, (SAMPLES, data.model.m))
-    size = np.maximum(high - low, 1e-12)
+    size = np.where(high > low, high - low, 1.0)  # of a state that is not logged: any
 
     def slope(up: Hypothesis, down: Hypothesis) -> Array:
         after, before = (_rate(predictor, end, x, u) for end in (up, down))

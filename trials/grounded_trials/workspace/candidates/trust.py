@@ -210,7 +210,9 @@ def _by_diagnosis(
     """Return how far the model as it is now misses the first weighed states, by a diagnosis."""
     if found_last is None or since is None or not found_last.prediction_error:
         return {}
-    row, adopted = found_last.prediction_error[-1], bool(since.adopted) and not since.missing
+    rows = found_last.prediction_error
+    row = next((one for one in reversed(rows) if not one.whole_trial), rows[-1])
+    adopted = bool(since.adopted) and not since.missing
     if since.changed and not adopted:
         return {}
     errors = row.with_effects if adopted else row.crude
