@@ -55,7 +55,7 @@ def _alike(facts: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
     by_unit: dict[str, list[str]] = {}
     for name in names:
         by_unit.setdefault(facts[name].unit, []).append(name)
-    told = {}
+    told: dict[str, str] = {}
     for unit, some in by_unit.items():
         if len(some) > 1:
             told |= zip(some, measured_alike([facts[n].value for n in some], unit), strict=True)
