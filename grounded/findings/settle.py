@@ -17,12 +17,16 @@ def settle(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
     One that is only a consequence of another, as that one's entry says (`hides`), is left out if
     both are about the same signal or trial, or one of them is about none. What stands there twice
-    is told once.
+    is told once, with its heaviest weight.
     """
-    once = {(one.code, one.about): one for one in reversed(list(findings))}
+    once = dict[tuple[str, tuple[str, ...]], Finding]()
+    for one in findings:
+        known = once.setdefault((one.code, one.about), one)
+        if ORDER.index(one.weight) < ORDER.index(known.weight):
+            once[one.code, one.about] = one
     kept = [
         one
-        for one in reversed(once.values())
+        for one in once.values()
         if not any(_hides(other, one) for other in once.values() if other is not one)
     ]
     return tuple(sorted(kept, key=_rank))

@@ -208,7 +208,7 @@ def test_run_may_name_any_candidate_and_needs_one(w):
     again = grounded("-C", w, "run", "c0001", "--json").json
     assert Path(again["trial_file"]).name == "c0001-2.mcap"
     wrong = grounded("-C", w, "run", "c0009")
-    assert wrong.code == 1 and holds(wrong.err, "'c0009'", "c0001")
+    assert wrong.code == 1 and holds(wrong.err, "c0009", "c0001")
 
 
 def test_exports_hold_the_same_policy_with_units_and_time_base(w, tmp_path):

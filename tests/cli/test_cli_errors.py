@@ -152,17 +152,17 @@ def lost(k, of, values):
 RUNS = {
     "short": (lambda s, u: (s[:21], u[:20]), ["20", "40"]),
     "nothing": (lambda s, u: (s[:1], u[:0]), ["0", "40"]),
-    "nan": (lambda s, u: (lost(10, 41, s), u), ["'x'", "0.50 s"]),
-    "nan at once": (lambda s, u: (lost(0, 41, s), u), ["'x'", "0.00 s"]),
-    "input lost": (lambda s, u: (s, lost(7, 40, u)), ["'force'", "0.35 s"]),
+    "nan": (lambda s, u: (lost(10, 41, s), u), ["x", "0.500 s"]),
+    "nan at once": (lambda s, u: (lost(0, 41, s), u), ["x", "0 s"]),
+    "input lost": (lambda s, u: (s, lost(7, 40, u)), ["force", "0.350 s"]),
     "gap": (
         lambda s, u: (np.where((np.arange(41) // 5 == 2)[:, None], np.nan, s), u),
-        ["10", "'x'", "0.50 s"],
+        ["10", "x", "0.500 s"],
     ),
     "far start": (lambda s, u: (s + np.array([0.5, 0.0]), u), ["x"]),
     "beyond limits": (lambda s, u: (s, u * 0 + 9.0), ["force", "[limits]"]),
-    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["50 ms"]),
-    "longer": (lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])), ["3", "40"]),
+    "late": (lambda s, u: (s, np.vstack([u[:1], u[:-1]])), ["1 step"]),
+    "longer": (lambda s, u: (np.vstack([s, s[-3:]]), np.vstack([u, u[-3:]])), []),
 }
 FAILED = ("short", "nothing", "nan", "nan at once", "input lost")
 
