@@ -31,8 +31,6 @@ from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.step.step_size import SearchOptions
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_bounded_step_is_the_best_one_inside(seed):
@@ -118,7 +116,6 @@ def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
     assert not bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
 
 
-@worse
 @pytest.mark.slow
 def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
