@@ -8,10 +8,9 @@ steps:
        predictions are better by more than their standard error and as much as matters (LEAST, and
        SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
-    3. Of the supported sets that the reference is not better than by the same test (a smaller one:
-       likelier and predicting better; one as large: predicting better), the smallest is chosen: the
-       one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
-       (Piironen & Vehtari 2017).
+    3. Of the supported sets that the reference predicts no better than, by the same test of
+       predictions, the smallest is chosen: the one-standard-error rule of Breiman et al. (1984),
+       and of projection predictive selection (Piironen & Vehtari 2017).
     4. Of those that are as small, and those that predict better than one of them, the likeliest.
        Within NATS nats they tie: then a parameter comes before a mechanism, and that before what
        has no mechanism (`Option.order`).
@@ -132,11 +131,5 @@ class Rule:
         return not self.held_out or (matters and more.pays(SCATTERS))
 
     def _as_good(self, option: Option, best: Option) -> bool:
-        """Check whether the best set is no better, by the test of a cause.
-
-        More causes must be likelier and predict better; of as many, predictions decide.
-        """
-        likelier = best.evidence - option.evidence >= NATS
-        smaller = len(option.causes) < len(best.causes)
-        better = self.gain(option.errors, best.errors).pays(SCATTERS)
-        return not better or (smaller and not likelier)
+        """Check whether predictions of the best set are no better, by the test of a cause."""
+        return not self.gain(option.errors, best.errors).pays(SCATTERS)

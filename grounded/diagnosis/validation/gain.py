@@ -61,7 +61,7 @@ class Gain:
     def pays(self, scatters: float) -> bool:
         """Check whether the gain is significant: over all channels, again and again, or in one."""
         one = (self.channels > SURE * scatters * self.scatters) & (self.channels > LEAST)
-        several = self.mean > 0 and (self.again > SURE or bool(one.any()))
+        several = self.mean > 0 and (self.again > SURE * scatters or bool(one.any()))
         return self.largest > LEAST and (self.mean > scatters * self.scatter or several)
 
 
