@@ -40,8 +40,3 @@ def _hides(one: Finding, other: Finding) -> bool:
     """Return whether a finding is told by another already."""
     shared = not one.about or not other.about or bool({*one.about} & {*other.about})
     return shared and any(fnmatchcase(other.code, code) for code in entry_of(one.code).hides)
-
-
-def refused(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return those that stop the command."""
-    return tuple(one for one in findings if one.weight is Weight.REFUSE)

@@ -224,5 +224,4 @@ ENTRIES: dict[str, Entry] = {
         "runner sends {held}, which does not hold it there[[ ({would} would)]]",
         "hold it with another controller as soon as `runner.done(t)` is true",
     ),
-    "note": Entry("note", "{about}"),
 }

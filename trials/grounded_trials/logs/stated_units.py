@@ -94,10 +94,6 @@ class Stated:
         found = factor_between(said, wanted) if (said := self.unit(path)) else None
         return 1.0 if found is None else found
 
-    def by_whom(self, path: str) -> str:
-        """Return what states the unit, as the subject of a sentence."""
-        return "the log" if path in self.heads else "its name"
-
 
 def unit_in_name(path: str) -> str:
     """Return the unit at the end of a message path's last name, as in `/csv.x_mm`; "" for none."""

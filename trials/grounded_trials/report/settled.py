@@ -27,9 +27,6 @@ from grounded_trials.workspace.adopting import (
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
-    read_diagnosis,
-    since_diagnosis,
-    usable_ids,
 )
 from grounded_trials.workspace.user_files.config import ModelTable
 
@@ -90,28 +87,6 @@ def _error(d: Diagnosis, now: str = "with_effects", before: str = "crude") -> Fi
 
 def _open(d: Diagnosis) -> Finding | None:
     return next(open_line(d), None) if d.leftover else None
-
-
-def measured_now(workspace: Folder) -> str:
-    """Return the current planning model's prediction error by the last diagnosis, or "".
-
-    If what that claims was adopted since, it is compared with the error just before.
-    """
-    try:
-        diagnosis = read_diagnosis(workspace.reports)
-    except GroundedError:
-        return ""
-    if diagnosis is None:
-        return ""
-    since = since_diagnosis(workspace, diagnosis, usable_ids(workspace))
-    settled = settled_in(workspace, diagnosis, since)
-    if settled is not None and settled.closed:
-        one = _error(diagnosis)
-    elif settled is not None:
-        one = settled.gained
-    else:
-        one = None if since.changed else _error(diagnosis, "crude", "crude")
-    return sentence(one) if one else ""
 
 
 def told_since(diagnosis: Diagnosis, since: Since, settled: Settled | None) -> Told:

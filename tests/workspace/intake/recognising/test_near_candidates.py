@@ -272,7 +272,7 @@ def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
     first = propose_in(w).candidate.id
     for _ in range(3):
         done = ingest_log(w, run_candidate(w, first).trial_file, first)
-        assert not of_code(done, "run.note")
+        assert not of_code(done, "search.counts")
     runs = [one.trial for one in w.trials()]
     states = runs[0].states + np.linspace(0, 0.5, 41)[:, None]
     strange = replace(runs[0], states=states, inputs=runs[0].inputs[::-1])

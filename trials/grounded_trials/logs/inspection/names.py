@@ -80,11 +80,6 @@ _RATE = re.compile(r"_(rate|speed|velocity|vel|omega|dot)$")
 WORTH, LESS, TOPIC, STEM = 4.0, 0.3, 3.0, 3.0  # points of the usual name, less of each further one
 
 
-def is_command(path: str) -> bool:
-    """Return whether a word of a path says that it is a command."""
-    return bool({*_COMMANDED}.intersection(_WORD.findall(path.lower())))
-
-
 def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) -> tuple[str, ...]:
     """Return the usual names of a state or input, its own first.
 

@@ -97,9 +97,7 @@ class Ingested(Result):
     @property
     def faults(self) -> tuple[str, ...]:
         """The sentences of those that say that columns of the log are wrong."""
-        return tuple(
-            one.sentence for one in self.findings if one.code in (*COLUMNS, "run.exchanged")
-        )
+        return tuple(one.sentence for one in self.findings if one.code in FAULTS)
 
     def summary(self) -> str:
         """Return the trial, what it ran and the verdict."""
