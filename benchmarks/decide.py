@@ -20,14 +20,15 @@ from pathlib import Path
 import grounded.diagnosis.diagnose as diagnosing
 from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
 from grounded.challenge.score import share
-from grounded.diagnosis.validation import choose
+from grounded.diagnosis.validation import choose, gain
 from grounded.diagnosis.validation.decide import Options, decide
 from grounded.diagnosis.validation.gain import Comparison
 
 CURVES = {
-    "NATS": (1.0, 2.0, 3.0, 5.0, 8.0),
-    "SCATTERS": (0.5, 1.0, 1.5, 2.0),
-    "SHARE": (0.0, 0.01, 0.02, 0.05),
+    (choose, "NATS"): (1.0, 2.0, 3.0, 5.0, 8.0),
+    (gain, "SURE"): (0.5, 1.0, 1.5, 2.0, 3.0),
+    (choose, "SHARE"): (0.0, 0.01, 0.02, 0.05),
+    (gain, "LEAST"): (0.0, 0.01, 0.03, 0.1),
 }
 
 
@@ -151,13 +152,13 @@ def main():
     then = [marked(c, c["document"]["verdict"]["effects"]) for c in cases.values()]
     print(f"{len(cases)} cases\nwhen made: {told(then)}")
     print("now:       " + told([marked(case, decided(case)) for case in cases.values()]))
-    for name, values in CURVES.items() if options.curves else ():
-        usual = getattr(choose, name)
+    for (room, name), values in CURVES.items() if options.curves else ():
+        usual = getattr(room, name)
         for value in values:
-            setattr(choose, name, value)
+            setattr(room, name, value)
             line = told([marked(case, decided(case)) for case in cases.values()])
             print(f"{name} {value:g}{' *' if value == usual else ''}: {line}")
-        setattr(choose, name, usual)
+        setattr(room, name, usual)
 
 
 if __name__ == "__main__":

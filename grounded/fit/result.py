@@ -20,7 +20,6 @@ from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.choose import SCATTERS
 from grounded.diagnosis.validation.gain import LEAST, Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
@@ -95,7 +94,7 @@ class Fit(Result):
     @property
     def helps(self) -> bool:
         """Whether the values are likelier and predict held-out trials better (`choose`)."""
-        better = self.gain is None or (self.gain.pays(SCATTERS) and not self.gain.ruins)
+        better = self.gain is None or (self.gain.pays and not self.gain.ruins)
         return self.nats >= NATS and better
 
     @property
@@ -103,7 +102,7 @@ class Fit(Result):
         """Whether held-out trials are predicted worse than before, by as much as matters."""
         if self.gain is None or self.loss is None:
             return False
-        return (self.loss.pays(SCATTERS) and self.loss.mean > LEAST) or self.gain.ruins
+        return (self.loss.pays and self.loss.mean > LEAST) or self.gain.ruins
 
     @property
     def at_bounds(self) -> tuple[str, ...]:

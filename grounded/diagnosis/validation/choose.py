@@ -27,7 +27,6 @@ from dataclasses import dataclass
 from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.validation.gain import Errors, Gain
 
-SCATTERS = 2.0  # standard errors by which predictions must gain by each cause
 SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
 
 
@@ -128,8 +127,8 @@ class Rule:
             return False
         more = self.gain(less.errors, option.errors)
         matters = more.mean >= SHARE * max(self.gained(option), 0.0)
-        return not self.held_out or (matters and more.pays(SCATTERS))
+        return not self.held_out or (matters and more.pays)
 
     def _as_good(self, option: Option, best: Option) -> bool:
         """Check whether predictions of the best set are no better, by the test of a cause."""
-        return not self.gain(option.errors, best.errors).pays(SCATTERS)
+        return not self.gain(option.errors, best.errors).pays

@@ -58,11 +58,12 @@ class Gain:
         """Whether predictions are clearly better."""
         return self.mean > SURE * self.scatter and self.largest > LEAST
 
-    def pays(self, scatters: float) -> bool:
-        """Check whether the gain is significant: over all channels, again and again, or in one."""
-        one = (self.channels > SURE * scatters * self.scatters) & (self.channels > LEAST)
-        several = self.mean > 0 and (self.again > SURE * scatters or bool(one.any()))
-        return self.largest > LEAST and (self.mean > scatters * self.scatter or several)
+    @property
+    def pays(self) -> bool:
+        """Whether predictions are better: clearly, or twice as surely again and again or in one."""
+        one = (self.channels > 2 * SURE * self.scatters) & (self.channels > LEAST)
+        several = self.mean > 0 and (self.again > 2 * SURE or bool(one.any()))
+        return self.clear or (several and self.largest > LEAST)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,7 @@ def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
     assert decision.causes and set(decision.without) == set(decision.causes)
     assert ruler.gain(decision.crude, decision.fit).mean > 1
     for less in decision.without.values():
-        assert ruler.gain(less, decision.fit).pays(1.0)
+        assert ruler.gain(less, decision.fit).pays
     worth = credited(ruler, decision, losses(ruler, decision))
     assert max(worth.values()) > 0.2 and sum(worth.values()) <= 1 + 1e-9
 
