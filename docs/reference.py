@@ -68,6 +68,10 @@ def page(room: str) -> str:
     return "\n\n".join(opening + front + [f"::: {module}" for module in modules(room)]) + "\n"
 
 
+# What Markdown would read in an entry: slots and clauses are no links, a bar is no cell.
+PLAIN = str.maketrans({sign: f"&#{ord(sign)};" for sign in "[]|*<>"})
+
+
 def findings() -> str:
     """Return the page of all findings, from the catalogue, in Markdown."""
     parts = [
@@ -86,7 +90,7 @@ def findings() -> str:
         ]
         for code, one in catalogue.entries(area).items():
             cells = [f"`{code}`", one.weight, one.short, one.remedy]
-            rows[-1] += "\n| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+            rows[-1] += "\n| " + " | ".join(cell.translate(PLAIN) for cell in cells) + " |"
         parts += rows
     return "\n\n".join(parts) + "\n"
 
