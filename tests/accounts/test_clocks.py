@@ -178,7 +178,6 @@ CARTS = [
 
 @pytest.mark.parametrize(("seconds", "back_emf", "gains"), CARTS)
 def test_a_short_smooth_run_of_a_motor_with_a_back_emf_is_no_clock(seconds, back_emf, gains):
-    """The model lacks that: the cart was told to be 0.24 s ahead, and its clock is one."""
     trial = steered(there(seconds), back_emf=back_emf, gains=gains)
     assert answers_early(pole_cart(), trial, range(4)) is None
 
@@ -202,7 +201,6 @@ def test_a_controller_with_another_clock_is_told_whatever_friction_the_model_lac
 
 
 def test_a_diagnosis_stops_at_them_and_names_the_delay():
-    """Four effects were claimed of a log that was put together half a second wrong."""
     trials = [driven(REAL, early=23 * k, seed=k) for k in range(2)]
     with pytest.raises(GroundedError) as stopped:
         gr.diagnose(craft(), trials)
@@ -225,7 +223,6 @@ def test_short_runs_gaps_and_commands_that_never_change_tell_nothing():
 
 @pytest.mark.parametrize(("odd", "gain", "told"), [(1, 1.2, False), (1, 2.0, True), (2, 1.2, True)])
 def test_one_swing_of_several_that_looks_early_is_not_the_clock(monkeypatch, odd, gain, told):
-    """A robot's logs have one clock: an arm that stuck in one of three was refused."""
     model = cart()
     trials = [driven(model, seed=seed) for seed in range(3)]
     early = iter([Early(0.1, 0, 0.5, 0.2, gain)] * odd + [None] * 3)

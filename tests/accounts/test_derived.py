@@ -60,7 +60,6 @@ def swung(kind, noise=2e-4, steps=700, keep=0.5):
 @pytest.mark.parametrize("keep", [0.5, 0.8])
 @pytest.mark.parametrize("noise", [2e-4, 2e-3])
 def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(noise, keep):
-    """It was taken for a rate 0.08 s late: `offset:omega`, a false `rate_gain`, L 16 sigma off."""
     found = preflight(SWING, swung("filtered", noise, keep=keep))
     kinds = {f.kind for f in found.findings if f.signal == "w"}
     assert "smoothed" in kinds and kinds <= {"smoothed", "delay", "lag"}
@@ -68,7 +67,6 @@ def test_a_rate_filtered_from_positions_is_not_used_and_no_scale_is_claimed(nois
 
 
 def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted():
-    """It follows from the positions as before: diagnoses were of their noise, fits ran away."""
     site = Site(SWING, ("w",), Scales(dt=DT))
     behind = wrap(sensor_lag.at(site), {"tau": 0.04}, DT)
     (trial,) = swung("filtered", keep=0.8)
@@ -89,14 +87,12 @@ def test_a_late_sensor_of_its_own_is_still_used(noise):
 
 @pytest.mark.parametrize("noise", [2e-4, 2e-3])
 def test_a_slow_sensor_of_its_own_is_still_used(noise):
-    """Weights of past differences fit its motion, but not its noise: it was left out, too."""
     found = preflight(SWING, swung("slow", noise))
     assert "smoothed" not in {f.kind for f in found.findings}
     assert np.isfinite(found.trials[0].states[:, 1]).any()
 
 
 def test_a_signal_that_is_not_used_has_one_line():
-    """One line said "corrected here", the next the opposite."""
     for kind, keep in (("filtered", 0.5), ("filtered", 0.8)):
         found = preflight(SWING, swung(kind, keep=keep)).findings
         assert {"smoothed"} < {f.kind for f in found if f.signal == "w"}
@@ -139,7 +135,6 @@ def rolled(late, steps=350):
 
 @pytest.mark.slow
 def test_a_speed_that_is_computed_from_a_late_position_is_as_late():
-    """A plan took a speed for 57 ms old that came from a camera 32 ms late: promised too much."""
     found = diagnose(BALL, [rolled(late=2)], DiagnosisOptions(max_effects=1))
     assert found.effects == ("sensor_delay:x",)
     late = found.late_sensors

@@ -41,7 +41,6 @@ def wave(rest=60):
 
 
 def test_a_cart_at_a_wall_is_seen_from_there_on():
-    """A rover's log had 6 s at a wall: dead zone, friction and parameters were all lost by it."""
     sent = wave()
     trial = driven(sent, wall=4.0)
     arrives = DT * int(np.argmax(trial.states[:, 0] > 3.99))
@@ -84,7 +83,6 @@ def test_ingest_of_data_says_where_to_cut_the_log(tmp_path):
 
 
 def test_wheels_at_a_wall_are_no_sensor_that_sticks():
-    """`v sticks to its last value, up to 1.15 s at a time, and then jumps`: it stood still."""
     rover = Model(
         states={"x": "m", "psi": "rad", "v": "m/s"},
         inputs={"u": "1", "turn": "rad/s"},

@@ -240,7 +240,6 @@ def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
 
 
 def test_of_several_trials_the_one_with_a_folded_heading_is_named():
-    """A rover's later log alone was in degrees: `no fault found in the sensors`."""
     trials = [*logged(BOAT)[:2], logged(BOAT, folded)[2]]
     with pytest.raises(UnusableTrials) as error:
         preflight(BOAT, trials)
@@ -303,7 +302,6 @@ def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypa
 
 
 def test_a_delay_that_a_constant_drift_makes_as_well_is_none(monkeypatch):
-    """A blind case: a car that drifted by 0.3 m/s along its way was given sensors 57 ms late."""
     found = {False: (0.0, 0.013), True: (0.03, 0.013)}  # [s], after the shift and before it
     name = "grounded.accounts.ages._left"
     monkeypatch.setattr(name, lambda ways, steps, *_, **__: [found[steps == 0]])
@@ -341,10 +339,6 @@ def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
 
 
 def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
-    """Blind cases: a car whose tyres slip was given positions 42 ms late.
-
-    A delay that only shows across its way is a slip as well, since nothing measures that speed.
-    """
     late_along_and_across = [(0.0, 0.003), (0.07, 0.003)]
 
     def left(ways, steps, dt, *, apart):

@@ -149,7 +149,6 @@ def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_sensor(seed):
-    """Moved back by 59 ms, it hid a ball's rolling friction and the delay of its camera."""
     rng, half = np.random.default_rng(seed), DT / 2
 
     def fault(y):
@@ -171,10 +170,6 @@ def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_senso
 
 @pytest.mark.parametrize("counts", [1024, 4096])
 def test_a_speed_that_a_motor_controller_filters_from_its_encoder_is_no_sensor(counts):
-    """A student's time constant was 0.065 +- 0.001 s, truly 0.070 s, with such a speed as a sensor.
-
-    The controller counts at 1 kHz, and sends every 20 ms.
-    """
     rng, fine = np.random.default_rng(counts), 20
     count, part = 2 * np.pi / counts, 1e-3 / (0.02 + 1e-3)
 
@@ -242,7 +237,6 @@ def test_a_constant_that_few_or_noisy_samples_would_not_show_may_be_there():
 
 @pytest.mark.slow
 def test_a_heading_rate_that_is_only_carried_rules_out_no_effect_on_the_heading():
-    """A car that turned by -0.43 rad/s was told as a patch of ground, with ten times the error."""
     rng, trials = np.random.default_rng(2), []
     real = wrap(Library().effect("offset:psi", car), {"c": -0.4}, DT)
     for _ in range(4):
@@ -328,7 +322,6 @@ def of_another_axis(x):
 
 
 def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
-    """Seen: a damping of 1e136 1/s explained it."""
     with pytest.raises(UnusableTrials) as stopped:
         preflight(ARM, arm(of_another_axis))
     assert (stopped.value.finding.code, stopped.value.finding.about) == ("log.dead", ("w",))
@@ -463,7 +456,6 @@ def test_noise_in_both_brackets_the_scale():
 
 @pytest.mark.parametrize("size", [1.0, 0.9])
 def test_noise_is_no_scale_where_a_motion_hardly_changes(size):
-    """In a half circle, what little a boat's turn rate changed was 5 % smaller in its gyro."""
     rng, t = np.random.default_rng(2), np.arange(400) * DT
     true = 0.7 + 0.06 * np.sin(1.3 * t)
     a = true + 0.001 * rng.standard_normal(400)
@@ -478,7 +470,6 @@ def test_noise_is_no_scale_where_a_motion_hardly_changes(size):
 @pytest.mark.slow
 @pytest.mark.parametrize("filtered", [True, False])
 def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):
-    """A pendulum's rate behind a filter of 11 ms was 10 ms late and 5.6 % too small."""
     rng, t, tau = np.random.default_rng(2), DT * np.arange(1500), 0.011
     a, b = np.zeros(1500), np.zeros(1500)
     for w, size in ((3.0, 0.3), (19.0, 1.0), (23.0, 0.8), (27.0, 0.6)):
@@ -569,7 +560,6 @@ def test_one_state_of_one_trial_in_degrees_is_named():
     ("state", "factor"), [(0, 180 / np.pi), (0, np.pi / 180), (1, 180 / np.pi), (1, np.pi / 180)]
 )
 def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
-    """A theta that was 57.3 times too small passed for an omega in degrees."""
     trials = arm()
     states = np.array(trials[1].states)
     states[:, state] *= factor
@@ -593,7 +583,6 @@ def driven():
 
 
 def test_a_gyro_that_is_off_is_told_though_the_model_carries_its_rate_along():
-    """Off by 0.95 rad/s it was not found: the carried rate stays off in the model as well."""
     biased = [replace(trial, states=trial.states + 0.9 * GYRO) for trial in driven()]
     (found,) = preflight(car, biased).findings
     assert (found.signal, found.kind, found.corrected) == ("psi_rate", "offset", False)
@@ -731,7 +720,6 @@ def test_one_factor_of_all_rates_is_the_clock(off, told):
     [(60 / (2 * np.pi), True, True), (2 * np.pi / 60, True, False), (9.2, False, False)],
 )
 def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
-    """`w shows 955 % of the rate of q`: a motor's driver gives turns a minute."""
     (found,) = preflight(ARM, arm(columns(w=lambda x: factor * x))).findings
     assert (found.signal, found.corrected) == ("w", mended)
     assert ("rpm" in found.finding) == rpm
@@ -739,7 +727,6 @@ def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
 
 
 def test_two_rates_in_rpm_are_no_clock():
-    """It said to multiply the stamps by 0.105, and offered six effects to adopt."""
     trials, factor = [], 60 / (2 * np.pi)
     for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
         a, b = first.states, second.states
@@ -805,7 +792,6 @@ def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hide
 
 @pytest.mark.parametrize("limit", [0.1, 0.45])
 def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
-    """A steering that the crude model itself limits to 0.45 rad was probed beyond that only."""
 
     def within(s, a, p):
         steering = np.minimum(np.maximum(a.steering, -limit), limit)
@@ -835,7 +821,6 @@ ROVER = Model(
 
 
 def test_a_delay_that_is_part_of_the_model_is_not_corrected_again():
-    """It was: then the adopted delay "should be 0", and `diagnose` advised to adopt that."""
     late = adopted(ROVER, ("sensor_delay:omega", {"d": 0.14 * DT}))
     t = np.arange(1500) * DT
     inputs = np.sin(1.3 * t)[:, None] + np.sign(np.sin(0.7 * t))[:, None]

@@ -70,7 +70,6 @@ def test_a_model_that_steps_by_itself_is_not_judged():
 
 
 def test_the_delay_behind_a_whirl_is_found_and_what_was_left_out_is_said():
-    """It was hidden: 182,574 rad a second ahead by one trial, and no effect was claimed."""
     library = Library(tuple(map(Library().family, ("delay", "viscous_friction", "input_gain"))))
     options = DiagnosisOptions(library=library)
     found = diagnose(arm, [driven(0, WHIRL), driven(1), driven(2)], options)

@@ -201,7 +201,6 @@ def test_only_the_trial_in_another_unit_is_named():
 
 
 def test_a_gyro_that_is_no_difference_of_the_heading_stays():
-    """Of nine sound logs one had its gyro left out: wide windows agree by chance."""
     (heading,) = integrals(BOAT)
     for seed in range(12):
         for steps in (230, 300):
@@ -220,7 +219,6 @@ def test_a_gyro_that_is_no_difference_of_the_heading_stays():
     ],
 )
 def test_it_is_told_when_a_log_is_taken_in(fault, code, about):
-    """Runs with a twist in the world's axes were taken in without a word, and planned from."""
     w = SimpleNamespace(base_model=BOAT)
     told = [(one.code, one.about) for one in column_faults(w, logged(fault)[0])]
     assert told == [(code, about)] * bool(code)

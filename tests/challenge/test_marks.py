@@ -121,7 +121,6 @@ def marks_of(truth, named, *, errors=(1.0, 1.0), kind="single", param_error=0.0,
 
 
 def test_a_value_whose_uncertainty_is_unknown_counts_as_an_error_but_covers_nothing():
-    """A patch far from the motion had no std: the score of 200 cases ended in a traceback."""
     label = {"effects": [{"effect": "patch:a", "params": {"c": 2.0, "x0": 1.0}}], "case": "x"}
     label |= {"kind": "single", "noise": "white", "system": "car", "param_error": 0.0}
     row = {"whole_trial": False, "crude": {"v": 1.0}, "with_effects": {"v": 0.5}}

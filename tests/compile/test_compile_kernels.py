@@ -196,7 +196,6 @@ def too_long(*args):
 
 
 def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypatch):
-    """Adopted effects on an arm: `diagnose` and `fit` ended in `TooLong`."""
     whole, rng = problem("car").system, np.random.default_rng(0)
     x, u = rng.uniform(0.2, 0.9, (5, whole.n)), rng.uniform(0.2, 0.9, (5, whole.m))
     at = (x, u, problem("car").p, 0.05, 0.05)

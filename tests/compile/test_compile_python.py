@@ -44,7 +44,6 @@ def test_names():
     ids=["minus", "times", "sin", "plus"],
 )
 def test_values_unpacked_by_mistake_as_names(rate):
-    """`x, v = s` gives names, as of a dict: the error says so, with the user's line."""
 
     def dynamics(s, a, p):
         _, v = s

@@ -29,7 +29,6 @@ def test_a_value_is_as_precise_as_its_standard_deviation(value, std, unit, text)
 
 
 def test_what_is_farthest_above_its_noise_is_left_over_first():
-    """x 0.54 cm at a noise of 0.46 cm came before th 0.30 rad at 0.004: a rate explained some."""
     names = ("x", "v", "th")
     flexible = Leftover("x", 200.0, 1e-3, "m/s", np.zeros((1, 1)), np.zeros((1, 1)))
     fake = SimpleNamespace(

@@ -174,7 +174,6 @@ BEFORE = [
 @pytest.mark.parametrize("later", LATER, ids=lambda part: part[0])
 @pytest.mark.parametrize("before", BEFORE, ids=lambda part: part[0])
 def test_they_are_adopted_in_any_order(before, later):
-    """`adopt` wrote coriolis:u after drift_world:x+y, and no command could read the workspace."""
     models = [adopted(before, later), adopted(later, before)]
     assert {*models[0].params} == {*models[1].params}
     assert body_velocity(models[0]) == ("u", "v") and turning(models[0]) == ("u", "v", "r")
@@ -273,7 +272,6 @@ ADDED = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("added", "rate", "unit"), ADDED)
 def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, unit):
-    """A `rate_gain` would change the drag and the thrust as well."""
     found = gr.diagnose(boat, driven(added=added, steps=100))
     assert found.verdict.effects == (f"coriolis:{rate}",)
     size = found.ranking[0].params["k"]

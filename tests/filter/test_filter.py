@@ -263,7 +263,6 @@ def test_threads_that_ask_at_once_get_one_library(monkeypatch):
 
 
 def test_tempering_changes_little_where_a_correlation_passes_its_threshold():
-    """A sum that was cut off where a correlation fell below two errors jumped by a fifth."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((401, 1, 1))
     shape = np.convolve(rng.standard_normal(460), np.ones(60) / 8, "valid")[:401, None, None]

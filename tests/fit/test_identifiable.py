@@ -88,7 +88,6 @@ def drags(noise=0.02, T=80):
 
 
 def test_parameters_that_are_known_only_together_are_written_together():
-    """Neither was written, though their calibration made the whole gain."""
     model = Model(
         states={"v": "m/s"},
         inputs={"u": "N"},
@@ -119,10 +118,6 @@ def test_a_direction_that_only_the_prior_sets_is_not_known():
 
 
 def test_what_is_known_but_for_one_factor_is_adopted_whole(monkeypatch):
-    """A boat's masses and drags were adopted without its thrust, and it went out of control.
-
-    All were known but for one factor, to 23 %; of the thrust's prior that left 72 %.
-    """
     model = motor(
         mass=Param(30.0, "kg", 15.0, 80.0), gain=Param(20.0, "N", 5.0, 60.0), drag=Param(10.0)
     )

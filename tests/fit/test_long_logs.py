@@ -72,7 +72,6 @@ def clocked(monkeypatch, stages, **options):
 
 
 def test_the_most_time_that_may_be_left_follows_from_the_least_share_done(monkeypatch):
-    """`up to about 9 min left`, 8 s before the end; and 45 s, three minutes before it."""
     run = [("scan", 2), ("refine", 4), ("scan", 10), ("refine", 20), ("scan", 24), ("refine", 79)]
     told = clocked(monkeypatch, [*run, ("refine", 90)])
     assert told[0] == "scan, 2 s so far" and "left" not in told[1]

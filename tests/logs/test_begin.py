@@ -688,7 +688,6 @@ def test_next_ingests_proposes_and_exports(tmp_path):
 
 
 def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path):
-    """After a change of the task a file for the robot stayed beside the new ones."""
     w = Workspace(workspaces.make(tmp_path / "w").folder)
     made = w.propose().candidate.id
     for form in ("npz", "csv"):

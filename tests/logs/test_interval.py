@@ -82,7 +82,6 @@ def table(path, every):
 
 @pytest.mark.parametrize("every, dt", [(5, 0.05), (1, 0.01)])
 def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(tmp_path, every, dt):
-    """`dt = 0.01  # that of the log's commands`, of which one came every 50 ms."""
     (tmp_path / "m.py").write_text(MODEL)
     found = begin(tmp_path / "w", table(tmp_path / "r.csv", every), model=tmp_path / "m.py")
     assert found.dt == dt

@@ -147,7 +147,6 @@ def test_fit_stays_the_function_after_its_room_was_imported():
 
 
 def test_the_front_door_opens_at_once():
-    """`import grounded` does not load numpy; `benchmarks/run.py` measures the time."""
     code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())

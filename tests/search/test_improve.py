@@ -263,7 +263,6 @@ def test_the_fingerprint_follows_the_model_and_nothing_else():
 
 
 def test_refit_plans_with_parameters_from_all_trials():
-    """[search] refit: the bias is added to the model that `refit` returns."""
     task, candidates, trials = story("rover")
     asked = []
 

@@ -49,7 +49,6 @@ def test_the_first_plan_is_finished_and_the_best_of_many_starts(mechanisms):
 
 
 def test_only_columns_that_are_weighed_shape_the_guess(mechanisms):
-    """Reason 3: 0.1 took every finite target column as prescribed, whatever its weight."""
     task = mechanisms.arm_task()
     wild = np.array(task.target)
     wild[:, 2:] = np.random.default_rng(0).normal(size=wild[:, 2:].shape) * 50.0

@@ -126,7 +126,6 @@ def test_what_a_probe_promises_is_what_the_diagnosis_after_it_states(tmp_path):
 
 
 def test_one_trial_that_knows_most_is_not_believed_alone():
-    """Scores are drawn as `foretold` assumes, and the jackknife of each draw is averaged."""
     rng, count = np.random.default_rng(0), 4
     root = rng.standard_normal((count, 3, 3))
     groups = root @ root.swapaxes(1, 2) + np.eye(3)

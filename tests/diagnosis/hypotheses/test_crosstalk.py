@@ -37,7 +37,6 @@ def found():
 
 
 def test_an_input_that_acts_on_another_axis_too_is_named(found):
-    """Fails on 0.1: such a helicopter's yaw rate was "shaken at 0.931 rad/s"."""
     assert found.effects == ("crosstalk:yaw_rate<-u_pitch",)
     [row] = [row for row in found.ranking if row.effect == found.effects[0]]
     assert row.params["k"].value == pytest.approx(K, abs=3 * row.params["k"].std)

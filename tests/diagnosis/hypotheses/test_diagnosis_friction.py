@@ -106,7 +106,6 @@ def test_what_holds_the_plain_friction_as_a_case_is_compared_with_it(search):
 
 
 def test_the_plain_friction_is_compared_with_a_constant_of_its_own(search):
-    """With the speed over which another law builds up it lost, though it was the right one."""
     (loaded,) = (e for e in search.candidates if e.name == LOADED)
     wide = loaded.fixed["width"] * 4
     fit = fitted(search, (loaded.tuned("width", wide), {"c": 0.31, "k": 0.2, "width": wide}))

@@ -45,7 +45,6 @@ def driven(trials=4, steps=250, bias=-0.3, damping=0.5, drag=0.3):
 
 @pytest.mark.slow
 def test_more_than_three_effects_are_looked_for_where_three_leave_more_than_noise():
-    """It stopped at three with a wrong damping (0.84), and asked for `--max-effects 5`."""
     families = {name.partition(":")[0] for name in TRUE} | {"input_gain", "bias"}
     library = Library(tuple(f for f in Library().families if f.name in families))
     three = diagnose(SLED, driven(), DiagnosisOptions(library=library, max_effects=3)).verdict

@@ -61,7 +61,6 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
 
 
 def test_a_rate_that_no_command_asks_for_is_no_limit():
-    """A servo was limited to 167 rad/s, and no command changed faster than 35 rad/s."""
     t = np.arange(60) * 0.05
     trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
     data = prepare(pendulum, [trial, trial])
@@ -71,7 +70,6 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
 
 
 def test_noise_of_a_state_is_no_rate_that_refutes_a_limit():
-    """A steering angle with 0.045 rad of noise was limited to 0.094 rad/s."""
     t, rng = np.arange(301) * 0.02, np.random.default_rng(0)
     slow = 0.1 * np.abs((t + 0.5) % 2 - 1)  # at 0.1 rad/s, up and down
     for noise in (0.0, 0.045):
@@ -86,7 +84,6 @@ def test_noise_of_a_state_is_no_rate_that_refutes_a_limit():
 
 
 def test_a_late_position_is_tried_with_a_filter_of_its_own():
-    """In the scan, a position 50 ms late of an aircraft seemed to gain 0.6 nats of 73."""
     rng, trials = np.random.default_rng(3), []
     for _ in range(3):
         u = np.repeat(rng.uniform(-1, 1, 15), 10)
@@ -113,10 +110,6 @@ def test_a_late_position_is_tried_with_a_filter_of_its_own():
 
 @pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
 def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
-    """Of what a command of 1 loses by coming `late` steps late, a limit of 2.5 a step says as much.
-
-    By more than a step it is a limit that commands reach, and the only effect that is offered.
-    """
     rng, trials = np.random.default_rng(0), []
     for k in range(3):
         u = np.repeat(rng.choice([-0.5, 0.5], 30), 4)
@@ -149,7 +142,6 @@ def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
     ],
 )
 def test_absurd_sizes_are_not_claimed(name, sound, absurd):
-    """Logs in degrees: the command got 494 % stronger every second, a log was 181 % too large."""
     t = np.arange(60) * 0.05
     states = 2 * np.sin(0.05 * np.arange(61))[:, None] * [1.0, 1.0]
     trial = Trial(states, np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))

@@ -70,7 +70,6 @@ def test_two_effects_are_one_thing_beside_a_parameter_that_moves(one, other, kno
 
 
 def test_what_a_parameter_does_alone_makes_no_two_effects_one_thing():
-    """A wrong sign was "equivalent" to a friction: each was also another value of a parameter."""
     model = Model(
         name="fan",
         states={"psi": "rad", "w": "rad/s"},
@@ -139,7 +138,6 @@ def test_what_is_one_thing_beside_a_parameter_is_named_together():
 
 
 def test_an_input_that_acts_the_other_way_round_is_found_at_its_size():
-    """A gain ended at its bound, g = -1.5, and was said to be 150 % weaker."""
     library = Library(tuple(map(Library().family, ("input_gain", "offset"))))
     found = diagnose(turner(0.12), trials(2, gain=-1.0), DiagnosisOptions(library=library))
     assert found.effects == ("input_gain:c",)
@@ -169,7 +167,6 @@ def boat(right=1.0):
 
 @pytest.mark.slow
 def test_one_thruster_is_weaker_or_the_other_stronger_which_no_trial_tells():
-    """A trial was promised that `may tell` them apart."""
     real, rng, found = boat(0.9).with_values({"thrust": 19.0}), np.random.default_rng(1), []
     for _ in range(3):
         commands = np.repeat(rng.uniform(-1, 1, (12, 2)), 10, axis=0)

@@ -36,7 +36,6 @@ def test_the_scale_of_a_sensor_is_offered_and_no_gain_that_equals_it():
 
 
 def test_a_wrong_zero_of_a_sensor_may_be_another_level():
-    """A beam that hangs 0.06 rad off level was said to have a log that is off."""
     assert levelled(pendulum) == ["theta"] and not levelled(STICK)
     params = {"g": Param(9.8, "m/s^2"), "l": Param(0.5, "m")}
     coupled = Model(  # the angle also moves the cart
@@ -82,7 +81,6 @@ def short(scale=0.94, trials=3, steps=200, dt=0.02):
 
 @pytest.mark.slow
 def test_an_encoder_that_reads_short_is_named_and_a_gear_as_its_second_reading():
-    """It was a state that "changes slower", to be told apart by a trial that could not."""
     found = diagnose(STICK, short())
     assert found.effects == ("sensor_scale:stick",)
     assert found.ranking[0].values["k"] == pytest.approx(-0.06, abs=0.005)

@@ -158,7 +158,6 @@ def stepped(trials=3, steps=450, late=2):
 
 @pytest.mark.slow
 def test_an_offset_found_before_a_dead_zone_acts_after_it():
-    """A gain and a curve stood in for the dead zone, which was tried behind the offset alone."""
     found = diagnose(AXES, stepped(steps=300))
     assert set(found.effects) == {"dead_zone:a", "input_bias:a", DELAY}, found.sentence
     assert found.acting.index("dead_zone:a") < found.acting.index("input_bias:a")

@@ -169,7 +169,6 @@ def test_no_force_moves_an_angle_beside_its_own_rate():
 
 
 def test_what_fills_up_a_shorter_run_grows_without_bound_nowhere():
-    """An arm's diagnosis ended in "Eigenvalues did not converge": 100 steps beside 196."""
     falling = Model(
         states={"q": "rad", "w": "rad/s"},
         inputs={"u": "rad/s^2"},
@@ -197,8 +196,6 @@ def test_what_fills_up_a_shorter_run_grows_without_bound_nowhere():
 
 @pytest.mark.parametrize("tau", [None, 0.1])
 def test_the_slopes_of_the_noise_are_those_of_the_likelihood(tau):
-    """Those of the starts of the runs were missing: fits of many short runs stopped beside the top,
-    in one of several places, by the last bit."""
     rng, trials = np.random.default_rng(2), []
     for _ in range(12):
         x = np.cumsum(0.1 * rng.standard_normal((13, 1)), axis=0)

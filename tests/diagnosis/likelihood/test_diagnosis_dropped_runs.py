@@ -40,7 +40,6 @@ def known(monkeypatch):
 
 
 def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
-    """Noise was called unknown though candidates had been run twice: repeats were left out."""
     predictor, _, trials = known
     monkeypatch.setattr(diagnosis_data, "SESSION", 16)
     data = prepare(predictor.data.model, trials)
@@ -50,7 +49,6 @@ def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
 
 
 def test_of_long_data_two_runs_of_one_candidate_are_kept_from_their_beginning(known):
-    """`How much of that is noise is not known: repeat one run`, where two had been run twice."""
     predictor, _, trials = known
     ran = [replace(t, candidate=c) for t, c in zip(trials, ["a", "b", "b", "c"], strict=True)]
     data = prepare(predictor.data.model, ran)
@@ -85,7 +83,6 @@ def test_repeats_of_different_length_are_compared_where_they_begin_together(know
 
 
 def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(known):
-    """Hand logs of 29 s were called 32 times noisier than the scatter of runs of 4 s."""
     predictor, _, trials = known
     short = [replace(t, states=t.states[:61], inputs=t.inputs[:60]) for t in trials[::2]]
     for some, whole in ((short, True), ([*short, trials[1]], False)):
@@ -98,7 +95,6 @@ def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(
 
 
 def test_repeats_that_ended_before_a_horizon_tell_no_noise_of_it(known):
-    """Of both runs of a beam only the first 0.4 s was used: a traceback instead of a diagnosis."""
     predictor, _, trials = known
     short = [replace(t, states=t.states[:9], inputs=t.inputs[:8]) for t in trials[::2]]
     data = prepare(predictor.data.model, [*short, *trials[1::2]])
@@ -163,7 +159,6 @@ def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
 
 
 def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
-    """A 40 s drive by hand of a 3.5 s task had a utility, which the model "missed by 368"."""
     predictor, fit, trials = known
     task = pushed_cart_task(predictor.data.model, STEPS // 3)
     assert not len(utility_prediction(predictor, fit, fit.states, task, trials).real)

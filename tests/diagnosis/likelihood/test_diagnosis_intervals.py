@@ -48,7 +48,6 @@ def test_an_unknown_that_nothing_depends_on_is_unknown():
 
 
 def test_correlated_innovations_hold_less_information():
-    """The interval of a value was as narrow as if every sample were news."""
     rng = np.random.default_rng(4)
     trials = [
         Trial(
@@ -71,7 +70,6 @@ def test_correlated_innovations_hold_less_information():
 
 
 def test_of_two_parameters_that_hide_each_other_one_stays():
-    """Each could be spared beside the other, so both were left out."""
     rng, trials = np.random.default_rng(1), []
     for _ in range(3):
         u, v = np.repeat(rng.uniform(-3, 3, 10), 8)[:, None], np.zeros(81)

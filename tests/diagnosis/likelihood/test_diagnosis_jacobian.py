@@ -61,7 +61,6 @@ def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
     ("name", "values"), [("viscous_friction:v", {"k": 2.0}), ("rate_gain:v", {"g": 0.3})]
 )
 def test_parameters_act_through_the_effects(cars, name, values):
-    """Those of the bare model are 30 % off: a scale that no data tell seemed known."""
     _, data = cars
     predictor = Predictor(data)
     h = replace(Hypothesis().plus(effect(data, name), values), spread=1.0)
@@ -157,7 +156,6 @@ def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):
 
 
 def test_a_limit_of_a_rate_is_not_below_the_rates_in_the_log(cars):
-    """With two commands exchanged, a limit of 0 rad/s^2 was claimed, and advised for adoption."""
     _, data = cars
     limit, i = effect(data, "slew_limit:v"), data.model.state_names.index("v")
     fastest = np.abs(np.diff(data.y[..., i], axis=0)).max() / data.dt

@@ -44,7 +44,6 @@ def weaker(model):
 
 
 def test_a_gain_beside_an_uncertain_mass_is_as_uncertain_as_the_mass():
-    """It was stated to a thousandth, and not told that it holds for the declared mass."""
     found = diagnose(cart(0.0), driven(weaker(cart(0.0))), OF_CART)
     assert found.effects == ("input_gain:u",)
     g = found.ranking[0].params["g"]

@@ -88,11 +88,6 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
 
 
 def test_an_effect_on_an_input_moves_what_an_adopted_lag_begins_with():
-    """The lag has settled at what a gain makes of the input that was held, at every trial's begin.
-
-    It began at the input itself: beside a lag a bias and an offset that undoes it were likelier
-    than none by hundreds of nats.
-    """
     model, runs = lagging(0.0, trials=2)
     held = (0.8, -0.5)
     runs = [replace(r, start_inputs=np.array([u])) for r, u in zip(runs, held, strict=True)]
@@ -189,11 +184,6 @@ def late(trials, steps=400, delay=1.5 * DT):
 
 @pytest.mark.parametrize("trials", [1, 2])
 def test_true_values_behind_a_late_log_begin_where_the_log_is(trials):
-    """Seen on a ball on a beam, whose speed no sensor has: pieces of two logs began at x = 0.
-
-    The first samples of both, all that was known of the true place, said that it never is anywhere
-    else: 1 s ahead predictions missed by 4.7 cm instead of 0.3 cm, and no known effect did it.
-    """
     model, better, found = late(trials)
     memory = better.state_names[model.n :]
     lifted = [
@@ -294,7 +284,6 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
 
 
 def test_adopt_lists_the_values_of_adopted_effects_that_it_rewrites(tmp_path):
-    """A car's: `gain`, `tau` and `trim` were listed, six effects were rewritten silently."""
     friction = '{name = "viscous_friction:omega", k = 0.3}'
     workspace(
         tmp_path / "ws",
@@ -404,7 +393,6 @@ def seen_late(trials=3, steps=260):
 
 @pytest.mark.slow
 def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_still_seen():
-    """Adopting exactly what was claimed made predictions worse than model.py, and a new cause."""
     model, runs = seen_late(steps=180)
     first = diagnose(model, runs)
     assert first.effects == ("sensor_delay:x+v",)
@@ -424,7 +412,6 @@ def test_an_adopted_delay_predicts_as_diagnosed_and_the_filter_behind_it_is_stil
 
 
 def test_a_mean_that_was_left_out_is_left_out_once_its_delay_is_adopted():
-    """Seen: a lag of 2,308 nats, two couplings and "unknown", of a speed that is a difference."""
     model, runs = seen_late(trials=2)
     back, differences = 3, []
     for run in runs:

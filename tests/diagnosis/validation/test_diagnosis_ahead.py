@@ -77,7 +77,6 @@ def test_all_folds_together_are_each_alone(model, freed):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [car, pendulum], ids=["car", "pendulum"])
 def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, monkeypatch):
-    """A helicopter's log of 3,000 rows was predicted by Python, a millisecond each step."""
     monkeypatch.setattr(marching, "LONG", 1)
     data = data_of(model)
     predictor, compiled, refused = Predictor(data), set(), set()
@@ -100,7 +99,6 @@ def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, monkeypatch):
 
 
 def test_a_compiled_hypothesis_joins_what_was_adopted_before(monkeypatch):
-    """Seen: KeyError 'first_order_lag_volt_tau': what joins a model goes before its memory."""
     monkeypatch.setattr(marching, "LONG", 1)
     late = wrap(Library().effect("first_order_lag:torque", pendulum), {"tau": 0.08}, DT)
     data = data_of(late)

@@ -103,7 +103,6 @@ def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
 
 
 def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
-    """A blind case: a drag of 6.5 nats was named, an input's curve of 7.3 with them was not."""
     search = copy(wavy[0])
     one, other = (f for f in search.of_size(1)[:2])
     plain = replace(one, hypothesis=replace(one.hypothesis, shift=None, spread=0.0))

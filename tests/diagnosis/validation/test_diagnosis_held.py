@@ -67,7 +67,6 @@ def test_table_and_document_say_it(found):
 
 
 def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
-    """It was told with a tight +-, and without a word that three std were used up."""
     model, trials = motor(2)
     known = {"m": Param(1.0, "kg"), "k": Param(1.0, "N/V", std=0.05)}
     sure = replace(model, params={**model.params, **known})
@@ -88,7 +87,6 @@ def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
     ],
 )
 def test_what_trials_disagree_about_by_as_much_is_not_off(off, named):
-    """Twelve of an aircraft's 32 parameters "off" were so by less than their +-."""
     model, _ = motor(1)
     sizes = [off[name] for name in model.param_names]
     estimates = {

@@ -70,7 +70,6 @@ def test_a_free_motion_shows_causes_and_a_held_command_does_not():
 
 
 def test_the_friction_of_a_free_swing_is_named():
-    """No cause was named, since no input ever changed."""
     nominal = replace(
         pendulum, params={n: Param(p.value, p.unit) for n, p in pendulum.params.items()}
     )
@@ -83,7 +82,6 @@ def test_the_friction_of_a_free_swing_is_named():
 
 
 def test_how_much_a_switch_is_on_is_not_doubted():
-    """A servo's `torque_enable` of 0 and 1 was claimed to saturate at 0.588."""
     trials = [replace(t, inputs=(np.asarray(t.inputs) > 0) * 1.0) for t in swings()]
     data = prepare(pendulum, trials)
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
@@ -121,7 +119,6 @@ def two_of_three(late=3, trials=2, steps=120):
 
 
 def test_a_joint_effect_is_offered_of_the_inputs_that_move():
-    """A delay of both joints that moved was called a lag, since two others stood still."""
     data = prepare(ARM, two_of_three())
     all_of_them = Library().candidates(ARM, data.scales)
     names = [e.name for e in knowable(data, all_of_them)]
@@ -138,7 +135,6 @@ def test_a_joint_effect_is_offered_of_the_inputs_that_move():
 
 
 def test_all_that_stands_still_takes_one_sentence():
-    """There were six lines on two joints."""
     (said,) = limits(prepare(ARM, two_of_three())).findings
     assert said.about == ("u1", "q1", "w1")
     (said,) = limits(prepare(pendulum, list(stuck(swings(), 0, 1)))).findings
@@ -210,7 +206,6 @@ def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(cl
 
 
 def test_a_filter_that_sensors_show_alone_is_held():
-    """A speed's filter of 0.050 s, seen beside its position, was calibrated to 0.035 s."""
     tau = Param(0.05, "s", 0.0, 0.6, 0.025)
     model = Model(
         states={"x": "m", "v": "m/s"},

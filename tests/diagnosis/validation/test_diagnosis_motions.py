@@ -72,7 +72,6 @@ def test_numbers_of_an_adopted_wave_are_held_where_one_motion_is_repeated(speeds
 
 
 def test_an_adopted_delay_of_two_sensors_as_one_is_not_asked_for_again():
-    """The model that has it offers `sensor_delay:x` alone: every later diagnosis failed."""
     model = Model(
         states={"x": "m", "v": "m/s", "beam": "rad"},
         inputs={"u": "rad"},

@@ -68,7 +68,6 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
 
 
 def test_repeats_without_a_speed_tell_the_noise_of_what_was_measured():
-    """One state without a sensor, and no run was taken for a repeat of another."""
     first = swings(1, 150, 3)[0]
     rng, runs = np.random.default_rng(4), []
     for _ in range(4):

@@ -65,7 +65,6 @@ def test_the_smaller_bound_is_the_noise_of_a_state_with_a_gap(monkeypatch, left)
     ],
 )
 def test_no_reading_is_predicted_better_than_its_sensor_is(monkeypatch, differences, fitted, noise):
-    """A boat's x was off by 9.5 mm, "noise: at most 6.7 mm", by a sensor of 8 mm: no gap."""
     monkeypatch.setattr(measured, "repeated", lambda *_: [[0, 1]])
     found = measuring(())
     for run in found.trials:

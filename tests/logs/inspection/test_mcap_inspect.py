@@ -141,7 +141,6 @@ def test_twins() -> None:
 
 @pytest.mark.parametrize("step", [0.00153, 0.0044, 1e-7])
 def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, step: float) -> None:
-    """An angle in steps of 0.00153 rad got a standard deviation of 3e-05."""
     t = np.arange(1000) * 0.02
     rng = np.random.default_rng(0)
     true = 0.05 * np.sin(0.8 * t) * (t > 3)

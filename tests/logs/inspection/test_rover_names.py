@@ -32,7 +32,6 @@ def table(path, names):
     ],
 )
 def test_a_speed_and_a_turn_rate_command_are_a_rover_s(tmp_path, measured, sent):
-    """Of `x, y, yaw, v, omega, cmd_v, cmd_omega`: "the kind of robot is unknown"."""
     log = table(tmp_path / "drive.csv", ("time", "x", "y", "yaw", *measured, *sent))
     done = begin(tmp_path / "w", log)
     assert done.kind == "rover" and done.then.verb == "ingest"

@@ -43,7 +43,6 @@ def test_a_column_farther_from_the_prediction_is_told_whatever_its_size(made, by
 
 @pytest.mark.parametrize("factor", [0.8, 1.1])
 def test_a_factor_of_the_commands_is_told_where_it_explains_all_of_a_small_difference(made, factor):
-    """0.8 of a command was stored in silence: the commands are nearly alike."""
     task, own, _ = made
     exact = own.predicted_run
     wrong = multiplied(exact, ["force"], factor)

@@ -51,7 +51,6 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_what_the_program_passed_is_named(waiting, way):
-    """`Somebody, or another controller, drove` was said of states in degrees."""
     task, made = waiting
     wrong, named = WAYS[way]
     trial = driven(task, made, **wrong)
@@ -61,7 +60,6 @@ def test_what_the_program_passed_is_named(waiting, way):
 
 
 def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
-    """A rover's states in another order: its log ended in a second of zeros, "all are 0"."""
     task, made = waiting
     trial = driven(task, made, times=lambda t: 1.7e9 + t)
     plain = follows(made.policy, trial, latest(task))

@@ -41,7 +41,6 @@ WRONG = [
 
 @pytest.mark.parametrize(("change", "facts"), WRONG)
 def test_a_trial_that_is_not_its_candidate_s_run(change, facts):
-    """`learn` refuses it and says how to override that; `tell` takes it and warns."""
     with pytest.raises(gr.TrialRefused, match=holding(*facts, "check=False")) as refused:
         gr.learn(TASK, lambda c: change(run(c)), ONE)
     assert refused.value.search.trials == ()

@@ -98,7 +98,6 @@ def test_a_start_within_the_noise_of_its_sensor_is_no_warning(w, tmp_path, sigma
 
 
 def test_a_start_is_far_off_by_what_it_costs(tmp_path):
-    """By the range in the run, a z off by 3 mm was told again and again, an x by 60 mm never."""
     config = CONFIG.replace("{ x = 10.0 }", "{ x = 10.0, v = 1e-4 }")
     rows = "\n".join(f"{0.05 * i:.2f},{i / 40},0.5" for i in range(41))
     w = make(tmp_path / "w", config=config, target=f"t,x,v\n{rows}\n")
@@ -118,7 +117,6 @@ def test_a_start_is_far_off_by_what_it_costs(tmp_path):
 
 
 def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
-    """A car that was set down to a degree was told of `10 % of a mean step` again and again."""
     ran, *_ = read_trial(run(w))
     a_step = np.sqrt(-w.task.utility(ran) / len(ran.states) / 10)
     told = []
@@ -138,10 +136,6 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
 def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
     w, tmp_path, monkeypatch, part, lost, told
 ):
-    """A balancer that began 4.5 cm away lost by "bad luck": two runs had begun as far.
-
-    Such a run counts: a rover's were to be discarded, and the repeats began as far off.
-    """
     ran, *_ = read_trial(run(w))
     cost = -w.task.utility(ran)
     a_step = np.sqrt(cost / len(ran.states) / 10)
@@ -159,7 +153,6 @@ def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
 
 
 def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
-    """One run: `discard t0005` for its y, "The run counts, no need to repeat it" for its x."""
     ran, *_ = read_trial(run(w))
     cost = -w.task.utility(ran)
     moved = np.array(ran.states)
@@ -172,7 +165,6 @@ def test_a_run_that_began_elsewhere_gets_one_verdict(w, tmp_path, monkeypatch):
 
 
 def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later(w, tmp_path):
-    """A run began 5.0 mm off with a warning, a later one 6.9 mm off without."""
     ran, *_ = read_trial(run(w))
     told = []
     for k, off in enumerate((0.2, -0.2, 0.25)):
@@ -187,7 +179,6 @@ def test_the_first_runs_say_that_starts_which_scatter_as_much_are_not_told_later
 def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
     w, tmp_path, monkeypatch, scatter, again
 ):
-    """A start changed a utility by -0.00028, where runs scatter by 0.0011: `discard t0010`."""
     ran, *_ = read_trial(run(w))
     cost = -w.task.utility(ran)
     a_step = np.sqrt(cost / len(ran.states) / 10)
@@ -205,7 +196,6 @@ def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
 
 @pytest.mark.parametrize("data", [False, True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
-    """A trial in cm was stored as if it were in m."""
     write_trial(tmp_path / "t.mcap", plain(), {}, state_units={"x": "cm", "v": "m / s"})
     with pytest.raises(GroundedError, match="x is in cm, but the model has it in m") as refused:
         ingest_log(w, tmp_path / "t.mcap", data=data)
@@ -316,7 +306,6 @@ def test_equal_trials_are_equal_bytes(tmp_path):
 
 
 def test_a_trial_of_a_deleted_candidate_still_counts(w):
-    """Its file is lost, but the trial carries the policy that was run."""
     path = run(w)
     ingest_log(w, path)
     Path(w.candidate_path("c0001")).unlink()
@@ -327,7 +316,6 @@ def test_a_trial_of_a_deleted_candidate_still_counts(w):
 
 
 def test_data_are_taken_from_where_a_step_of_their_commands_begins(w, tmp_path):
-    """Half a step early or late, a delay was found so much too short or long."""
     t = np.arange(0, 4, 0.005)
     force = np.sin(np.floor((t - 0.03) / 0.05 + 1e-6))
     rows = np.column_stack([t, np.sin(t), np.cos(t), force])
@@ -399,7 +387,6 @@ def test_another_part_of_a_recording_is_another_trial(w, tmp_path):
 
 
 def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
-    """The error named the table and a page; the lines had to be found there."""
     log, file = table_in(w, tmp_path)
     bare = file.read_text().replace('v = { path = "/csv.v" }\n', "")
     file.write_text(bare)
@@ -422,7 +409,6 @@ def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
 
 
 def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
-    """GPS of 10 Hz in a table of 50 Hz was 40 ms late, without a word."""
     t = np.arange(0, 6, 0.02)
     x, v = np.sin(t), np.cos(t)
     file = w.folder / "grounded.toml"

@@ -27,7 +27,6 @@ def blind(tmp_path):
 
 @pytest.mark.parametrize("before", [0.0, 0.1, 0.8])
 def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
-    """With [estimate] no start was sought: "somebody drove" of every log with a lead-in."""
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, before)
     found = blind.ingest(path)
@@ -59,7 +58,6 @@ def test_another_unit_is_told_where_speeds_are_estimated(blind, tmp_path, column
 
 
 def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
-    """The load drives another way than the model says: the first speeds were off by 0.1 m/s."""
     policy, off = blind.candidate("c0002")[0].policy, []
     for seed in range(3):
         path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
@@ -75,7 +73,6 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed):
-    """A crane's exact runs were said to be those of other candidates, one never exported."""
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, 0.8, seed=seed, differs=16)
     found = blind.ingest(path)
@@ -91,7 +88,6 @@ ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
 
 @pytest.mark.parametrize("before", [0.0, 0.8])
 def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before):
-    """Four of five true logs were refused, the others begun two rows early."""
     w = waiting(tmp_path, ITS_OWN)
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, before, noise=ROUGH)
@@ -115,10 +111,6 @@ def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path)
 
 @pytest.mark.parametrize("after", [0.0, 1.0])
 def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after):
-    """A ball ran off its beam: "its first row is 1.46 s after c0003 began", in a log from before.
-
-    `next` asked for the same command again, and --candidate let the candidate count as failed.
-    """
     policy = blind.candidate("c0002")[0].policy
     wild = replace(policy, gain=40 * policy.gain)  # the commands don't tell where the run begins
     path = record(blind, tmp_path / "a.csv", wild, 0.5, turned=True, after=after)

@@ -66,7 +66,6 @@ def unsent(w, path, policy, missed):
 
 @pytest.mark.parametrize("missed", [0, 1, 2])
 def test_a_run_whose_first_steps_were_not_sent_begins_before_its_first_command(w, tmp_path, missed):
-    """A car's driver skipped step 0: all of it was booked a step late, its utility was halved."""
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(unsent(w, tmp_path / "a.csv", policy, missed))
     told = of_code(found, "run.missed")
@@ -93,7 +92,6 @@ def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discard
 
 @pytest.mark.parametrize("said", [False, True])
 def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path, said):
-    """With [log.span], too: `somebody, or another controller, drove`, for two commands of 40."""
     log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, (-5.0, -4.9))
     if said:
         toml = w.folder / "grounded.toml"

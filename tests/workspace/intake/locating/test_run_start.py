@@ -51,10 +51,6 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
 
 @pytest.mark.parametrize("waits", [0, 20])
 def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_path, waits):
-    """A busy computer wrote it 20 ms late: from there on all states were 20 ms after their rows.
-
-    The program acted on each row's own states.
-    """
     made, rng = w.candidate("c0002")[0], np.random.default_rng(3)
     policy, model = made.policy, w.task.model
     late = np.r_[np.zeros(waits), 20, 5, rng.uniform(0, 1, policy.horizon + 18)]  # [ms]
@@ -74,7 +70,6 @@ def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_pat
 
 @pytest.mark.parametrize("before", [0.0, 1.0])
 def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before):
-    """Its feedback saw the states as they were logged, not as [log] delay_s moves them."""
     late = LOGGED.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = 0.12\n')
     w = Workspace(make(tmp_path / "w", config=late).folder)
     w.propose()
@@ -107,7 +102,6 @@ def test_a_span_begins_at_the_same_command_whatever_delay_s_says(tmp_path):
 
 
 def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_is_exact():
-    """Commands at their limits, whatever the noise: the mean was less some rows off."""
     T, dt, rng, waits = 60, 0.01, np.random.default_rng(4), 100
     feedforward, gain = rng.normal(0, 0.05, (T, 1)), np.zeros((T, 1, 3))
     feedforward[:2] = -3
@@ -125,10 +119,6 @@ def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_
 
 
 def test_the_start_of_a_run_that_fell_is_found_where_gains_are_high():
-    """A millisecond between a state and its command was another command: somebody drove, it said.
-
-    And of a log that ends before the run would have, no instant has the run whole.
-    """
     T, dt, rng, waits, fell = 200, 0.01, np.random.default_rng(5), 100, 120
     t = dt * np.arange(waits + T - 20)
     way = 0.03 * np.sin(9 * t) + 0.02 * np.sin(31 * t + 1)
@@ -164,10 +154,6 @@ def start_in(policy, felt, sent):
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize("fell", [0.0, 1.0, 1.65])
 def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
-    """Its motors were cut: somebody had taken over, it said, or the floor was scored.
-
-    So it was near the end of a run, the more so: it was the first to be improved on.
-    """
     w = waiting(tmp_path, LOGGED + "[safety]\nx = [-5.0, 5.0]\n")
     policy = w.candidate("c0002")[0].policy
 
@@ -209,7 +195,6 @@ def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
 @pytest.mark.parametrize("until", [1.0, 1.5])
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_run_that_was_cut_is_found_behind_a_hold_controller_too(w, tmp_path, until, stopped):
-    """A robot that is held upright before its run moves: somebody took over at 0.4 s, it said."""
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, 1.0, until=until)
     head, rows = path.read_text().splitlines()[0], np.loadtxt(path, delimiter=",", skiprows=1)
@@ -261,7 +246,6 @@ def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
 @pytest.mark.parametrize("before", [0.0, 1.0])
 @pytest.mark.parametrize("late", [0, 1, 2, 3])
 def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late):
-    """One step was told, two were taken without a word."""
     policy = w.candidate("c0002")[0].policy
     table = np.loadtxt(record(w, tmp_path / "a.csv", policy, before), delimiter=",", skiprows=1)
     rows = late * round(policy.dt * RATE)
@@ -275,7 +259,6 @@ def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late)
 @pytest.mark.parametrize("stale", [0, 1, 2])
 @pytest.mark.parametrize("before", [0.0, 0.93, 1.0])
 def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, before, stale):
-    """It was found some rows off, "on other states than the controller used", and counted."""
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, before, stale=stale))
     told = of_code(found, "log.late", "run.late")
@@ -288,7 +271,6 @@ def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, befo
 
 @pytest.mark.parametrize("before", [0.5, 2.0])
 def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w, tmp_path, before):
-    """Somebody drove, it said, or states in other units; and the clock only with --candidate."""
     policy = w.candidate("c0002")[0].policy
     log = record(w, tmp_path / "a.csv", policy, before, ahead=10)
     with pytest.raises(GroundedError) as refused:
@@ -303,7 +285,6 @@ def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w
 @pytest.mark.parametrize("part", [0.2, 0.6])
 @pytest.mark.parametrize("before", [0.0, 1.0])
 def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before, part):
-    """`Right 1000 times too small`: of commands that a limiter held at 0.6 all the time."""
     policy = w.candidate("c0002")[0].policy
     most = part * float(np.abs(policy.feedforward).max())
     log = record(w, tmp_path / "a.csv", policy, before, most=most)
@@ -316,7 +297,6 @@ def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, bef
 
 
 def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
-    """Velocities that were made of positions afterwards moved the start by 6 ms, unsaid."""
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, 1.0)
     table = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -330,7 +310,6 @@ def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
 
 
 def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
-    """One of them was taken, and no word said."""
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0)
     once = np.loadtxt(path, delimiter=",", skiprows=1)
     length = once[-1, 0] - once[0, 0] + 1 / RATE
@@ -375,7 +354,6 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
 
 
 def test_a_log_whose_trial_was_discarded_is_of_the_candidate_that_it_was_of(w, tmp_path):
-    """It was booked on the one that waited; and one that did not count was `run again`."""
     first, log = tmp_path / "first.csv", tmp_path / "b.csv"
     ran = w.ingest(record(w, log, w.candidate("c0002")[0].policy, 0.0))
     assert w.propose().candidate.id == "c0003"
@@ -426,7 +404,6 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
 def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
     w, tmp_path, by, told
 ):
-    """In millivolts a log was "a recording played at another rate"; no start is found as it is."""
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.7)
     table = np.loadtxt(path, delimiter=",", skiprows=1)
     table[:, 3] *= by
@@ -442,7 +419,6 @@ def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so
 
 @pytest.mark.slow
 def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_named(w, tmp_path):
-    """A named one was refused too, and told to name the candidate."""
     policy = w.candidate("c0002")[0].policy
     driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
     strange = replace(policy, feedforward=driven, gain=0 * policy.gain)
@@ -467,7 +443,6 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     ],
 )
 def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_path, wrong, said):
-    """The last two were somebody who took over, to be taken in as data."""
     folder = make(tmp_path / "w", "pendulum").folder
     with (folder / "grounded.toml").open("a") as file:
         for kind, name in (("state", "theta"), ("state", "omega"), ("input", "torque")):
@@ -565,7 +540,6 @@ def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace
 
 
 def test_one_log_is_one_trial(w, tmp_path):
-    """A stranger's log was stored three times: as runs of two candidates, and as data."""
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
     first = w.ingest(path)
     for other in ({"candidate": "c0001"}, {"data": True}):
@@ -631,7 +605,6 @@ def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
 
 
 def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
-    """A drive by hand was offered as the best candidate's run: it cost -3,943."""
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     policy = w.propose().candidate.policy
     w.ingest(record(w, tmp_path / "first.csv", policy, 0.0))
@@ -657,7 +630,6 @@ def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
 
 
 def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
-    """Of a run that lacked a second somebody else was said to have driven, and no more."""
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     policy = w.propose().candidate.policy
     log = record(w, tmp_path / "run.csv", policy, 0.5)
@@ -682,7 +654,6 @@ def edited(path, change):
 
 
 def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
-    """Behind a lead-in no start was found for it: `somebody, or another controller, drove`."""
 
     def hole(table):
         table[450:470, 1:3] = np.nan
@@ -693,7 +664,6 @@ def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
 
 
 def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
-    """A robot that sends zeros all the time: `start recording before the run`, which it did."""
 
     def blind(table):
         table[:8, 1:3] = np.nan
@@ -708,7 +678,6 @@ def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
 
 
 def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_early(tmp_path):
-    """What to take out where the clocks were said to differ, and did not."""
     w = waiting(tmp_path)
     log = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
     toml = w.folder / "grounded.toml"
@@ -723,7 +692,6 @@ def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_ea
 
 @pytest.mark.parametrize("before", [0.91, 0.92, 0.93, 0.94])
 def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
-    """A step too early, and the log was blamed for it."""
     step = round(w.task.dt * RATE)
 
     def sent(table):
@@ -739,7 +707,6 @@ def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w,
 
 
 def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
-    """`run c0003 again`, said `propose`, and then: `none is waiting: name it with --candidate`."""
     w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text().replace("max_trials = 12", "max_trials = 2"))
@@ -761,7 +728,6 @@ def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
 
 
 def test_a_stored_log_says_so_first_and_a_discard_what_to_run(w, tmp_path, monkeypatch):
-    """An old log's result looked new; after `discard`, one had to remember which file to run."""
     monkeypatch.chdir(w.folder)
     toml = w.folder / "grounded.toml"
     toml.write_text(re.sub(r"\[system\]\n(?:\w.*\n)*", "", toml.read_text()))

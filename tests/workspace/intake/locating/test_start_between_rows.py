@@ -14,7 +14,6 @@ def w(tmp_path):
 
 @pytest.mark.parametrize("phase", [0, 3, 6, 9])
 def test_a_run_begins_between_the_rows_that_show_it(w, tmp_path, phase):
-    """Rows of 100 Hz show a command up to 10 ms late: a score went from -0.13 to -3, or refused."""
     policy, every = w.candidate("c0002")[0].policy, round(w.task.dt * 1000)
     path = record(w, tmp_path / "fine.csv", policy, 0.5, rate=1000)
     fine = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -33,7 +32,6 @@ def test_a_run_begins_between_the_rows_that_show_it(w, tmp_path, phase):
 
 @pytest.mark.parametrize("row", [0.007, 0.011, 0.013])
 def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
-    """Each row shows a change late by another part of it: 10 ms were left, of a row of 10 ms."""
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, 0.8)
     table = np.loadtxt(path, delimiter=",", skiprows=1)

@@ -86,7 +86,6 @@ def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
     ],
 )
 def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
-    """That somebody took over was said of a run, and of data that the robot moved by 0 m/s^2."""
     found = crossed(ROVER, reading(ROVER, *columns, form="/{}"))
     assert len(found) == odd
     assert all((one.about, one.facts["by"]) == (("linear", "angular"), "units") for one in found)
@@ -102,7 +101,6 @@ def test_a_length_that_is_read_from_an_angle_is_told(path, scale):
 
 
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):
-    """The program was said to be another controller, or the data were taken without a word."""
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     log = record(w, tmp_path / "run.csv", w.propose().candidate.policy, 0.0)
     config = w.folder / "grounded.toml"

@@ -66,7 +66,6 @@ def test_a_speed_is_estimated_whatever_the_sensor_s_rate(task, every):
 
 
 def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
-    """One of 25 ms was asked for steps of 10 ms, as the sensor had them."""
 
     class Simulator:
         timestep = 0.025
@@ -95,7 +94,6 @@ def test_samples_that_were_lost_part_a_log(task):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, seed):
-    """A speed was taken to begin at 0, give or take 1: 635 mm/s were off by 135 all along."""
     in_mm = MODEL.replace("(a.force - p.drag * s.v)", "(1000 * a.force - p.drag * s.v)")
     errors = []
     for size, model in ((1.0, MODEL), (1000.0, in_mm)):
@@ -114,7 +112,6 @@ def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, see
 
 @pytest.mark.parametrize("process", [{}, {"v": 0.05}])
 def test_a_speed_is_the_slope_of_its_position_where_the_model_is_off_for_long(tmp_path, process):
-    """It answers in 0.03 s, its gain is too large: the speed was 0.025 m/s too low on average."""
     quick = MODEL.replace("(a.force - p.drag * s.v) / p.mass", "(a.force - s.v) / 0.03")
     task = make(tmp_path / "w", model=quick).task
     t = np.arange(0, 4, 1e-3)
@@ -211,7 +208,6 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
 
 
 def test_that_a_column_only_identifies_runs_is_told_once(tmp_path):
-    """It is what docs/robot.md recommends, and each log was warned of it."""
     lines = [
         f'[log.{k}.{n}]\npath = "/csv.{n}"'
         for k, n in (("state", "x"), ("input", "force"), ("state", "v"))
@@ -234,7 +230,6 @@ def test_that_a_column_only_identifies_runs_is_told_once(tmp_path):
 
 
 def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
-    """The speed of a position that is told 40 ms late is as late; it was 20 times worse."""
     lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
     config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
     logged, *_ = disturbed(0.0, 0.8)
@@ -259,7 +254,6 @@ def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
 
 
 def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
-    """Its signal was not read, and nothing said so."""
     names = (("state", "x"), ("state", "v"), ("input", "force"))
     lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in names]
     config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
@@ -289,7 +283,6 @@ def late(before, until=3.0, delay=0.06, held=0.0, v=0.0, seed=0):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_log_that_begins_with_a_run_knows_what_was_held_before(task, seed):
-    """Its first command was taken to have been held before, so it seemed to start in motion."""
     task = replace(task, latency=np.array([0.06]))
     logged, t, v = late(0.0, seed=seed)
     error, at = off(with_estimates(logged, TABLE, task), t, v)
@@ -304,7 +297,6 @@ def test_a_log_that_begins_amid_driving_had_its_first_command_before(task):
 
 
 def test_seconds_under_a_column_of_milliseconds_are_told(task):
-    """The smoother's noise was NaN, with warnings of numpy."""
     logged, _, _ = driven()
     log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}
     with pytest.raises(GroundedError, match="in another unit"):
@@ -323,10 +315,6 @@ def turn(s, a, p):
 
 
 def test_an_angle_that_acts_only_at_speed_is_not_estimated_half_a_turn_off():
-    """At rest wheels hardly turn a heading: their angle was taken for 6 rad, and came out pi off.
-
-    The real ones turn further than the model's.
-    """
     units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s", "delta": "rad"}
     inputs = {"steering": "1", "throttle": "1"}
     model = Model(states=units, inputs=inputs, derivative=turn, angles=("psi",))

@@ -52,7 +52,6 @@ def mapped(w, text=TABLE):
 
 @pytest.mark.parametrize("start", [0.0, STAMP])
 def test_what_is_left_of_a_stored_log_is_that_trial(w, tmp_path, start):
-    """Seen: a recovered file was taken for a repeat, and its data counted twice."""
     mapped(w)
     first = ingest_log(w, log(tmp_path / "a.csv", start=start), data=True)
     for rows in (slice(0, 120), slice(0, 60)):
@@ -99,7 +98,6 @@ def test_what_is_left_of_a_trial_of_ours_is_that_trial(w, tmp_path):
 
 @pytest.mark.parametrize("rows", [-40, -110])
 def test_a_shorter_copy_of_a_run_is_no_second_run(tmp_path, rows):
-    """Behind a lead-in it counted as one, whose scatter was 5e-8: "an improvement, 1.00"."""
     w = waiting(tmp_path)
     whole = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0, after=1.0)
     first = w.ingest(whole)

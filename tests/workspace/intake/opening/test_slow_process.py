@@ -63,14 +63,12 @@ def tanks(tmp_path_factory):
 
 
 def test_rows_far_apart_are_believed_where_the_column_names_seconds(tanks):
-    """`next:` was `init` in another folder: "are the times in ms or us?"."""
     begun, *_ = tanks
     assert begun.dt == DT and begun.then.verb != "init"
     assert not any("apart" in note for note in begun.notes)
 
 
 def test_a_slow_hidden_state_is_estimated(tanks):
-    """Pieces of 5 s had two rows each, and the estimate was 0."""
     _, workspace, levels = tanks
     [one] = workspace.trials()
     known = [flow(*x, 0.0, TRUE)[1] - flow(0.0, x[1], 0.0, TRUE)[1] for x in levels]
@@ -97,7 +95,6 @@ def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
 
 @pytest.mark.slow
 def test_a_slow_process_is_predicted_ten_steps_ahead(tanks):
-    """One step of 4 s was the only horizon: too short to show what the model lacks."""
     _, workspace, _ = tanks
     found = workspace.diagnose()
     assert [row.horizon_s for row in found.prediction_error[:-1]] == [DT, 5 * DT, 10 * DT]

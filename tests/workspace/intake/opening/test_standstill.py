@@ -9,7 +9,6 @@ from workspaces import CONFIG, make
 
 
 def test_a_robot_that_stands_still_before_its_first_command_was_sent_nothing(tmp_path):
-    """A joystick that is published once it is touched: 0.5 s of the drive were thrown away."""
     w = Workspace(make(tmp_path / "v", config=SEPARATE).folder)
     starts = {}
     for speed in (0.0, 0.4):

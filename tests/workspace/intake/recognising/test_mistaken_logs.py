@@ -107,7 +107,6 @@ def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
 
 
 def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
-    """`Correct the paths in [log]`: every later run would have been misread."""
     w.ingest(log(w, tmp_path / "a.csv"), data=True)
     other = log(w, tmp_path / "b.csv", columns=("starboard", "port"), seed=1)
     told, *_ = w.ingest(other, data=True).findings
@@ -133,7 +132,6 @@ def test_states_that_earlier_logs_have_in_their_columns_are_exchanged_on_the_rob
 def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(
     w, tmp_path, before
 ):
-    """With the paths in [log] exchanged as advised, `ingest` asked to exchange them back."""
     toml = w.folder / "grounded.toml"
     text = toml.read_text().replace("/csv.port", "/csv.m1").replace("/csv.starboard", "/csv.m2")
     toml.write_text(text)
@@ -163,7 +161,6 @@ def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_ta
 
 
 def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
-    """Only the diagnosis told it, when the next logs were read so, too."""
     path = log(w, tmp_path / "a.csv")
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[:, 3] = np.rad2deg(rows[:, 3])
@@ -175,7 +172,6 @@ def test_a_yaw_in_degrees_beside_its_rate_is_told_at_once(w, tmp_path):
 
 @pytest.mark.parametrize(("most", "wrong"), [(100.0, True), (1.0, False)])
 def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path, most, wrong):
-    """Once the scale was corrected, limits from the log in degrees allowed a steer of 22.9 rad."""
     config = CONFIG.replace("[-1.0, 1.0]", f"[-{most}, {most}]")
     w = Workspace(make(tmp_path / "w", config=config, model=MODEL, target=TARGET).folder)
     told, *_ = w.ingest(log(w, tmp_path / "a.csv", scale=100.0), data=True).findings
@@ -187,7 +183,6 @@ def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path
 def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
     w, tmp_path, monkeypatch, here
 ):
-    """`next: status`, it said, after a warning to ingest the log again."""
     path = log(w, tmp_path / "a.csv", scale=100.0)
     w.ingest(path, data=True)
     (tmp_path / "b").mkdir()
@@ -250,7 +245,6 @@ def test_a_run_whose_commands_are_in_percent_is_its_candidate_s(w, tmp_path):
 def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
     w, tmp_path, monkeypatch, crossed
 ):
-    """Its saturated commands showed samples of 5 ms, true were 12: the user looked for a timer."""
     age, one = Quantity(0.005, "s"), Quantity(1.0, "m")
     note = finding("run.samples", ran="", state="v", age=age, moved=one, error=one)
     monkeypatch.setattr(recognise, "old_samples", lambda *_: [note])
@@ -268,7 +262,6 @@ def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
 
 
 def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
-    """It was told as `somebody, or another controller, drove`."""
     plan = w.propose().candidate
     w.run()
     trial = read_trial(next((w.folder / "runs").iterdir()))[0]
@@ -295,7 +288,6 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
 
 @pytest.mark.parametrize("before", [True, False])
 def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before):
-    """`Exchange the paths in [log]`, said of a truthful log: obeyed, it spoilt all later runs."""
     if before:
         w.ingest(log(w, tmp_path / "a.csv"), data=True)
     plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
@@ -329,7 +321,6 @@ def test_states_that_a_program_exchanged_are_mended_there(w, tmp_path):
 
 
 def test_inputs_exchanged_in_the_log_are_no_motor_that_is_wired_wrongly(w, tmp_path, monkeypatch):
-    """`right acted the other way round, with 280 % of its effect. Is it wired the wrong way?`"""
     plan = w.propose().candidate
     w.run()
     trial = read_trial(next((w.folder / "runs").iterdir()))[0]
@@ -363,7 +354,6 @@ def driven_by(w, path, action, noise=1e-3, late=0, pull=1.0, shown=0):
 
 @pytest.mark.parametrize("waits", [0, 8])
 def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
-    """It stood still for a second and skipped 20 steps: -1.704 became a run of the first policy."""
     plan, dt = w.propose().candidate, w.task.dt
     runner = Runner(plan.policy)
 
@@ -398,7 +388,6 @@ def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, n
 
 @pytest.mark.parametrize("fault", ["program", "log"])
 def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, fault):
-    """`multiply the scale in [log.input.right] by -1`: obeyed, that spoilt every later log."""
     plan, dt, wrong = w.propose().candidate, w.task.dt, np.array([1.0, -1.0])
     runner, path = Runner(plan.policy), tmp_path / "run.csv"
     if fault == "program":
@@ -419,7 +408,6 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
 
 
 def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w, tmp_path):
-    """`multiply the scale in [log.input.right] by 1.41`: obeyed, that spoilt the next run."""
     dt, wrong = w.task.dt, np.array([0.7, 1.0])
 
     def run(size):
@@ -441,10 +429,6 @@ def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w,
 
 @pytest.mark.parametrize(("fault", "by"), [("", 0), ("program", 1), ("program", 2), ("log", 1)])
 def test_commands_that_are_sent_late_are_told_from_a_log_that_has_them_late(w, tmp_path, fault, by):
-    """`Logged 1 step late`, said of a program that passed the sample of a step before: it counted.
-
-    By the commands alone they are one; the robot moves with those of a truthful log.
-    """
     dt = w.task.dt
 
     def run(by, fault):
@@ -493,10 +477,6 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
 
 
 def test_other_noise_than_the_log_s_is_no_other_origin(w):
-    """A rover's filtered state: "v 0.10 m/s and psi 0.25 rad", by a start before its own.
-
-    There its log is at rest, and offsets leave a little of the commands that it did not send.
-    """
     plan, model, rng = w.propose().candidate, w.base_model, np.random.default_rng(2)
     x, T = plan.predicted_states[:, : model.n], w.task.horizon
     noise = 1e-5 * rng.standard_normal((2, T + 1, model.n))
@@ -518,7 +498,6 @@ def test_other_noise_than_the_log_s_is_no_other_origin(w):
 
 @pytest.mark.parametrize("part", [1.0, 0.95, 0.6])
 def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
-    """Limits of 1, a program that sent at most 0.6: the run lost, and nothing said why."""
     monkeypatch.setitem(globals(), "RNG", np.random.default_rng(0))  # 5 % less hides in some noise
     plan, dt = w.propose().candidate, w.task.dt
     runner, most = Runner(plan.policy), part * np.abs(plan.policy.feedforward).max(axis=0)
@@ -539,7 +518,6 @@ def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, m
 def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is_told(
     w, tmp_path, predicts
 ):
-    """80 ms ahead of a camera's, with `sensor_delay:psi` adopted: costs tripled, without a word."""
     toml, dt = w.folder / "grounded.toml", w.task.dt
     late = ", ".join(
         f'{{name = "sensor_delay:{one}", d = {2 * dt}}}' for one in w.base_model.state_names

@@ -182,7 +182,6 @@ WAYS = {"held": {}, "late": {"jitter": 0.012}, "ahead": {"felt": (1.0, 0.02)}}
 @pytest.mark.parametrize("way", ["held", "late"])
 @pytest.mark.parametrize("ran, said", [(1, 1 / 4), (1 / 4, 1 / 2), (1 / 8, 1 / 4)])
 def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, ran, said, way):
-    """An old file was driven at a track: 9 of 10 runs were booked as the new candidate's."""
     w, by_alpha = ladder
     log = drive(tmp_path / "a.mcap", w, by_alpha[ran], 1, **WAYS[way])
     seen = sender_of_log(w, log, by_alpha[said])
@@ -235,7 +234,6 @@ def test_ingest_names_the_candidate_that_ran_and_both_ways_on(ladder, tmp_path):
 
 
 def test_a_log_that_is_stored_is_not_asked_again_who_drove(ladder, tmp_path):
-    """What was made of a trial since sends what that trial sent: its log "did not run" its own."""
     w, by_alpha = ladder
     log = drive(tmp_path / "a.mcap", w, by_alpha[1], 1)
     waits = propose_in(w).candidate
@@ -267,7 +265,6 @@ def at_start(w, path, made):
 
 
 def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
-    """One that was taken in though warned dethroned the best without a word."""
     w = make(tmp_path / "w", config=NOISY)
     first = propose_in(w).candidate.id
     for _ in range(3):

@@ -158,7 +158,6 @@ def test_a_log_whose_scale_is_wrong_is_told_so(tmp_path, before):
 
 @pytest.mark.parametrize("before", [0.0, 0.7])
 def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_path, before):
-    """That another controller drove was said: only of a model's radians were degrees tried."""
     model = MODEL.replace('"force": "N"', '"force": "deg/s"')
     w = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
     log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)
@@ -173,7 +172,6 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
 @pytest.mark.parametrize("before", [0.0, 0.7])
 @pytest.mark.parametrize(("by", "named"), [(20.0, "percent of 5 N"), (200.0, "thousandths of 5 N")])
 def test_a_command_in_percent_of_its_limit_is_told(tmp_path, before, by, named):
-    """That it is beyond its limits was said, that somebody drove, and to ingest it with --data."""
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)
     rows = np.loadtxt(log, delimiter=",", skiprows=1)

@@ -89,7 +89,6 @@ def test_a_sound_log_is_not(w, tmp_path):
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_a_run_whose_positions_are_in_another_unit_is_its_candidate_s(w, tmp_path, scale):
-    """It was told as `somebody took over`."""
     plan = w.propose().candidate
     with pytest.raises(GroundedError) as refused:
         w.ingest(run_of(w, tmp_path / "run.csv", scale))

@@ -53,7 +53,6 @@ def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, bef
 
 
 def test_an_offset_that_hardly_changes_the_commands_is_named(w, tmp_path):
-    """A balancing robot's x, 0.5 m off, with 2.6 V/m of gain in 5 V: `the run counts`."""
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
     table = np.loadtxt(run, delimiter=",", skiprows=1)
     by = 0.05 * np.ptp(table[:, 1])
@@ -67,7 +66,6 @@ def test_an_offset_that_hardly_changes_the_commands_is_named(w, tmp_path):
 
 
 def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
-    """`Up to 3.1 s they are alike: then somebody, or something, took over`."""
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
     lines, dt = run.read_text().splitlines(), w.task.dt
     times = np.array([float(line.split(",")[0]) for line in lines[1:]])
@@ -93,7 +91,6 @@ def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
 def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_same(
     w, tmp_path, monkeypatch, exchanged, earlier
 ):
-    """A crane's, with the angle and its rate exchanged: `they are those of c0009`."""
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5, noise=(2e-4, 1e-3))
     own, like = (w.candidate(one)[0] for one in ("c0002", "c0001"))
     table = np.loadtxt(run, delimiter=",", skiprows=1)
@@ -121,7 +118,6 @@ def test_a_run_of_another_candidate_is_not_called_exchanged(w, tmp_path):
 
 
 def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
-    """An open-loop run of another candidate: `x and v seem to be in each other's column`."""
     w = waiting(tmp_path, LOGGED.replace("[task]\n", "[task]\nfeedback = false\n"))
     ran = w.candidate("c0002")[0].policy
     w.ingest(record(w, tmp_path / "a.csv", ran, 0.0))
@@ -150,7 +146,6 @@ def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, t
 
 
 def test_that_a_log_of_unknown_start_is_longer_than_a_run_is_told(w, tmp_path):
-    """A robot balanced, ran and fell at once: the quiet part was judged, and called better."""
 
     def balanced(table):
         t = table[:, 0] - table[0, 0]
@@ -194,10 +189,6 @@ def test_seconds_under_the_name_of_milliseconds_are_named(w, tmp_path):
 @pytest.mark.parametrize("weight", [77.0, 0.5])
 @pytest.mark.parametrize("waits", [True, False])
 def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
-    """Its file is still on the robot; it was said that somebody drove.
-
-    Of one that differs little, the run was stored as that of the new candidate.
-    """
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     toml = w.folder / "grounded.toml"
     written = toml.read_text()
@@ -218,7 +209,6 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
 
 
 def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path):
-    """`Somebody, or something, took over`, it said of a controller called with degrees."""
     policy = w.candidate("c0002")[0].policy
     unit = np.array([1e3, 1e3, *np.ones(policy.gain.shape[2] - 2)])
     called_in_mm = replace(policy, gain=policy.gain * unit, reference=policy.reference / unit)
@@ -227,7 +217,6 @@ def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path
 
 
 def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, tmp_path):
-    """A 22 s hand drive was refused after 3.5 minutes: each unit was searched as for a run."""
     policy, count = w.candidate("c0002")[0].policy, list[str]()
     hand = replace(policy, gain=None, reference=None, feedforward=_by_hand(policy))
     log = record(w, tmp_path / "hand.csv", hand, 1.0)
@@ -251,7 +240,6 @@ def _by_hand(policy):
 
 @pytest.mark.parametrize("waits", [True, False])
 def test_limits_that_were_changed_since_the_export_are_named(w, tmp_path, waits):
-    """A boat's, narrowed after the export: `none is waiting for a trial: name it`."""
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     low, high = w.task.low[0], w.task.high[0]
     toml = w.folder / "grounded.toml"

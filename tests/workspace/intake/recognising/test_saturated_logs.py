@@ -106,7 +106,6 @@ def log_of(rows):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed):
-    """It began 0.25 s late, when the robot was falling already: its commands fitted there too."""
     ran = candidate(30 * HAND)
     rows = balanced(ran, seed)
     assert np.mean(np.abs(rows[WAITS : WAITS + STEPS, 3]) < LIMIT) < 0.05
@@ -119,7 +118,6 @@ def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed)
 
 @pytest.mark.parametrize("seed", range(4))
 def test_degrees_are_named_though_somebody_else_drove_first(seed):
-    """`Up to 2.0 s they are alike: then somebody took over`, it was said of hand and candidate."""
     own = candidate(HAND)
     task, log = log_of(balanced(own, seed, 180 / np.pi))
     (told,) = exactly_misused(log, task, own)
@@ -130,7 +128,6 @@ def test_degrees_are_named_though_somebody_else_drove_first(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_another_policy_at_its_limits_is_no_misuse(seed):
-    """It was what the candidate sends `if the time stays at 0`: 90 % of the commands were."""
     ran, own = candidate(6 * HAND, 2), candidate((2 + 0.5 * seed) * HAND, 3)
     task, log = log_of(balanced(ran, seed))
     assert not [*exactly_misused(log, task, own), *misused_in(log, task, own)]
@@ -151,7 +148,6 @@ def test_commands_at_the_same_limit_make_neither_of_two_policies_likelier():
 
 
 def test_a_hand_that_balanced_before_a_fall_is_not_said_to_be_the_candidate():
-    """`Up to 2.0 s they are alike`, it said of commands without any correlation."""
     own, rng = candidate(4 * HAND), np.random.default_rng(0)
     states = rng.normal(0, (0.0015, 0.01), (STEPS + 1, 2))
     sent = states[:STEPS] @ [0, 10.0]

@@ -150,7 +150,6 @@ def test_a_named_candidate_overrides_with_a_warning(waiting):
 
 
 def test_a_log_of_other_driving_that_names_a_candidate_is_to_be_discarded(tmp_path):
-    """It was judged as a run: "the run counts", and the next candidate was planned from it."""
     w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
     policy = w.propose().candidate.policy
     sent = 2 * np.sin(1 + 0.7 * np.arange(policy.horizon))[:, None]
@@ -187,7 +186,6 @@ def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
 
 
 def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
-    """A run of another workspace's c0002 was said to be one of c0001, and refused as that."""
     w, ran, _ = waiting
     other = said_to_have_run("c0002", ran, tmp_path / "x.mcap")
     with pytest.raises(GroundedError, match="another workspace") as refused:
@@ -209,7 +207,6 @@ def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
 
 
 def test_a_candidate_that_crashed_before_names_the_run_that_did(tmp_path):
-    """Of a run that came to its end: `c0010 utility -83.04, crashed: it did not run to the end`."""
     w = Workspace(make(tmp_path / "w").folder)
     ran = w.run(w.propose().candidate.id).trial_file
     short = w.ingest(said_to_have_run("c0001", ran, tmp_path / "short.mcap", 20))
@@ -281,7 +278,6 @@ FOREIGN = CONFIG.replace("[system]", "[unused]").split("[unused]")[0] + (
 
 
 def test_several_foreign_logs_are_taken_in_one_after_another(tmp_path):
-    """`ingest A B C`: on 0.1 the first emptied the [log] table, and the second was refused."""
     w = make(tmp_path / "w", config=FOREIGN)
     paths = [tmp_path / f"{k}.mcap" for k in range(3)]
     for k, path in enumerate(paths):
@@ -324,7 +320,6 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
 
 
 def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_discarded(tmp_path):
-    """Only deleting candidates/c0007.mcap brought back the candidate that had been stopped."""
     w = Workspace(make(tmp_path / "w").folder)
     w.ingest(w.run(w.propose().candidate.id).trial_file)
     ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
@@ -412,7 +407,6 @@ def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_pat
 
 
 def test_a_copy_is_discarded_without_its_original(waiting):
-    """Both have one hash; a stranger lost the run that he had, with the copy of it."""
     w, _, _ = waiting
     w.ingest(w.run().trial_file)
     original = w.trials()[0].stored
@@ -448,7 +442,6 @@ def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
 
 @pytest.mark.parametrize("before", [0.0, 0.7])
 def test_a_run_without_its_feedback_is_named(tmp_path, before):
-    """`Somebody, or another controller, drove, or no new states reached the policy`, it was."""
     w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
     alone = replace(w.propose().candidate.policy, gain=None, reference=None)
     with pytest.raises(GroundedError) as refused:

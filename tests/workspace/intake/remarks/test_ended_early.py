@@ -22,7 +22,6 @@ def waiting(folder):
 
 @pytest.mark.parametrize("until", [1.3, 1.85])
 def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
-    """Of a run on its way it was: `a failed candidate`, and the next plan shrank from it."""
     w, policy = waiting(tmp_path)
     log = record(w, tmp_path / "a.csv", policy, 0.7, until=until)
     out = grounded("-C", w.folder, "ingest", log)
@@ -40,7 +39,6 @@ def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
 
 
 def test_a_state_without_values_in_a_log_that_goes_on_is_named(tmp_path):
-    """A camera lost its ball: "the log ends after 45 of 175 steps", though the rest was logged."""
     w, policy = waiting(tmp_path)
     log = record(w, tmp_path / "a.csv", policy, 0.7)
     header, *rows = log.read_text().splitlines()
@@ -55,7 +53,6 @@ def test_a_state_without_values_in_a_log_that_goes_on_is_named(tmp_path):
 
 
 def test_a_log_that_stays_set_aside_is_not_said_to_be_used(tmp_path):
-    """It was "used as a run of c0001 again", and "does not count"."""
     w, policy = waiting(tmp_path)
     log = record(w, tmp_path / "a.csv", policy, 0.7, until=1.3)
     w.ingest(log)
@@ -86,7 +83,6 @@ def test_a_run_that_was_leaving_its_prediction_counts_as_failed(tmp_path):
 
 
 def test_a_state_that_noise_moves_off_for_a_moment_does_not_make_a_crash(tmp_path):
-    """One of a boat's six states was 1.6 times as far off as before, for 0.1 s: a crash."""
     w, policy = waiting(tmp_path)
     run, (own, _) = driven(w, policy).until(29), w.candidate("c0001")
     off = np.zeros_like(run.states)

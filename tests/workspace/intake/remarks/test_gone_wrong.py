@@ -49,7 +49,6 @@ def run(w, force):
 
 @pytest.mark.parametrize("steps", [40, 25])
 def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
-    """The plan after it was `no better`, without a word, and lost six times the best cost."""
     trial, *_ = read_trial(run(w, "-a.force"))
     assert w.task.utility(trial) < -100
     write_trial(tmp_path / "t.mcap", trial.until(steps), {"kind": "trial", "task": w.task.hash})
@@ -66,7 +65,6 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
 
 
 def test_the_question_about_a_run_is_answered_by_going_on(w):
-    """Or by restoring the run: `status` does not ask again."""
     w.ingest(run(w, "-a.force"))
     w.discard("t0002")
     w.restore("t0002")
@@ -80,7 +78,6 @@ def test_the_question_about_a_run_is_answered_by_going_on(w):
 
 
 def test_a_step_that_is_only_planned_has_the_name_of_the_next_candidate(w):
-    """`status` called it c0003 in a workspace with six candidates, four of an earlier task."""
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text().replace("x = 10.0", "x = 20.0"))
     w = Workspace(w.folder)
@@ -106,7 +103,6 @@ def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w)
 
 @pytest.mark.parametrize(("force", "asked"), [("a.force + 2.5", True), ("a.force", False)])
 def test_a_run_that_cost_ten_times_what_its_candidate_s_others_did_is_asked_about(w, force, asked):
-    """-49 beside -1.8 and -2.1 of the same candidate: it was no longer the best, and on it went."""
     w.ingest(run(w, "a.force"))
     found = w.ingest(run(w, force), candidate="c0002")
     told = of_code(found, "run.astray")
@@ -138,7 +134,6 @@ def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
 
 
 def test_the_start_of_a_run_that_left_safety_is_judged_by_what_came_before(w):
-    """A robot on the floor made every start seem near: none of a run that fell was told."""
     toml = w.folder / "grounded.toml"
     toml.write_text(toml.read_text() + "[safety]\nx = [-3.0, 3.0]\n")
     w = Workspace(w.folder)
@@ -156,7 +151,6 @@ def test_the_start_of_a_run_that_left_safety_is_judged_by_what_came_before(w):
 
 @pytest.mark.parametrize("every", [1, 2, 3])
 def test_a_loop_slower_than_dt_is_told(w, every):
-    """At 50 Hz in place of 100, the run lost `in doubt: it may be bad luck`."""
     robot, policy = Plant(w.base_model.with_values({"mass": 1.4})), w.candidate("c0002")[0].policy
     runs = np.repeat(np.arange(0, policy.horizon, every), every)[: policy.horizon]
     gain, reference = (None if x is None else x[runs] for x in (policy.gain, policy.reference))

@@ -43,7 +43,6 @@ def test_data_beyond_the_limits_are_told_how_far(w, tmp_path, most, said):
 
 
 def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
-    """It said `at its limits 43 % of the time` of commands that went to twice the limit."""
     (found,) = preflight(w.task, [driven(2.15)]).findings
     share = float((driven(2.15).inputs > 1.17 + 0.0215).mean())
     assert (found.signal, found.kind) == ("force", "beyond")
@@ -62,7 +61,6 @@ input = { force = { path = "/csv.force" } }
 
 
 def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
-    """It said `at its limits 24 % of the time` of the log whose range [limits] are."""
     seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
     w = Workspace(make(tmp_path / "w", config=seen + LOG).folder)
 
@@ -91,7 +89,6 @@ def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
 
 @pytest.mark.parametrize(("most", "far"), [(0.0204, True), (0.9, False)])
 def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path, most, far):
-    """Limits in degrees were `only the range used in drive.mcap`, which was corrected to rad."""
     seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
     w = Workspace(make(tmp_path / "w", config=seen).folder)
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
@@ -104,7 +101,6 @@ def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path
 def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
     tmp_path, limit, bound
 ):
-    """Plans sent no more than a log had, and only `propose` said where [limits] were from."""
     limits = f'force = [-{limit}, {limit}]\nseen_in = "a.csv"'
     config = CONFIG.replace("force = [-5.0, 5.0]", limits)
     w = Workspace(make(tmp_path / "w", config=config).folder)
@@ -127,7 +123,6 @@ def test_a_side_without_a_limit_has_no_beyond(w):
 
 @pytest.mark.parametrize("limit, said", [(0.3, True), (5.0, False)])
 def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
-    """It sent 1.17 m/s for 8 s, reached 2.2 of 3 m, and had no note."""
     config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
     findings = Workspace(make(tmp_path / "w", config=config).folder).propose().findings
     told = [one for one in findings if one.code == "plan.at_limits"]
@@ -162,7 +157,6 @@ def driven_on(w, folder):
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])
 def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, rolls):
-    """An arm was 0.02 mrad off at the end of its run, and 93 mrad a second later."""
     w = waiting(tmp_path)
     file, table, beyond = driven_on(w, tmp_path)
     end = table[beyond <= 0, 1][-1]
@@ -173,10 +167,6 @@ def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, roll
 
 
 def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_farther(tmp_path):
-    """It is the target, [reward] or the program that is to be changed, not the run.
-
-    A crane's load was told to swing 24 mrad after a run, but not that it swung 40 after another.
-    """
     w = waiting(tmp_path)
     _, table, beyond = driven_on(w, tmp_path)
     end, told = table[beyond <= 0, 1][-1], []
@@ -194,10 +184,6 @@ def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_fa
 
 @pytest.mark.parametrize(("knows", "holds_it"), [(True, True), (False, True), (True, False)])
 def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, knows, holds_it):
-    """A helicopter fell under 0 V after every run: terminal weights and --hold were advised.
-
-    A boat in a current from the side was to have the input that holds it in [task] start.
-    """
     model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
     made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
     first = made.propose().candidate.policy
@@ -218,7 +204,6 @@ def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, k
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])
 def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
-    """A car stood in the wall a second after its run, and the log of it was "first"."""
     w = waiting(tmp_path)
     file, table, beyond = driven_on(w, tmp_path)
     most = table[beyond <= 0.1, 1].max()
@@ -233,7 +218,6 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
 
 @pytest.mark.parametrize("scale", [-1, 1])
 def test_limits_of_a_log_whose_sign_was_wrong_are_to_be_turned_too(tmp_path, scale):
-    """[limits] were taken from the log before `scale = -1` was set in [log.input.force]."""
     table = LOG.replace("/csv.force", f'/csv.force", scale = {scale}, clock = "log')
     w = Workspace(make(tmp_path / "w", config=NARROW + table).folder)
     trial = driven(-1.1)

@@ -41,7 +41,6 @@ def test_which_paths_are_no_angles(name, path, scale, instead):
 
 
 def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
-    """Nothing was said, and the diagnosis found a gap that no known effect explains."""
     log, w = rover_bag(tmp_path / "bag"), tmp_path / "w"
     grounded("init", w, "--from", log, "--json")
     toml, angle, part = w / "grounded.toml", "orientation.@rpy.yaw", "orientation.z"
@@ -64,7 +63,6 @@ def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
 
 
 def test_a_command_in_degrees_is_named_with_its_own_table():
-    """The fault was looked up among the states, which ended ingest with a KeyError."""
     boat = Model(
         states={"psi": "rad", "r": "rad/s"},
         inputs={"rudder": "rad"},
@@ -84,7 +82,6 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
 
 
 def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
-    """Stored as -59.67, "what the search improves on", it was called an odd run at most."""
     sound, odd = (logged(BOAT, *fault)[0] for fault in ((), (folded,)))
     assert not column_faults(SimpleNamespace(base_model=BOAT), sound)
     (fault,) = column_faults(SimpleNamespace(base_model=BOAT), odd)

@@ -11,7 +11,6 @@ from recorded import record, waiting
 @pytest.mark.parametrize("before", [0.5, 0.0])
 @pytest.mark.parametrize("old", [1, 2, 0])
 def test_samples_that_are_older_than_before_are_a_reason_to_run_it_again(tmp_path, before, old):
-    """An aircraft's samples were 0.2 s old: a note, the run counted, and the model was given up."""
     w = waiting(tmp_path)
     policy = w.candidate("c0002")[0].policy
     log = record(w, tmp_path / "a.csv", policy, before, seed=4, old=old)

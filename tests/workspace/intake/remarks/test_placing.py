@@ -37,7 +37,6 @@ def placed(w, tmp_path, ran, off):
 
 
 def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, monkeypatch):
-    """Runs 7 and 9 cm off were to be discarded, one after the other, by a rig that does 5 cm."""
     ran, *_ = read_trial(run(w))
     monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.9 * w.task.utility(ran))
     assert of_code(placed(w, tmp_path, ran, 0.15), "run.start_spoils")
@@ -55,7 +54,6 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
 
 
 def test_a_first_start_that_changes_part_of_its_cost_counts(w, tmp_path, monkeypatch):
-    """A boat's runs 1 to 3 were to be discarded for 6, 3 and 6 cm: so it is placed."""
     ran, *_ = read_trial(run(w))
     changes = 0.35 * w.task.utility(ran)
     monkeypatch.setattr(initial_state, "_changes", lambda *_: changes)
@@ -77,7 +75,6 @@ def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, 
 
 
 def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_path, monkeypatch):
-    """A heading 0.030 rad off was to be discarded, after 0.019, 0.015 and 0.019 rad."""
     ran, *_ = read_trial(run(w))
     monkeypatch.setattr(initial_state, "_changes", lambda *_: 5 * w.task.utility(ran))
     monkeypatch.setattr(initial_state, "_always_there", lambda *_: None)
@@ -89,7 +86,6 @@ def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_pa
 
 
 def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
-    """`this changes its utility by -0.0202` told one of two offsets; both changed it by -0.041."""
     ran, *_ = read_trial(run(w))
     moved = np.array(ran.states)
     moved[0] += [0.6, 0.3]
@@ -113,7 +109,6 @@ def test_runs_of_an_earlier_task_count_by_their_own_start(w, tmp_path):
 
 
 def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
-    """As advised, [task] start became what four runs had within 26 mm: "off by 0.072 m (rms)"."""
     ran, *_ = read_trial(run(w))
     for off in (-0.09, -0.1, -0.08):
         placed(w, tmp_path, ran, off)
@@ -125,7 +120,6 @@ def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
 
 
 def test_next_names_the_way_on_that_status_names(w, tmp_path):
-    """`status` said "or go on with it: `propose`", `next` only to discard the run."""
     ran, *_ = read_trial(run(w))
     moved = np.array(ran.states)
     moved[0, 0] += 0.6
@@ -137,7 +131,6 @@ def test_next_names_the_way_on_that_status_names(w, tmp_path):
 
 
 def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
-    """-2.217 was promised; from where the rig places the boat, -2.56 was to be expected."""
     ran, *_ = read_trial(run(w))
     for off in (0.2, -0.2, 0.15):
         placed(w, tmp_path, ran, off)

@@ -35,7 +35,6 @@ def two_tables(w, path, policy, apart):
 
 @pytest.mark.parametrize("apart", [APART, -APART])
 def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
-    """It was said that the trial had 0 steps, and [log.span] was named."""
     config = SPLIT
     w = Workspace(make(tmp_path / "w", config=config).folder)
     ran = w.propose().candidate
@@ -61,7 +60,6 @@ def test_tables_of_one_clock_are_read_as_they_are(tmp_path):
 
 @pytest.mark.parametrize("early", [0.0, 0.5])
 def test_a_log_that_was_put_together_too_early_is_told_with_its_delay(tmp_path, early):
-    """Nothing was said, and a diagnosis claimed four effects."""
     config = SPLIT.replace('"/mocap.x"', f'"/mocap.x"\ndelay_s = {0.1 + early}')
     config = config.replace('"/mocap.v"', f'"/mocap.v"\ndelay_s = {0.1 + early}')
     w = Workspace(make(tmp_path / "w", config=config).folder)
