@@ -8,7 +8,7 @@ sample, and gains that were to bring it to zero in the last steps answered that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,8 +132,3 @@ def drawn(task: Task) -> NextCommand | None:
     shape = "step" if np.allclose(share[1:], 1.0) else "line"
     to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
     return NextCommand("target", (shape, *(word for pair in to for word in pair)))
-
-
-def names_told(names: Sequence[str], values: Mapping[str, Array]) -> str:
-    """Return the values at the end as `th = 0.03, w = 0`."""
-    return ", ".join(f"{name} = {values[name][-1] + 0.0:.3g}" for name in names)

@@ -114,15 +114,6 @@ def seen_in(config: Config) -> str:
     return log
 
 
-def limits_of_log(config: Config) -> str:
-    """Return that plans keep to the commands of a log until the user enters the limits; or ""."""
-    log = seen_in(config)
-    return log and (
-        f"[limits] are only the range used in {log} (0 included), and plans keep to it: enter the "
-        "robot's real limits, then delete seen_in there"
-    )
-
-
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     table = config.reward
     kinds = {"state": states, "terminal": states, "input": inputs, "input_change": inputs}

@@ -1,0 +1,67 @@
+"""Findings on a manoeuvre that was drawn."""
+
+from __future__ import annotations
+
+from grounded.findings.catalogue import Entry
+
+ENTRIES: dict[str, Entry] = {
+    "seconds": Entry(
+        "refuse",
+        "a {about} lasts as long as its speeds take it; --seconds is for a step, a swing-up or a "
+        "line --to STATE=VALUE",
+        "set how fast it is driven with --speed and --accel",
+    ),
+    "weighed": Entry(
+        "warn",
+        "[reward] weighs {about}, without a column in the target: `propose` refuses that",
+        "[[draw it again with `{to}`, or ]]remove the weight in grounded.toml",
+    ),
+    "degrees": Entry(
+        "warn",
+        "{about} = {value:g} rad is {turns:.2g} turns",
+        "if you meant degrees, use `--to {about}={rad:.4g}`",
+    ),
+    "beyond": Entry("warn", "{about} goes to {goes}, beyond its bound in [safety], {bound:g}"),
+    "readings": Entry(
+        "note",
+        "the sensor of {about} reads {bias}, and the target is in its readings[[; it ends at "
+        "{end}]][[; [task] start is {start}]]",
+        "if a true 0 is meant there, add the bias",
+    ),
+    "start": Entry(
+        "note",
+        "[task] start is where {about} rests: {start}",
+        "if runs begin elsewhere, change it and draw the target again",
+    ),
+    "slower": Entry(
+        "note",
+        "it reaches {fastest} at most, not --speed {asked:g}: --accel {accel:g} and --lateral "
+        "{lateral:g} m/s^2 limit it",
+    ),
+    "may_rest": Entry(
+        "note",
+        "nothing asks for rest at the end",
+        "for {about} there, by weights in [reward] terminal, draw it again with `--rest` as well",
+    ),
+    "complete": Entry("note", "--rest has nothing to add: every state has a column already"),
+    "kept": Entry(
+        "note",
+        "[reward] state is kept, since it was chosen: {weights}",
+        "delete the line and draw the target again for this target's own: {usual}",
+    ),
+    "still": Entry(
+        "note",
+        "{about} {about:does/do} not move in the target, so it does not show what a small error is",
+        "choose the weight in [reward] state",
+    ),
+    "noisy_end": Entry(
+        "note",
+        "the weight of {about} at the end is only {least:.3g}: with it, the sensor noise ({noise}) "
+        "costs {cost:g} of the utility, and with a larger one the inputs would answer that noise",
+    ),
+    "replaced": Entry(
+        "note",
+        "the search starts again; before: {about}[[about? , ]]the target in {file}.bak",
+        "to go back, copy {file}.bak and grounded.toml.bak over {file} and grounded.toml",
+    ),
+}

@@ -1,0 +1,350 @@
+"""Draws a manoeuvre into a workspace: its columns, the weights that follow, and what is told."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, found, settle
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.places import velocities
+from grounded_trials import Workspace
+from grounded_trials.starting.recorded_run import recorded_run
+from grounded_trials.starting.shapes import (
+    PATHS,
+    SHAPES,
+    Drive,
+    has_plane,
+    line_target,
+    path_target,
+    step_target,
+    swing_up,
+)
+from grounded_trials.wording import figure, misread
+from grounded_trials.workspace.candidates.at_rest import rest_of_trials
+from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
+from grounded_trials.workspace.candidates.rest_at_end import NOISY, Rest, rest_at_end
+from grounded_trials.workspace.candidates.standstill import read_at_start
+from grounded_trials.workspace.off_target import driven, usual_weights
+from grounded_trials.workspace.user_files.config import TaskTable, set_start
+from grounded_trials.workspace.user_files.task_file import seen_in, without_range
+
+SECONDS = 5.0  # default duration of a step or a swing-up
+REACHED = 0.95  # of the speed asked for: a path that stays below it brings a note
+STRAIGHT = 1e3  # times its size: larger turning radii are those of a straight line
+OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
+TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
+
+Weights = dict[str, dict[str, float]]  # by kind (state, terminal, input_change) and name
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """A manoeuvre as a person asks for it.
+
+    Args:
+        shape: one of `shapes.SHAPES`, a stored trial, or a file of a log or of columns.
+        drive: size and pace of a path.
+        to: where states end, or what they keep along a path.
+        seconds: duration of a step, a swing-up or a line to a state; None: 5 s, or by the pace.
+        paces: those of `drive` that were asked for, among speed and accel.
+        rest: whether the states that a line leaves free rest at its end.
+    """
+
+    shape: str
+    drive: Drive = field(default_factory=Drive)
+    to: Mapping[str, float] = field(default_factory=dict)
+    seconds: float | None = None
+    paces: Mapping[str, float] = field(default_factory=dict)
+    rest: bool = False
+
+    @property
+    def is_path(self) -> bool:
+        """Whether it is driven along a path in the plane."""
+        return self.shape in PATHS
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What was drawn.
+
+    Args:
+        path: the file of the target.
+        columns: of the tracked states, (H + 1,) each.
+        units: of the model's states.
+        dt: control interval [s].
+        free: states without a column.
+        driven: highest speed [m/s] and smallest turning radius [m] of a path, NaN and inf if none.
+        weights: what is new in [reward].
+        findings: what is told, the heaviest first.
+        then: the command to type next.
+    """
+
+    path: Path
+    columns: Mapping[str, Array]
+    units: Mapping[str, str]
+    dt: float
+    free: tuple[str, ...]
+    driven: tuple[float, float]
+    weights: Weights
+    findings: tuple[Finding, ...]
+    then: NextCommand
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each column."""
+        return {name: (float(v.min()), float(v.max())) for name, v in self.columns.items()}
+
+    @property
+    def horizon(self) -> int:
+        """Number of control steps H."""
+        return len(next(iter(self.columns.values()))) - 1
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document that `target --json` prints."""
+        return {
+            "target": str(self.path),
+            "horizon": self.horizon,
+            "columns": self.ranges,
+            "free": list(self.free),
+            "findings": [one.to_json() for one in self.findings],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """What the findings on a target are read from."""
+
+    workspace: Workspace  # with the new target
+    asked: Manoeuvre
+    columns: Mapping[str, Array]
+    free: Sequence[str]
+    fastest: float  # [m/s] along a path, NaN if it is none
+    line: Rest | None  # what lets the free states of a line rest at its end
+    rests: Rest | None  # the same, if it was asked for
+    begins: Mapping[str, float]  # what is new in [task] start
+    seen: str  # the trial that rests there
+    ran: bool  # whether there are candidates for the target before
+    old: TaskTable
+    before: Weights
+    reward: Weights
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        model: Model = self.workspace.base_model
+        return model.states
+
+
+def draw(workspace: Workspace, asked: Manoeuvre) -> Drawn:
+    """Write a manoeuvre to the workspace's target, with its length and usual weights.
+
+    Args:
+        workspace: the workspace.
+        asked: the manoeuvre.
+
+    Raises:
+        GroundedError: if it can't be drawn for this model; the files are then as before.
+    """
+    # Where it begins: [task] start, or where the trials show the robot at rest.
+    rest, seen = rest_of_trials(workspace)
+    model, old = workspace.base_model, workspace.config.task
+    start, before = old.start or rest, _reward(workspace)
+
+    # Its columns; those of a log know their own start.
+    columns = _columns(workspace, asked, start)
+    if asked.shape not in SHAPES:
+        rest = {}
+    line = rest_at_end(workspace, columns, start) if asked.shape == "line" else None
+    rests = line if asked.rest else None
+    if rests is not None:
+        columns = {**columns, **rests.columns}
+
+    # The files.
+    extra = () if rests is None else (rests.weights, [*rests.columns])
+    path, ran = workspace.target(columns, *extra), bool(workspace.candidate_ids())
+    if rest:
+        set_start(workspace.config.file, rest)
+        workspace.forget()
+
+    # What is told of it.
+    reward = _reward(workspace)
+    free = tuple(name for name in model.states if name not in columns)
+    planar = asked.is_path and has_plane(model)
+    along = driven(model, columns, old.dt) if planar else (math.nan, math.inf)
+    case = _Case(
+        workspace, asked, columns, free, along[0], line, rests, rest, seen, ran, old, before, reward
+    )
+    return Drawn(
+        path,
+        columns,
+        model.states,
+        old.dt,
+        free,
+        (along[0], along[1] if along[1] < STRAIGHT * asked.drive.size else math.inf),
+        {kind: own for kind, own in reward.items() if own != before.get(kind, {})},
+        settle(one for tell in TOLD for one in tell(case)),
+        INSPECT if unmapped(workspace) else NextCommand("propose"),
+    )
+
+
+def _columns(
+    workspace: Workspace, asked: Manoeuvre, start: Mapping[str, float]
+) -> dict[str, Array]:
+    """Return the columns of a manoeuvre, (H + 1,) each."""
+    model, dt, shape = workspace.base_model, workspace.config.task.dt, asked.shape
+    long = SECONDS if asked.seconds is None else asked.seconds
+    if shape == "line" and (asked.to or not has_plane(model)):
+        pace = next(iter(asked.paces), "")
+        return line_target(asked.to, start, asked.drive, model, dt, asked.seconds, pace)
+    if shape == "step":
+        return step_target(asked.to, model, dt, long, start)
+    if shape == "swing-up":
+        return swing_up(model, dt, long, asked.to, start)
+    if asked.seconds is not None:
+        raise GroundedError(found("target.seconds", shape))
+    if asked.is_path:
+        return path_target(shape, asked.drive, model, dt, asked.to, start)
+    return recorded_run(workspace, shape, SHAPES)
+
+
+def _reward(workspace: Workspace) -> Weights:
+    written = tomllib.loads(workspace.config.file.read_text(encoding="utf-8"))
+    return dict(written.get("reward", {}))
+
+
+# What is told
+
+
+def _slower(case: _Case) -> Iterator[Finding]:
+    asked, drive = case.asked.paces.get("speed"), case.asked.drive
+    if asked is not None and not case.asked.to and case.fastest < REACHED * asked:
+        fastest = Quantity(case.fastest, "m/s")
+        yield found(
+            "target.slower", fastest=fastest, asked=asked, accel=drive.accel, lateral=drive.lateral
+        )
+
+
+def _in_degrees(case: _Case) -> Iterator[Finding]:
+    for name, value in case.asked.to.items():
+        if case.units.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
+            turns = abs(value) / (2 * math.pi)
+            yield found("target.degrees", name, value=value, turns=turns, rad=math.radians(value))
+
+
+def _weighed_without_column(case: _Case) -> Iterator[Finding]:
+    kinds = (case.reward.get(kind, {}) for kind in ("state", "terminal"))
+    weighed = {name for kind in kinds for name, weight in kind.items() if weight}
+    if about := [name for name in case.free if name in weighed]:
+        rates = velocities(case.workspace.base_model) if case.line else ()
+        to = " ".join(f"--to {name}={'0' if name in rates else 'VALUE'}" for name in about)
+        path = case.asked.is_path and not case.asked.to
+        yield found("target.weighed", *about, to=None if path else to)
+
+
+def _rest(case: _Case) -> Iterator[Finding]:
+    if case.line is not None and case.rests is None:
+        ends = {name: column[-1] + 0.0 for name, column in case.line.columns.items()}
+        yield found("target.may_rest", *(f"{name} = {end:.3g}" for name, end in ends.items()))
+    elif case.asked.rest and case.rests is None:
+        yield found("target.complete")
+
+
+def _replaced(case: _Case) -> Iterator[Finding]:
+    old, steps = case.old, len(next(iter(case.columns.values()))) - 1
+    if case.ran:
+        was = [f"horizon = {old.horizon}"] * (old.horizon != steps)
+        was += [
+            f"[reward] {kind}: {_equal(weights)}"
+            for kind, weights in case.before.items()
+            if weights != case.reward.get(kind)
+        ]
+        yield found("target.replaced", *was, file=str(old.target))
+
+
+def _begins(case: _Case) -> Iterator[Finding]:
+    if case.begins:
+        yield found("target.start", case.seen, start=_equal(case.begins))
+
+
+def _kept_weights(case: _Case) -> Iterator[Finding]:
+    ended = {} if case.rests is None else case.rests.columns
+    each = usual_weights(case.workspace.base_model, case.columns)
+    usual = {name: float(f"{w:.6g}") for name, w in each.items() if name not in ended}
+    weights = case.reward.get("state", {})
+    if weights and weights == case.before.get("state", {}) and weights != usual:
+        yield found("target.kept", weights=_equal(weights), usual=_equal(usual))
+
+
+def _noisy_end(case: _Case) -> Iterator[Finding]:
+    for name, noise in (case.rests.noise if case.rests else {}).items():
+        weight = case.reward["terminal"][name]
+        if case.rests and weight == case.rests.weights[name]:  # else it is the user's own
+            noise_ = Quantity(noise, case.units[name])
+            yield found("target.noisy_end", name, least=weight, noise=noise_, cost=NOISY)
+
+
+def _beyond_safety(case: _Case) -> Iterator[Finding]:
+    bounds = case.workspace.config.safety.pairs(list(case.units))
+    for name, column in case.columns.items():
+        least, most = bounds.get(name, (-math.inf, math.inf))
+        low, high = float(column.min()), float(column.max())
+        if low < least or high > most:
+            end, bound = (low, least) if low < least else (high, most)
+            yield found("target.beyond", name, goes=Quantity(end, case.units[name]), bound=bound)
+
+
+def _in_readings(case: _Case) -> Iterator[Finding]:
+    for effect in case.workspace.config.model.effects:
+        family, _, name = str(effect["name"]).partition(":")
+        if family != "sensor_bias" or name not in case.columns:
+            continue
+        b, unit = effect["b"], case.units[name]
+        ends = float(case.columns[name][-1])
+        begins = float(case.workspace.config.task.start.get(name, case.columns[name][0]))
+        start = None if read_at_start(case.workspace, name, b) else begins
+        off = [
+            None if at is None or math.isclose(at, b, rel_tol=OBEYED) else Quantity(at, unit)
+            for at in (ends, start)
+        ]
+        if any(off):
+            yield found("target.readings", name, bias=misread(b, unit), end=off[0], start=off[1])
+
+
+def _still(case: _Case) -> Iterator[Finding]:
+    ended = {} if case.rests is None else case.rests.columns
+    still = [name for name in without_range(case.columns, case.units) if name not in ended]
+    if still:
+        yield found("target.still", *still)
+
+
+def _of_log(case: _Case) -> Iterator[Finding]:
+    if log := seen_in(case.workspace.config):
+        yield found("plan.limits_of_log", log=log)
+    if (lost := unmapped(case.workspace)) is not None:
+        yield lost
+
+
+def _equal(by_name: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {figure(value)}" for name, value in by_name.items())
+
+
+TOLD = (
+    _weighed_without_column,
+    _in_degrees,
+    _of_log,
+    _beyond_safety,
+    _in_readings,
+    _begins,
+    _slower,
+    _rest,
+    _kept_weights,
+    _still,
+    _noisy_end,
+    _replaced,
+)
