@@ -106,11 +106,9 @@ def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
     w = Workspace(make(tmp_path / "w", config=config).folder)
     (note,) = (one for one in w.propose().notes if "seen_in" in one)
     assert ("force is at them for" in note and "of this plan" in note) is bound
-    done = grounded("-C", w.folder, "target", "line", "--to", "x=1")
-    said = " ".join(done.err.split())
-    assert holds(
-        said, "only the range used in a.csv (0 included), and plans keep to it", "delete seen_in"
-    )
+    drawn = grounded("-C", w.folder, "target", "line", "--to", "x=1", "--json").json
+    (told,) = (one for one in drawn["findings"] if one["code"] == "plan.limits_of_log")
+    assert told["facts"]["log"] == "a.csv"
 
 
 def test_a_side_without_a_limit_has_no_beyond(w):
