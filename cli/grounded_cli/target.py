@@ -85,7 +85,7 @@ def command(
     inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
     diagnose; the search starts again.
     """
-    from grounded_trials.starting.drawing import Manoeuvre, draw
+    from grounded_trials.starting.drawing import Manoeuvre
     from grounded_trials.starting.shapes import Drive
 
     paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
@@ -97,7 +97,7 @@ def command(
             "--rest is for a line: a swing-up ends at rest as it is, a path with --hold"
         )
     asked = Manoeuvre(shape, drive, _values(to), seconds, paces, at_rest)
-    drawn = draw(open_workspace(), asked)
+    drawn = open_workspace().draw(asked)
     if json_:
         show_json(drawn.to_json())
     else:

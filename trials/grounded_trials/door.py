@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
+    from grounded_trials.starting.drawing import Drawn, Manoeuvre
     from grounded_trials.workspace.adopting import Adopted, Undone
     from grounded_trials.workspace.candidates.exporting import Exported
     from grounded_trials.workspace.candidates.proposing import Proposed, Status
@@ -185,6 +186,19 @@ class Workspace(Folder):
         path = replace_target(here.config, columns, here.base_model, terminal or {}, only_at_end)
         self.forget()
         return path
+
+    def draw(self, asked: Manoeuvre) -> Drawn:
+        """Write a line, circle, figure-8, step, swing-up or recorded run as the target.
+
+        Args:
+            asked: the manoeuvre.
+
+        Raises:
+            GroundedError: if it can't be drawn for this model; the files are then as before.
+        """
+        from grounded_trials.starting.drawing import draw
+
+        return draw(self.forget(), asked)
 
     def learn(
         self,

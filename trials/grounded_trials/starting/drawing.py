@@ -14,7 +14,6 @@ from grounded.findings import Finding, Quantity, found, settle
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import velocities
-from grounded_trials import Workspace
 from grounded_trials.starting.recorded_run import recorded_run
 from grounded_trials.starting.shapes import (
     PATHS,
@@ -31,6 +30,8 @@ from grounded_trials.workspace.candidates.at_rest import rest_of_trials
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.rest_at_end import NOISY, Rest, rest_at_end
 from grounded_trials.workspace.candidates.standstill import read_at_start
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven, usual_weights
 from grounded_trials.workspace.user_files.config import TaskTable, set_start
 from grounded_trials.workspace.user_files.task_file import seen_in, without_range
@@ -121,7 +122,7 @@ class Drawn:
 class _Case:
     """What the findings on a target are read from."""
 
-    workspace: Workspace  # with the new target
+    workspace: Folder  # with the new target
     asked: Manoeuvre
     columns: Mapping[str, Array]
     free: Sequence[str]
@@ -141,7 +142,7 @@ class _Case:
         return model.states
 
 
-def draw(workspace: Workspace, asked: Manoeuvre) -> Drawn:
+def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     """Write a manoeuvre to the workspace's target, with its length and usual weights.
 
     Args:
@@ -167,10 +168,11 @@ def draw(workspace: Workspace, asked: Manoeuvre) -> Drawn:
 
     # The files.
     extra = () if rests is None else (rests.weights, [*rests.columns])
-    path, ran = workspace.target(columns, *extra), bool(workspace.candidate_ids())
+    path = replace_target(workspace.config, columns, model, *extra)
+    ran = bool(workspace.candidate_ids())
     if rest:
         set_start(workspace.config.file, rest)
-        workspace.forget()
+    workspace.forget()
 
     # What is told of it.
     reward = _reward(workspace)
@@ -193,9 +195,7 @@ def draw(workspace: Workspace, asked: Manoeuvre) -> Drawn:
     )
 
 
-def _columns(
-    workspace: Workspace, asked: Manoeuvre, start: Mapping[str, float]
-) -> dict[str, Array]:
+def _columns(workspace: Folder, asked: Manoeuvre, start: Mapping[str, float]) -> dict[str, Array]:
     """Return the columns of a manoeuvre, (H + 1,) each."""
     model, dt, shape = workspace.base_model, workspace.config.task.dt, asked.shape
     long = SECONDS if asked.seconds is None else asked.seconds
@@ -213,7 +213,7 @@ def _columns(
     return recorded_run(workspace, shape, SHAPES)
 
 
-def _reward(workspace: Workspace) -> Weights:
+def _reward(workspace: Folder) -> Weights:
     written = tomllib.loads(workspace.config.file.read_text(encoding="utf-8"))
     return dict(written.get("reward", {}))
 
