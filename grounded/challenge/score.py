@@ -27,8 +27,7 @@ from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.held_out import held_out_errors
-from grounded.diagnosis.validation.prediction_error import horizon, normalised
+from grounded.diagnosis.validation.prediction_error import gap_of, horizon
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.frozen import Array
@@ -123,7 +122,7 @@ def oracle(
     names = tuple(sorted(known))
     best = next(f for f in search.of_size(len(known)) if tuple(sorted(f.hypothesis.names)) == names)
     where = horizon(search.predictor, best, 1.0)
-    gap = normalised(held_out_errors(search.predictor, best, best.track, where), where)
+    gap = gap_of(search.predictor, best, where)
     none = search.score(search.best_null())
     rivals = [fitted([len(known) + i]) - none for i in range(len(others))]
     ruler = Ruler(search.predictor)

@@ -61,60 +61,11 @@ class Region(Document):
 
 
 @dataclass(frozen=True, eq=False)
-class Parts(Document):
-    """A mean squared error in three parts that sum to 1."""
-
-    explained: float = math.nan
-    unexplained: float = math.nan
-    irreducible: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class ChannelParts(Document):
-    """The three parts for one state, and the rms error of the crude model."""
-
-    name: str
-    unit: str = ""
-    rms: float = math.nan
-    explained: float = math.nan
-    unexplained: float = math.nan
-    irreducible: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Split(Document):
-    """The parts of the prediction error at one horizon: all states relative to noise, and each.
-
-    The irreducible part comes from "repeats" of a candidate, "repeats, at most", trials "alike", or
-    the "noise"; "at most" means that only an upper bound of the noise is known. NaN: the noise is
-    not known.
-    `irreducible_unsure`: standard deviation of the logarithm of the noise, from few repeats.
-    """
-
-    horizon_s: float
-    whole: Parts = field(metadata={"key": "all"})
-    channels: tuple[ChannelParts, ...] = ()
-    irreducible_from: str = "noise"
-    irreducible_unsure: float = field(metadata=BRIEF, default=0.0)
-
-    @property
-    def bound(self) -> bool:
-        """Whether the irreducible part is an upper bound."""
-        return self.irreducible_from in ("at most", *BOUNDS)
-
-    def may_be_noise(self, parts: Parts | ChannelParts) -> bool:
-        """Check whether the unexplained part is within the uncertainty of the noise."""
-        left, bound = parts.unexplained + parts.irreducible, self.irreducible_from == "at most"
-        return not bound and left <= doubt_of(self.irreducible_unsure) ** 2 * parts.irreducible
-
-
-@dataclass(frozen=True, eq=False)
 class Where(Document):
     """Where the gap is, largest shares first.
 
     Without a claim or a leftover, no channel has a share and no time or region is given.
 
-    split: by horizon (one_step, horizon, whole_run).
     whiteness: by state, the p-value of white innovations.
     tempering: factor on evidence, below 1 if the innovations are correlated or too large.
     """
@@ -122,24 +73,8 @@ class Where(Document):
     channels: tuple[ChannelShare, ...] = ()
     times: tuple[TimeShare, ...] = ()
     regions: tuple[Region, ...] = ()
-    split: Mapping[str, Split] = field(default_factory=dict)
     whiteness: Mapping[str, float] = field(default_factory=dict)
     tempering: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Change(Document):
-    """An error without effects and with them."""
-
-    before: float = math.nan
-    after: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class RunChange(Change):
-    """The rms error of predictions from the first state to the end of each run."""
-
-    unit: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,25 +90,11 @@ class Gap(Document):
     after: float = math.nan
     floor: float = math.nan
     held_out: bool = False
-    channels: Mapping[str, Change] = field(default_factory=dict)
 
     @property
     def measured(self) -> bool:
         """Whether the document contains a gap."""
         return self != Gap()
-
-
-@dataclass(frozen=True, eq=False)
-class UtilityPrediction(Document):
-    """Rms error of predicted utilities of whole trials, without the effects and with them."""
-
-    trials: int = 0
-    unit: str = field(metadata=BRIEF, default="")
-    before: float = math.nan  # NaN: the predicted run diverged
-    after: float = math.nan
-    spread: float = field(metadata=BRIEF, default=math.nan)  # std of the real utilities
-    mean: float = field(metadata=BRIEF, default=math.nan)
-    feedback: bool = False  # the trials had feedback, which the predictions lack
 
 
 @dataclass(frozen=True, eq=False)

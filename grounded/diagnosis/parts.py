@@ -23,8 +23,6 @@ from grounded.diagnosis.error_report import (
     Region,
     Remainder,
     RulerRow,
-    RunChange,
-    UtilityPrediction,
     Where,
 )
 from grounded.diagnosis.errors_told import objection
@@ -96,7 +94,6 @@ class Ranked(Document):
     gap_after: float = math.nan
     shrinkage: float = math.nan  # share of the gap that it closes
     claimed: bool = False
-    no_better: bool = False  # likely by evidence, but predicts held-out trials no better
 
     @property
     def values(self) -> dict[str, float]:
@@ -244,8 +241,6 @@ class Diagnosed(Document):
     lookalikes: tuple[Likeness, ...] = ()  # effects with nearly the signal of a claimed one
     acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
     gap: Gap = field(default_factory=Gap)
-    utility_prediction: UtilityPrediction | None = None  # if the subject was a task
-    whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
     unconfirmed: tuple[Unconfirmed, ...] = ()  # likely effects that are not claimed
     correction: Correction | None = None  # if there is a leftover
@@ -259,7 +254,6 @@ class Diagnosed(Document):
     per_trial: tuple[TrialValue, ...] = ()
     agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
-    unchanged: tuple[Changed, ...] = field(metadata=BRIEF, default=())  # between two groups
     trials: int = 0
     motions: int = field(metadata=BRIEF, default=0)  # number of groups
     groups: tuple[TrialGroup, ...] = ()  # trials that differ in motion or condition

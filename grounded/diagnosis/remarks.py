@@ -68,8 +68,6 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
     if (curve := d.correction) is not None and curve.adoptable:
         state, gain = curve.channel, curve.held_out_gain
         yield found("gap.correction", state, over=curve.over, gain=gain, state=state)
-    if likely := [row.effect for row in d.ranking if row.no_better]:
-        yield found("gap.no_better", *likely)
     if odd := in_the_log(d.preflight):
         yield found("gap.corrected", *(one.signal for one in odd))
 

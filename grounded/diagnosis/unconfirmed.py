@@ -2,15 +2,12 @@
 
 The same holds for an effect that shows in one repeated motion only. They are
 never claimed. Each is reported with the trial, the time and the region that show it, which is
-where a further trial should go. An effect that is likely in most trials and yet improves no
-held-out prediction points to a flaw of the likelihood: it is marked in the table, so that its
-evidence is not taken for a cause.
+where a further trial should go.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,8 +15,8 @@ import numpy as np
 from grounded import places
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.explored import no_limits
-from grounded.diagnosis.likelihood.levels import NATS, SURE
-from grounded.diagnosis.parts import Ranked, Unconfirmed
+from grounded.diagnosis.likelihood.levels import SURE
+from grounded.diagnosis.parts import Unconfirmed
 from grounded.diagnosis.validation.acting import acting
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
@@ -108,14 +105,6 @@ def _anywhere(effect: Effect) -> Sequence[str]:
     """
     where = places.position(effect.site.model)
     return () if len(where) < 2 or isinstance(effect.family, RateFamily) else where
-
-
-def marked(ranking: Sequence[Ranked], likely: Collection[str]) -> tuple[Ranked, ...]:
-    """Mark effects that are likely and yet do not improve held-out predictions."""
-    return tuple(
-        replace(r, no_better=r.effect in likely and not r.claimed and not r.evidence < NATS)
-        for r in ranking
-    )
 
 
 def _stretch(more: Array) -> Any:

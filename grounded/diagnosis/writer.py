@@ -12,14 +12,12 @@ from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
     AT_MOST,
-    Change,
     ChannelShare,
     Credit,
     Gap,
     Identifiable,
     Remainder,
     RulerRow,
-    UtilityPrediction,
     Where,
     furthest,
 )
@@ -29,17 +27,30 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.next_step import next_step
-from grounded.diagnosis.parts import Estimate, NoiseLevels, Ranked, Score, TrialGroup, Verdict
+from grounded.diagnosis.parts import (
+    Changed,
+    Estimate,
+    NoiseLevels,
+    Ranked,
+    Score,
+    TrialGroup,
+    Verdict,
+)
 from grounded.diagnosis.remarks import remarks
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.unconfirmed import marked, unconfirmed
-from grounded.diagnosis.validation.agreement import Compared, by_trial
+from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision
-from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.validation.limits import Limits, identifiable
-from grounded.diagnosis.validation.measured import Measured, root_mean_square
-from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
+from grounded.diagnosis.validation.measured import Measured
+from grounded.diagnosis.validation.prediction_error import (
+    by_region,
+    by_time,
+    explained,
+    gap_of,
+    horizon,
+)
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import acting_order, wrapping_order
 from grounded.findings import Finding, found
@@ -82,19 +93,18 @@ class Writer:
         self.claims = Claims(decision, self.measured.credit, known, ruler, uncertain)
         self.left, self.uncertain = self.measured.left, uncertain
 
-    def diagnosis(self, apart: Compared | None = None) -> Diagnosis:
+    def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
         data, predictor = self.data, self.predictor
         self.tick("gap")
         where = horizon(predictor, self.best, self.ahead)
-        bare = self.decision.crude.states  # a prediction starts from its own hypothesis' states
-        shrunk = shrinkage(predictor, self.best, bare, where)
+        before = gap_of(predictor, self.decision.crude, where)
         gain = explained(predictor, Hypothesis(), self.best)
         if self.left:
             i = data.model.state_names.index(self.left[0].channel)
             gain = gain.copy()
             gain[..., i] += self.left[0].improvement
-        ranking = self.claims.ranking(where, shrunk.gap_before)
+        ranking = self.claims.ranking(where, before)
         groups = self.claims.groups()
         same = self.claims.equivalent(groups)
         alike = self.claims.nearly(groups)
@@ -108,8 +118,6 @@ class Writer:
             gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
         channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
         seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
-        told = {one.effect for one in seen}.union(*groups)
-        ranking = marked(ranking, {one.name for one in self.decision.doubtful} - told)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         moved, parameters = len(data.groups), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
@@ -135,7 +143,6 @@ class Writer:
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best))
                 if located
                 else (),
-                split=measured.split(),
                 whiteness=measured.whiteness,
                 tempering=self.search.tempering.factor,
             ),
@@ -147,14 +154,11 @@ class Writer:
             gap=Gap(
                 horizon_s=where.steps * data.dt,
                 unit="noise-normalised rms",
-                before=shrunk.gap_before,
-                after=shrunk.gap_after,
+                before=before,
+                after=gap_of(predictor, self.best, where),
                 floor=1.0,
                 held_out=self.ruler.held_out,
-                channels=self.by_channel(shrunk.before, shrunk.after, where.spread),
             ),
-            utility_prediction=self.utility_prediction(bare),
-            whole_run=measured.whole_run(),
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
@@ -166,8 +170,7 @@ class Writer:
             credit=credit,
             per_trial=values,
             agreement=agreement,
-            changed=apart.changed if apart else None,
-            unchanged=apart.unchanged if apart else (),
+            changed=apart,
             trials=data.count,
             motions=moved,
             groups=tuple(
@@ -271,15 +274,6 @@ class Writer:
         ]
         return tuple(sorted(found, key=lambda one: -np.nan_to_num(one.share)))
 
-    def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Change]:
-        """The gap of each state, noise-normalised."""
-        found = {}
-        for i, name in self.shown:
-            found[name] = Change(
-                *(float(root_mean_square(e[:, i] / spread[:, i])) for e in (before, after))
-            )
-        return found
-
     def noise(self) -> NoiseLevels:
         """The noise as it was estimated."""
         noise = self.best.noise
@@ -291,14 +285,6 @@ class Writer:
             correlation_s=np.nan if tau is None else tau,
             outliers=not isinstance(noise.weight_v, float),
         )
-
-    def utility_prediction(self, bare: Any) -> UtilityPrediction | None:
-        """Rms errors of predicted utilities, held out; None for a bare model."""
-        if self.task is None:
-            return None
-        self.tick("utility")
-        found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
-        return replace(found.summary(), feedback=self.task.feedback)
 
 
 def _tracked(task: Task) -> tuple[str, ...]:

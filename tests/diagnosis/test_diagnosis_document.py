@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import Gap, Region, Remainder, UtilityPrediction, Where
+from grounded.diagnosis.error_report import Gap, Region, Remainder, Where
 from grounded.diagnosis.parts import Estimate, Made, Ranked, Verdict
 from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library
@@ -72,8 +72,6 @@ def diagnoses() -> st.SearchStrategy[Diagnosis]:
         where=st.builds(Where, whiteness=many),
         ranking=st.lists(rankings(), max_size=2).map(tuple),
         gap=st.builds(Gap, NUMBERS, NAMES, NUMBERS, NUMBERS, NUMBERS, st.booleans()),
-        utility_prediction=st.none()
-        | st.builds(UtilityPrediction, st.integers(0, 9), NAMES, NUMBERS, NUMBERS, NUMBERS),
         leftover=st.lists(remainders(), max_size=2).map(tuple),
         parameters=st.dictionaries(NAMES, estimates(), max_size=2),
         made=st.none() | made,
@@ -119,7 +117,7 @@ def test_an_older_document_is_read_with_what_it_has():
         {"verdict": {"kind": "none"}, "gap": {"before": "much"}},
         {"verdict": {"kind": "none"}, "trials": 1e400},
         {"verdict": {"kind": "none"}, "diagnosed": {"adopted": [{"c": 1.0}]}},
-        {"verdict": {"kind": "none"}, "where": {"split": {"horizon": None}}},
+        {"verdict": {"kind": "none"}, "where": {"channels": [None]}},
     ],
 )
 def test_what_is_no_diagnosis_is_refused(document):

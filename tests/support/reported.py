@@ -38,17 +38,6 @@ DIAGNOSIS: dict[str, Any] = {
         "channels": [{"name": "v", "share": 0.9, "rms": 0.2, "unit": "m/s"}],
         "times": [{"from": 0.0, "to": 1.0, "share": 0.6}],
         "regions": [{"when": "v > 0.5", "share": 0.7, "occupancy": 0.3}],
-        "split": {
-            key: {
-                "horizon_s": seconds,
-                "all": {"explained": 0.905, "unexplained": 0.004, "irreducible": 0.091},
-                "channels": [
-                    {"name": "v", "explained": 0.8, "unexplained": 0.05, "irreducible": 0.15}
-                ],
-                "irreducible_from": "noise",
-            }
-            for key, seconds in (("one_step", 0.05), ("horizon", 1.0), ("whole_run", 2.0))
-        },
         "whiteness": {"x": 0.4, "v": 0.0002},
     },
     "ranking": [
@@ -70,7 +59,6 @@ DIAGNOSIS: dict[str, Any] = {
         "floor": 1.0,
         "held_out": True,
     },
-    "utility_prediction": {"trials": 5, "before": 3.21, "after": 0.0456, "spread": 1.5},
     "lookalikes": [
         {"effect": "viscous_friction:v", "like": "quadratic_drag:v", "share": 0.96},
         {"effect": "viscous_friction:v", "like": "coulomb_friction:v", "share": 0.8},

@@ -20,7 +20,8 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.prediction_error import Horizon, errors
+from grounded.diagnosis.validation.ahead import missed
+from grounded.diagnosis.validation.prediction_error import Horizon
 from grounded.effects import Library
 from grounded.effects.correction import KNOTS, bells
 from grounded.frozen import Array
@@ -113,11 +114,12 @@ def _judged(
         at = np.flatnonzero(of_start == trial)
         if not len(at):
             continue
-        part = Horizon(where.steps, where.at[at], where.run[at], where.spread[at])
-        before, after = (
-            float(np.nanmean((errors(predictor, one, fit.states, part) / part.spread) ** 2))
+        start, which = (where.at[at], where.run[at], where.steps), np.zeros(len(at), int)
+        off = [
+            missed(predictor, [one], which, fit.states, *start)[-1] / where.spread[at]
             for one in (h, _with(h, predictor, channel, curves, own))
-        )
+        ]
+        before, after = (float(np.nanmean(each**2)) for each in off)
         gains.append(1 - after / before)
     if not gains:  # no trial is long enough to judge it
         return None

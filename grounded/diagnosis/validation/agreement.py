@@ -139,15 +139,7 @@ def _goes_with(data: Data, some: Any, own: Array) -> str:
     return f"{'rises' if ties[best] > 0 else 'falls'} with {best}"
 
 
-@dataclass(frozen=True)
-class Compared:
-    """A comparison of two groups of trials: the values that differ, and those that do not."""
-
-    changed: tuple[Changed, ...]
-    unchanged: tuple[Changed, ...]
-
-
-def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> Compared:
+def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> tuple[Changed, ...]:
     """Return what differs between two groups of trials, largest evidence first.
 
     An effect of one group alone may be too weak to be claimed on all trials. So the likeliest
@@ -162,13 +154,13 @@ def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> C
     fits += [fit for size in (1, 2) for fit in search.of_size(size)[:RIVALS]]
     found = [_compared(fit, search.data, first) for fit in fits]
     worth = [
-        search.score(fit) + sum(one.evidence - CHANGE for one in some.changed)
+        search.score(fit) + sum(one.evidence - CHANGE for one in some)
         for fit, some in zip(fits, found, strict=True)
     ]
     return found[int(np.nanargmax(worth))]
 
 
-def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
+def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> tuple[Changed, ...]:
     """Compare two groups under one hypothesis; held-out trials must support each change."""
     from scipy.special import chdtrc
 
@@ -186,7 +178,7 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
         found.append(k)
         taken = [*taken, k]
         left = {c: _difference(fit, group, taken, c, units) for c in values if c not in taken}
-    told = {k: _difference(fit, group, [c for c in taken if c != k], k, units) for k in values}
+    told = {k: _difference(fit, group, [c for c in taken if c != k], k, units) for k in found}
 
     def row(k: int) -> Changed:
         one, seen = values[k], told[k]
@@ -197,8 +189,7 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> Compared:
         chance = float(chdtrc(1, 2 * seen.evidence))
         return Changed(one.effect, one.quantity, a, b, seen.evidence, chance)
 
-    known = [k for k in values if k not in found and np.isfinite(told[k].stds).all()]
-    return Compared(tuple(map(row, found)), tuple(map(row, known)))
+    return tuple(map(row, found))
 
 
 def _units(trial_of: Array, group: Array) -> Array:

@@ -12,13 +12,27 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.likelihood.carried import stepper
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
 from grounded.diagnosis.likelihood.marching import LONG, marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
 FAR = 1e6  # size of a state above which it has diverged
+
+
+def by_fold(data: Data, fit: Fitted) -> tuple[list[Hypothesis], Any]:
+    """Return a fit's hypothesis for each fold, with values from the others; the fold of each run.
+
+    Without values, or a second fold, it is one hypothesis for all runs.
+    """
+    h, (folds, of_run) = fit.hypothesis, np.unique(data.folds, return_inverse=True)
+    if len(folds) < 2 or not (h.effects or h.spread > 0):
+        return [h], np.zeros_like(of_run)
+    shifts, _ = leave_one_out(fit, data.folds)
+    return [moved(data, h, shift) for shift in shifts], of_run
 
 
 def missed(

@@ -31,10 +31,9 @@ from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.blame import STILL, Blame, moved_parameters
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.decide import Decision
-from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.measured import ordered
-from grounded.diagnosis.validation.prediction_error import normalised
+from grounded.diagnosis.validation.prediction_error import gap_of
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.frozen import Array
@@ -118,9 +117,7 @@ class Claims:
         """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
         rows: list[Ranked] = []
         parts = self.parts()
-        after = normalised(
-            held_out_errors(self.predictor, self.best, self.best.states, where), where
-        )
+        after = gap_of(self.predictor, self.best, where)
         for name in ordered(self.credit, self.names):
             claimed = not self.known.no_cause
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
@@ -128,7 +125,7 @@ class Claims:
         listed = [row.effect for row in rows]
         for name, (fit, evidence) in self.tied(parts).items():
             if name not in listed:
-                gap = gaps_of(self.predictor, [fit], where)[0]
+                gap = gap_of(self.predictor, fit, where)
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
         others = (f for f in self.search.of_size(1) if f.hypothesis.names[0] not in listed)
@@ -138,10 +135,8 @@ class Claims:
             if math.isfinite(self.search.score(f)) and not no_limits(self.data, f.hypothesis)
         )
         sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
-        singles = list(islice(sized, max(RANKED - len(rows), 3)))
-        gaps = gaps_of(self.predictor, singles, where)
-        for fit, gap in zip(singles, gaps, strict=True):
-            name = fit.hypothesis.names[0]
+        for fit in islice(sized, max(RANKED - len(rows), 3)):
+            name, gap = fit.hypothesis.names[0], gap_of(self.predictor, fit, where)
             evidence = self.search.score(fit) - self.base
             rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
         return tuple(rows)

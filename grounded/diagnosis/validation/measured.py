@@ -3,9 +3,6 @@
 Errors above the floor are reported as a leftover, whatever is claimed. A correction by a flexible
 regression counts as a leftover if predictions gain by it; what it predicts is not noise, so the
 floor is lowered to what it reaches.
-
-The mean squared error is split into what the diagnosis removes on held-out trials, what it leaves
-above the noise, and the noise floor, which no model predicts (`split`).
 """
 
 from __future__ import annotations
@@ -23,14 +20,10 @@ from grounded.diagnosis.error_report import (
     AT_MOST,
     BOUNDS,
     SURE,
-    ChannelParts,
     Credit,
     Part,
-    Parts,
     Remainder,
     RulerRow,
-    RunChange,
-    Split,
 )
 from grounded.diagnosis.hypotheses.leftover import Leftover, whiteness
 from grounded.diagnosis.likelihood.delays import delays_of
@@ -307,28 +300,6 @@ class Measured:
         region = regions[0] if regions else None
         return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
 
-    def split(self) -> dict[str, Split]:
-        """Return explained, unexplained, irreducible parts of one step, the horizon, a trial."""
-        steps, dt = self.ruler.steps, self.data.dt
-        rows = {"one_step": 0, "horizon": len(steps) - 1, "whole_run": len(steps)}
-        seconds = [*(k * dt for k in steps), float(np.median(self.data.lengths)) * dt]
-        before, after = self.rms(self.decision.crude), self.rms(self.best)
-        carried = "at most" if self.at_most else "noise"
-        source = carried if self.source == "short horizon" else self.source
-        unsure = self.unsure.max(axis=1)
-        return {
-            key: split(
-                seconds[k], self.units, before[k], after[k], self.floor[k], source, unsure[k]
-            )
-            for key, k in rows.items()
-        }
-
-    def whole_run(self) -> dict[str, RunChange]:
-        """Return the errors of predictions of whole trials, before and after."""
-        before, after = self.rms(self.decision.crude)[-1], self.rms(self.best)[-1]
-        rows = zip(self.units.items(), before, after, strict=True)
-        return {n: RunChange(float(b), float(a), unit) for (n, unit), b, a in rows}
-
 
 def root_mean_square(error: Any) -> Any:
     """Return the rms along the first axis, NaN for a state that was never measured."""
@@ -356,51 +327,3 @@ def credited(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dic
 def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
     """Return names by their credit, largest first."""
     return sorted(names, key=lambda name: -shares_.get(name, 0.0))
-
-
-def shares(before: Array, after: Array, floor: Array) -> Array:
-    """Return the explained, unexplained and irreducible shares of mean squared errors, (3, ...).
-
-    Args:
-        before: mean squared errors of the crude model.
-        after: those of the diagnosed model.
-        floor: those of noise alone.
-    """
-    after = np.minimum(after, before)
-    floor = np.minimum(floor, after)
-    return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
-
-
-def split(
-    horizon_s: float,
-    units: dict[str, str],
-    before: Array,
-    after: Array,
-    floor: Array,
-    source: str,
-    unsure: float = 0.0,
-) -> Split:
-    """Return the parts of the error at one horizon.
-
-    Args:
-        horizon_s: how far ahead [s].
-        units: {channel: unit}, in order.
-        before: rms error of the crude model (n,).
-        after: rms error of the diagnosed model (n,).
-        floor: rms error of noise alone (n,); NaN where it is not known.
-        source: how the floor was determined.
-        unsure: standard deviation of the floor's logarithm.
-    """
-    unknown = np.isnan(floor) & ~np.isnan(before)
-    squares = [np.nan_to_num(rms) ** 2 for rms in (before, after, floor)]
-    each = shares(*squares)
-    each[1:, unknown] = np.nan
-    unit = squares[0] if unknown.any() else squares[2]  # of each state's errors
-    scale = 1 / np.maximum(unit, 1e-9 * np.maximum(squares[0], 1e-300))
-    whole = shares(*(np.asarray((scale * part).sum()) for part in squares))
-    whole[1:] += np.nan if unknown.any() else 0.0
-    channels = tuple(
-        ChannelParts(name, unit, float(np.nan_to_num(before[i])), *map(float, each[:, i]))
-        for i, (name, unit) in enumerate(units.items())
-    )
-    return Split(horizon_s, Parts(*map(float, whole)), channels, source, unsure)

@@ -18,12 +18,12 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Region, TimeShare
 from grounded.diagnosis.hypotheses.leftover import filter_of
-from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.validation.ahead import by_fold, missed
 from grounded.filter import kalman
 from grounded.frozen import Array
 
@@ -97,24 +97,20 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
     return np.asarray(np.sqrt(variance + R[at + steps, run]))
 
 
-def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:
-    """Return measurement minus prediction at the horizon, (M, n); NaN where not measured."""
-    data = predictor.data
-    x = track[where.at, where.run]
-    u, t = predictor.inputs(h)[..., : data.model.m], data.time
-    delays = delays_of(h, data)
-    oldest = 0 if delays is None else delays.oldest  # oldest state that delayed sensors may show
-    path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
-    advance = stepper(predictor, h)
-    for j in range(where.steps):
-        index = (where.at + j, where.run)
-        x = np.clip(advance(x, u[index], t[index]), -1e6, 1e6)
-        path.append(x)
-    offset = predictor.offset(h, np.stack(path))
-    last = x if isinstance(offset, float) else x + offset[-1]
-    index = (where.at + where.steps, where.run)
-    error = data.model.difference(data.y[index], last)
-    return np.where(data.seen[index] > 0, error, np.nan)
+def errors(predictor: Predictor, fit: Fitted, where: Horizon) -> Array:
+    """Return the errors of each fold of the trials with values from the others, (M, n).
+
+    They are measurements minus predictions at the horizon; NaN where not measured.
+    """
+    each, of_run = by_fold(predictor.data, fit)
+    at, run = where.at, where.run
+    off = missed(predictor, each, of_run[run], fit.states, at, run, where.steps)
+    return np.asarray(off[-1])
+
+
+def gap_of(predictor: Predictor, fit: Fitted, where: Horizon) -> float:
+    """Return the held-out gap that a fit leaves, from its own filtered states."""
+    return normalised(errors(predictor, fit, where), where)
 
 
 def normalised(error: Array, where: Horizon) -> float:

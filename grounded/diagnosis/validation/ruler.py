@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.validation.ahead import at_steps, missed, unseen
+from grounded.diagnosis.validation.ahead import at_steps, by_fold, missed, unseen
 from grounded.diagnosis.validation.gain import Comparison, Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
@@ -55,8 +55,7 @@ class Ruler:
     def __init__(self, predictor: Predictor, origin: Task | None = None) -> None:
         self.predictor, self.data, self.origin = predictor, predictor.data, origin
         data = self.data
-        self.folds = data.folds
-        self.held_out = len(np.unique(self.folds)) > 1
+        self.held_out = len(np.unique(data.folds)) > 1
         longest = int(data.lengths.max())
         fast = data.dt < SLOW
         steps = (1, *(max(1, round(s / data.dt)) for s in SECONDS)) if fast else STEPS
@@ -141,13 +140,9 @@ class Ruler:
         return self._measured[id(fit)][1]
 
     def _errors(self, fit: Fitted) -> Errors:
-        data, h, found = self.data, fit.hypothesis, self._none()
-        each, of_run = [h], np.zeros(len(data.valid), int)
-        if self.held_out and (h.effects or h.spread > 0):
-            shifts, _ = leave_one_out(fit, self.folds)
-            each = [moved(data, h, shift) for shift in shifts]
-            of_run = np.unique(self.folds, return_inverse=True)[1]
-        self._add(found, each, of_run, fit.states, unseen(self.predictor, h))
+        found = self._none()
+        each, of_run = by_fold(self.data, fit)
+        self._add(found, each, of_run, fit.states, unseen(self.predictor, fit.hypothesis))
         return found
 
     def _none(self) -> Errors:

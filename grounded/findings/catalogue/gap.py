@@ -90,11 +90,6 @@ ENTRIES: dict[str, Entry] = {
         "how much of the error of {state} is noise is not known",
         "repeat one run to know it",
     ),
-    "no_better": Entry(
-        "note",
-        "{about} alone {about:is/are} likely, but predictions do not clearly improve with "
-        "{about:it/them}",
-    ),
     "correction": Entry(
         "note",
         "a curve over {over} predicts {gain:%} of what no effect explains: no cause, but "

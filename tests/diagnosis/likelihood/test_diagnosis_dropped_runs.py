@@ -11,9 +11,8 @@ from grounded.diagnosis.likelihood import data as diagnosis_data
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.held_out import utility_prediction
 from grounded.diagnosis.validation.ruler import Ruler, _uneven, repeated
-from small_tasks import DT, pushed_cart, pushed_cart_task
+from small_tasks import DT, pushed_cart
 
 STEPS = 450  # three runs of 150 steps
 
@@ -54,15 +53,6 @@ def test_of_long_data_two_runs_of_one_candidate_are_kept_from_their_beginning(kn
     data = prepare(predictor.data.model, ran)
     begins = data.trial_of[data.time[0] == 0.0]
     assert {1, 2} <= {*begins.tolist()} and len(data.valid) == 7
-
-
-def test_a_utility_is_predicted_from_the_trials_own_start(known):
-    predictor, fit, trials = known
-    task = pushed_cart_task(predictor.data.model, STEPS)
-    found = utility_prediction(predictor, fit, fit.states, task, trials)
-    assert len(found.real) == 3  # of trial 2 the beginning was left out
-    np.testing.assert_allclose(found.before, found.real, rtol=1e-9)
-    np.testing.assert_allclose(found.after, found.real, rtol=1e-9)
 
 
 def test_repeats_are_compared_at_the_same_time(known):
@@ -156,11 +146,3 @@ def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
     assert data.skipped == 14
     beginnings, busiest = {0, 5, 15}, {3, 11, 19}  # the busiest of each group of neighbours
     assert set(number.tolist()) == beginnings | busiest
-
-
-def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
-    predictor, fit, trials = known
-    task = pushed_cart_task(predictor.data.model, STEPS // 3)
-    assert not len(utility_prediction(predictor, fit, fit.states, task, trials).real)
-    own = [replace(trial, candidate="c0001") for trial in trials]  # recorded for longer
-    assert len(utility_prediction(predictor, fit, fit.states, task, own).real) == 3

@@ -11,9 +11,8 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
-from grounded.diagnosis.validation.held_out import held_out_errors
 from grounded.diagnosis.validation.limits import knowable
-from grounded.diagnosis.validation.prediction_error import horizon, normalised
+from grounded.diagnosis.validation.prediction_error import errors, horizon, normalised
 from grounded.effects import Library
 from grounded.filter import kernels
 from grounded.filter.augmented import Delayed, coloured
@@ -319,7 +318,7 @@ def test_a_late_sensor_is_found_where_the_state_is_disturbed(sensor, shown, star
     assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
     assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
     where = horizon(search.predictor, fit, 0.5)
-    error = held_out_errors(search.predictor, fit, fit.track, where)
+    error = errors(search.predictor, fit, where)
     of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
     assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from grounded.diagnosis.error_report import Split
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis
@@ -22,7 +21,6 @@ from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import DIAGNOSE
 
 NO_TRIAL = "Nothing to diagnose yet: no trial and no log of data is stored."
-HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
 def gap_section(findings: Findings) -> list[Block]:
@@ -57,7 +55,7 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
         alike = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
         found.append(Block("heading", "Look-alikes, with the share of the signal they reproduce"))
         found.append(table("lookalikes", ("claimed effect", "look-alike ", "share"), alike))
-    return found + _by_trial(diagnosis) + leftover_table(diagnosis) + _made_of(diagnosis)
+    return found + _by_trial(diagnosis) + leftover_table(diagnosis)
 
 
 def _by_trial(diagnosis: Diagnosis) -> list[Block]:
@@ -75,28 +73,3 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     strong = [i for i, p in enumerate(found) if not p.agrees]
     each = table("per-trial", header, rows, strong)
     return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))] * bool(found)
-
-
-def _made_of(diagnosis: Diagnosis) -> list[Block]:
-    """The squared error of held-out predictions in three parts, by horizon."""
-    rows = []
-    away = any(row.runs_away for row in diagnosis.prediction_error if row.whole_trial)
-    for key, words in HORIZONS.items():
-        split = diagnosis.where.split.get(key)
-        if split is not None and not (away and key == "whole_run"):
-            rows.append((words.format(f"{split.horizon_s:.3g} s"), *_shares(split)))
-    if not any(cell not in ("-", "") for row in rows for cell in row[1:]):
-        return []
-    header = ("ahead", "removed by the causes", "left above the noise", "noise")
-    return [Block("heading", "What the error is made of"), table("split", header, rows)]
-
-
-def _shares(split: Split) -> tuple[str, str, str]:
-    parts = split.whole
-    explained, unexplained, noise = map(
-        percent, (parts.explained, parts.unexplained, parts.irreducible)
-    )
-    if split.bound:
-        return explained, f"≥ {unexplained}", f"≤ {noise}"
-    unsure = "≤ " if split.may_be_noise(parts) else ""
-    return explained, unsure + unexplained, noise
