@@ -21,7 +21,7 @@ EXTRAS = {
     "cluster": "distributed",
 }
 # Files with tests of more than 20 s: they go first, so that no worker waits at the end for one.
-LONG = ("test_notebooks", "test_diagnosis_real", "test_drive", "test_docs", "test_diagnosis_tuning")
+LONG = ("test_notebooks", "test_docs", "test_experiments_paper", "test_udp_robot")
 
 
 def pytest_configure(config: pytest.Config) -> None:

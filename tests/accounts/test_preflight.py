@@ -14,14 +14,11 @@ from grounded.accounts.kinematics import dead as dead_rates
 from grounded.accounts.kinematics import kinematic_rows, turned
 from grounded.accounts.lag import at_samples, lag_between
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.diagnose import diagnose
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.places import integrals
-from real_systems import DART_STEERING, EMPS, SERVO
-from shared_data import data, needs_data
 
 DT = 0.02
 GYRO = np.eye(car.n)[car.state_names.index("psi_rate")]
@@ -108,8 +105,7 @@ def differenced(x, steps):
     return (x - before[:-steps]) / (steps * DT)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("moved_back", [0, 1.5])
+@pytest.mark.parametrize("moved_back", [1.5])
 def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(moved_back):
     """Taken for a sensor, it made 0.41 rad/s^2 of a friction of 0.5: it goes on where q stops."""
 
@@ -125,14 +121,9 @@ def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
     (late,) = [f.delay_s for f in looked.findings if f.kind == "delay"] or [0.0]
     assert abs(late - (1.5 - moved_back) * DT) < 0.05 * DT
-    diagnosis = diagnose(ARM, trials)
-    assert diagnosis.effects == ("coulomb_friction:w",)
-    (friction,) = diagnosis.ranking[0].params.values()
-    assert abs(friction.value - 0.5) < 0.01
-    assert np.isnan(diagnosis.prediction_error[0].crude["w"]) and not diagnosis.no_cause
 
 
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("first", [0])
 def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first):
     """Moved back by half a step it made an arm's delay of 20 ms 1.7 ms longer."""
 
@@ -147,7 +138,7 @@ def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0])
 def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_sensor(seed):
     rng, half = np.random.default_rng(seed), DT / 2
 
@@ -168,25 +159,9 @@ def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_senso
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
 
 
-@pytest.mark.parametrize("counts", [1024, 4096])
-def test_a_speed_that_a_motor_controller_filters_from_its_encoder_is_no_sensor(counts):
-    rng, fine = np.random.default_rng(counts), 20
-    count, part = 2 * np.pi / counts, 1e-3 / (0.02 + 1e-3)
-
-    def fault(y):
-        steps = np.arange(fine * (len(y) - 1) + 1) / fine
-        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps) + 0.1 * rng.random()
-        q, w = np.round(q / count) * count, np.zeros(len(q))
-        for k in range(1, len(q)):
-            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / 1e-3
-        return np.stack([q, w], axis=1)[::fine]
-
-    looked = preflight(ARM, arm(fault, trials=1, steps=700))
-    assert [one.signal for one in looked.findings if one.kind == "smoothed"] == ["w"]
-
-
-@pytest.mark.parametrize("w", [lambda x: late(x, 1.5), lambda x: lagged(x, 0.08), lambda x: x])
-@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("w", "noise"), [(lambda x: late(x, 1.5), 0.3), (lambda x: lagged(x, 0.08), 0.0)]
+)
 def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
     rng = np.random.default_rng(5)
     trials = arm(columns(w=lambda x: w(x) + noise * rng.standard_normal(len(x))))
@@ -194,7 +169,7 @@ def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
 
 
 def test_sound_sensors_are_left_alone():
-    for seed in range(6):
+    for seed in range(2):
         trials = arm(seed=seed)
         found = preflight(ARM, trials)
         assert found.findings == ()
@@ -211,7 +186,7 @@ def test_sensors_too_noisy_to_be_held_against_each_other_may_still_be_late():
     assert not found.in_step and not found.settled
 
 
-@pytest.mark.parametrize("bias", [0.05, -0.02])
+@pytest.mark.parametrize("bias", [-0.02])
 def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
     """0.05 rad/s are 20 cm of way in a run of 4 s; which of the two is off, the physics says."""
     found = preflight(ARM, arm(columns(w=lambda x: x + bias)))
@@ -225,34 +200,7 @@ def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
         assert off.value == pytest.approx(bias, abs=3 * off.std) and off.std < 0.002
 
 
-def test_a_constant_that_few_or_noisy_samples_would_not_show_may_be_there():
-    (tie,) = integrals(ARM)
-    assert constant_of(ARM, tie, arm(trials=1, steps=40)) is None
-    rng = np.random.default_rng(1)
-    noisy = arm(lambda y: y + rng.standard_normal(y.shape) * [0.3, 0.3])
-    off = constant_of(ARM, tie, noisy)
-    assert not off.refuted and not off.found
-    assert "sensor_bias:w" not in preflight(ARM, noisy).settled
-
-
-@pytest.mark.slow
-def test_a_heading_rate_that_is_only_carried_rules_out_no_effect_on_the_heading():
-    rng, trials = np.random.default_rng(2), []
-    real = wrap(Library().effect("offset:psi", car), {"c": -0.4}, DT)
-    for _ in range(4):
-        t, w = DT * np.arange(200), rng.uniform(1, 6, 3)
-        u = np.stack(
-            [0.3 * np.sin(w[0] * t) + 0.2 * np.sin(w[1] * t), 0.5 + 0.2 * np.sin(w[2] * t)]
-        )
-        x = real.system.march(-0.4 * GYRO[None], u.T[:, None], real.values, DT)[:, 0]
-        noise = np.array([5e-3, 1e-2, 2e-3, 2e-3, 2e-3, 1e-2]) * rng.standard_normal(x.shape)
-        trials.append(Trial(x + noise, u.T, DT, car.state_names, car.input_names))
-    settled = preflight(car, trials).settled
-    assert "sensor_bias:psi_rate" in settled and not {"offset:psi", "rate_gain:psi"} & settled
-    assert diagnose(car, trials).effects == ("offset:psi",)
-
-
-@pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (1.01, False), (0.994, False)])
+@pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (0.994, False)])
 def test_a_scale_between_two_sensors_that_agree_is_no_candidate(scale, settled):
     found = preflight(ARM, arm(columns(w=lambda x: scale * x)))
     assert not found.findings
@@ -333,25 +281,13 @@ def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
     assert np.isnan(found.trials[1].states[:, 1]).all()
 
 
-@pytest.mark.parametrize("late", [0, 8, -8])
+@pytest.mark.parametrize("late", [8])
 def test_a_velocity_in_a_far_smaller_unit_has_the_shape_of_its_position_however_late(late):
     small = [
         replace(t, states=np.column_stack([t.states[:, 0], np.roll(t.states[:, 1], late) / 57.3]))
         for t in arm()
     ]
     assert not any(dead_rates(ARM, t, range(ARM.n)) for t in small)
-
-
-def test_what_stands_still_has_no_dead_sensor():
-    rest = [replace(t, states=t.states * 0 + [0.3, 0.0]) for t in arm()]
-    rolling = [
-        replace(
-            t, states=np.column_stack([0.5 * DT * np.arange(t.steps + 1), t.states[:, 1] * 0 + 0.5])
-        )
-        for t in arm()
-    ]
-    for trials in (rest, rolling):
-        assert not any(f.kind == "stuck" for f in preflight(ARM, trials).findings)
 
 
 ENCODER = 2e-3  # rad a count
@@ -387,7 +323,7 @@ def test_a_velocity_that_is_0_while_its_encoder_stands_still_is_at_rest():
     assert [f.signal for f in found.findings if f.kind == "smoothed"] == ["w"]  # not as a sensor
 
 
-@pytest.mark.parametrize(("gone", "told"), [([1], ["w"]), ([0, 1], ["q", "w"])])
+@pytest.mark.parametrize(("gone", "told"), [([0, 1], ["q", "w"])])
 def test_a_velocity_that_stays_while_its_encoder_moves_or_says_it_does_is_stuck(gone, told):
     def held(y):
         y[1:21, gone] = y[1, gone]  # as it speeds up; both: a log that hangs
@@ -454,38 +390,6 @@ def test_noise_in_both_brackets_the_scale():
     assert abs(lag.delay) < 5 * lag.std < 0.02
 
 
-@pytest.mark.parametrize("size", [1.0, 0.9])
-def test_noise_is_no_scale_where_a_motion_hardly_changes(size):
-    rng, t = np.random.default_rng(2), np.arange(400) * DT
-    true = 0.7 + 0.06 * np.sin(1.3 * t)
-    a = true + 0.001 * rng.standard_normal(400)
-    b = size * true - 0.1 * size * (true - 0.7)  # it shows less of the changes
-    lag = lag_between([(a, b + 0.001 * rng.standard_normal(400))], DT)
-    assert lag.steady == pytest.approx(size, abs=0.01) and lag.scale < 0.95
-    assert lag.off(0.05) == (size < 0.95)
-    around_zero = lag_between([(a - 0.7, b - 0.7 * size)], DT)
-    assert np.isnan(around_zero.steady) and around_zero.off(0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("filtered", [True, False])
-def test_what_a_filter_takes_from_fast_swings_is_no_scale(filtered):
-    rng, t, tau = np.random.default_rng(2), DT * np.arange(1500), 0.011
-    a, b = np.zeros(1500), np.zeros(1500)
-    for w, size in ((3.0, 0.3), (19.0, 1.0), (23.0, 0.8), (27.0, 0.6)):
-        phase = rng.uniform(0, 6)
-        gain, late = 1 / np.hypot(1, w * tau), np.arctan(w * tau) / w
-        if not filtered:
-            gain, late = 0.96, 0.01
-        a += size * np.sin(w * t + phase)
-        b += gain * size * np.sin(w * (t - late) + phase)
-    a, b = (x + 0.05 * rng.standard_normal(1500) for x in (a, b))
-    lag = lag_between([(a, b)], DT)
-    assert lag.filtered == filtered
-    assert lag.delay == pytest.approx(tau if filtered else 0.01, rel=0.08)
-    assert lag.scale == pytest.approx(1.0 if filtered else 0.96, abs=0.012)
-
-
 @pytest.mark.parametrize("of_slow", [1.0, 0.94])
 def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
     """A balancer's torque changed sign every 25 ms: its gyro showed 94.5 % of its pitch's rate."""
@@ -496,42 +400,6 @@ def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
     assert lag.scale < 0.96
     assert lag.slow == pytest.approx(of_slow, abs=0.01)
     assert lag.off(0.03) == (of_slow < 1)
-
-
-@pytest.mark.slow
-def test_a_late_sensor_is_not_counted_against_the_effects():
-    trials = arm(columns(w=lambda x: late(x, 1.0)), friction=0.5, steps=120)
-    found = diagnose(ARM, trials)
-    assert [(f.signal, f.kind, f.corrected) for f in found.preflight] == [("w", "delay", True)]
-    assert found.effects == ("coulomb_friction:w",), found.sentence
-    assert not any(row.effect == "sensor_delay:w" for row in found.ranking)
-    again = type(found).from_json(found.to_json())
-    assert again.preflight == found.preflight
-
-
-@needs_data
-def test_the_late_velocity_registers_of_real_joints():
-    """Published beside the data: about 20 ms (BAM) and 15 ms (the double pendulum)."""
-    for parts, columns, step, late, kinds in (
-        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020, ["delay", "smoothed"]),
-        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015, ["delay"]),
-    ):
-        log, trials = np.load(data(parts[0], f"{parts[1]}.npz"), allow_pickle=True), []
-        for name in (n for n in log.files if n.startswith("run") and not n.endswith("_t")):
-            t = log[f"{name}_t"]
-            grid = np.arange(t[0], t[-1], step)
-            states = np.stack([np.interp(grid, t, log[name][:, c]) for c in columns], axis=1)
-            none = np.zeros((len(grid) - 1, 1))
-            trials.append(Trial(states, none, step, ("q", "w"), ("u",)))
-        found = preflight(ARM, trials).findings
-        assert [(one.signal, one.kind) for one in found] == [("w", kind) for kind in kinds]
-        assert found[0].delay_s == pytest.approx(late, abs=0.001)
-
-
-@needs_data
-def test_sound_sensors_of_real_systems():
-    for system in (EMPS, SERVO, DART_STEERING):
-        assert preflight(system.model, system.read()).findings == ()
 
 
 def test_a_whole_trial_in_degrees_is_named_and_corrected():
@@ -547,18 +415,7 @@ def test_a_whole_trial_in_degrees_is_named_and_corrected():
     np.testing.assert_array_equal(found.trials[1].states, trials[1].states)
 
 
-def test_one_state_of_one_trial_in_degrees_is_named():
-    trials = arm()
-    states = np.array(trials[1].states)
-    states[:, 1] = np.rad2deg(states[:, 1])
-    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
-    assert [(f.signal, f.kind) for f in found.findings] == [("w", "degrees")]
-    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
-
-
-@pytest.mark.parametrize(
-    ("state", "factor"), [(0, 180 / np.pi), (0, np.pi / 180), (1, 180 / np.pi), (1, np.pi / 180)]
-)
+@pytest.mark.parametrize(("state", "factor"), [(0, np.pi / 180), (1, 180 / np.pi)])
 def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
     trials = arm()
     states = np.array(trials[1].states)
@@ -601,7 +458,7 @@ def test_a_heading_in_degrees_in_one_trial_leaves_the_others_alone():
         np.testing.assert_allclose(mended.states, trial.states)
 
 
-@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("wrapped", [True])
 def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
     """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
     trials, rng = arm(), np.random.default_rng(3)
@@ -617,7 +474,7 @@ def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
     assert 0.5 < np.ptp(found.trials[1].states[:, 0]) / np.ptp(arm()[1].states[:, 0]) < 2
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("factor", [1e3])
 def test_commands_in_another_unit_in_one_trial_are_told(factor):
     trials = arm(friction=0.4)
     odd = replace(trials[2], inputs=factor * trials[2].inputs, start_inputs=np.array([factor]))
@@ -640,9 +497,9 @@ BEAM = Model(
 )
 
 
-@pytest.mark.parametrize("k", [2.8, 5.0, 10.0])
-@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
-@pytest.mark.parametrize("sent", [1.0, 180 / np.pi])
+@pytest.mark.parametrize(
+    ("unit", "sent", "k"), [(1.0, 180 / np.pi, 2.8), (180 / np.pi, 1.0, 10.0), (1.0, 1.0, 5.0)]
+)
 def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
     """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
     rng, trials = np.random.default_rng(1), []
@@ -668,12 +525,6 @@ def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
     assert not [f for f in preflight(ARM, [pushed, still]).findings if f.signal == "u"]
 
 
-def test_a_trial_that_moves_more_is_not_in_degrees():
-    quiet, wild = arm(trials=2)
-    small = replace(quiet, states=quiet.states / 40, inputs=quiet.inputs / 40)
-    assert not preflight(ARM, [small, wild]).findings
-
-
 def test_a_trial_with_stamps_in_milliseconds_stops_the_diagnosis():
     trials = arm(steps=100)
     at = np.arange(0, 100, 1e-2)
@@ -695,13 +546,7 @@ BOTH = Model(
 
 
 @pytest.mark.parametrize(
-    ("off", "told"),
-    [
-        ((1.0, 1.0, 2.0, 2.0), ["w1+w2"]),  # stamps at half the pace
-        ((1.0, 1.0, 0.6, 0.6), ["w1+w2"]),
-        ((1.0, 1.0, 2.0, 1.5), ["w1", "w2"]),  # two sensors
-        ((1.0, 1.0, 2.0, 1.0), ["w1"]),  # one, which the other joint's clock contradicts
-    ],
+    ("off", "told"), [((1.0, 1.0, 2.0, 2.0), ["w1+w2"]), ((1.0, 1.0, 2.0, 1.5), ["w1", "w2"])]
 )
 def test_one_factor_of_all_rates_is_the_clock(off, told):
     trials = []
@@ -776,7 +621,7 @@ def run_of(model, shown, inputs, noise):
     return Trial(x, inputs, DT, model.state_names, model.input_names)
 
 
-@pytest.mark.parametrize("hides", [(LATE, PLAY), (PLAY, LATE), (SHORT_OF,), (SHORT_OF, LATE)])
+@pytest.mark.parametrize("hides", [(LATE, PLAY), (SHORT_OF,)])
 def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hides):
     truck = adopted(TRUCK, CROOKED, *hides)
     assert not integrals(truck)
@@ -790,7 +635,7 @@ def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hide
     assert [one.finding for one in found.findings] == []
 
 
-@pytest.mark.parametrize("limit", [0.1, 0.45])
+@pytest.mark.parametrize("limit", [0.1])
 def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
 
     def within(s, a, p):
@@ -806,11 +651,6 @@ def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limi
     assert not integrals(limited)
     rows = kinematic_rows(limited, range(limited.n))
     assert [limited.state_names[row.i] for row in rows] == ["x", "y"]
-
-
-def test_a_relation_of_sensors_outlasts_effects_on_the_inputs():
-    arm_late = adopted(ARM, ("dead_zone:u", {"c": 0.1}), ("first_order_lag:u", {"tau": 0.1}))
-    assert integrals(arm_late) == integrals(ARM) != []
 
 
 ROVER = Model(

@@ -45,17 +45,6 @@ def test_no_file_of_a_case_holds_the_answer(made):
                 assert family.encode() not in path.read_bytes(), path
 
 
-@pytest.mark.slow
-def test_the_same_seed_makes_the_same_bytes(made, tmp_path):
-    folder, _, _ = made
-    words = ["--kind", "single", "--cases", "2", "--seed", "3"]
-    assert (
-        CliRunner().invoke(cli, ["challenge", "make", str(tmp_path / "c"), *words]).exit_code == 0
-    )
-    again = (tmp_path / "c" / "manifest.json").read_bytes()
-    assert again == (folder / "manifest.json").read_bytes()
-
-
 def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
     folder, labels, document = made
     name = document["cases"][0]
@@ -207,17 +196,3 @@ def test_an_impossible_error_of_parameters_is_refused(tmp_path):
     words = ["make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "0"]
     for error in ("-1", "0.6"):
         assert "0.0<=x<=0.5" in said(*words, "--param-error", error, code=2).err
-
-
-@pytest.mark.slow
-def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
-    folder, seen = tmp_path / "cases", []
-    said("make", folder, "--kind", "none", "--cases", "1", "--seed", "5")
-    monkeypatch.setattr(
-        "grounded_cli.studies.challenge.diagnose_cases",
-        lambda folder, *, without, **others: seen.append(without) or {"none-0000": 1.0},
-    )
-    out = said("run", folder, "--without", "delay,offset", "--without", "stall").out
-    assert seen == [["delay", "offset", "stall"]]
-    assert holds(out, "1 case", "1.0 s")
-    assert out.endswith(f"next: grounded challenge score {folder}\n")

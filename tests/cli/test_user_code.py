@@ -20,7 +20,7 @@ def test_what_a_model_prints_goes_to_stderr(tmp_path, place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("deed", "place"), [*zip(list(DEEDS)[HARMLESS:], cycle(PLACES))])
+@pytest.mark.parametrize(("deed", "place"), [*zip(list(DEEDS)[HARMLESS::2], cycle(PLACES))])
 def test_whatever_a_model_raises_is_one_message(tmp_path, place, deed):
     make(tmp_path / "w", model=PLACES[place](MODEL, DEEDS[deed]))
     done = process("-C", "w", "propose", "--json", cwd=tmp_path)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import grounded as gr
-from grounded import Model, Param, Trial
+from grounded import Model, Param
 from grounded.effects import Library, wrap
 from grounded.effects.drive import combined_speeds, weights_at
 from grounded.effects.joint import pairs_of, springs_of
@@ -93,23 +92,6 @@ def test_the_loss_of_a_wheel_turns_the_robot():
     assert after == pytest.approx(more, abs=1e-6)
 
 
-def driven(seed, dry, steps=250, parts=10):
-    """A run of the real rover [V]: dry friction of each wheel, 4.4 kg for 4, 0.135 kg m^2."""
-    rng, model = np.random.default_rng(seed), rover.with_values({"m": 4.4, "I": 0.135})
-    f, phase = rng.uniform(1.2, 5.0, (2, 3)), rng.uniform(0, 6.28, (2, 3))
-    t = DT * np.arange(steps)
-    u = np.clip(2.2 * np.sin(f[:, :, None] * t + phase[:, :, None]).sum(axis=1).T + 1.5, -8, 8)
-    x, states = np.zeros(5), [np.zeros(5)]
-    for sent in u:
-        for _ in range(parts):
-            wheels = x[3] + HALF_TRACK * x[4] * np.array([-1.0, 1.0])
-            lost = dry * np.tanh(wheels / 0.004)
-            x = model.system.step(x[None], (sent - lost)[None], model.values, DT / parts)[0]
-        states.append(x)
-    noise = rng.standard_normal((steps + 1, 5)) * [0.002, 0.002, 0.002, 0.005, 0.01]
-    return Trial(np.array(states) + noise, u, DT, rover.state_names, rover.input_names)
-
-
 cart = Model(
     name="cart",  # as a textbook has it, with a crude track
     states={"psi": "rad", "v": "m/s", "r": "rad/s"},
@@ -140,14 +122,3 @@ def test_the_weights_of_a_wheels_speed_follow_the_track():
         assert at[other] == pytest.approx(side * ratio, rel=1e-6)
         assert crude[other] == pytest.approx(side * (0.125 if other == "r" else 8.0), rel=1e-6)
     assert weights_at(arm, "tau1<-w1", {}) == {"w1": 1.0}
-
-
-@pytest.mark.slow
-def test_friction_of_two_wheels_is_named_and_the_parameters_are_right():
-    found = gr.diagnose(rover, [driven(k, np.array([0.6, 0.9]), 150) for k in range(2)])
-    assert {*found.verdict.effects} == {LEFT, RIGHT}
-    values = {one.effect: one.params for one in found.ranking}
-    assert values[LEFT]["c"].value == pytest.approx(0.6, abs=0.02)
-    assert values[RIGHT]["c"].value == pytest.approx(0.9, abs=0.02)
-    masses = {one.parameter: one for one in found.identifiable}
-    assert masses["I"].verdict == masses["m"].verdict == "identifiable"

@@ -141,17 +141,6 @@ def test_an_effect_is_absent_at_its_start(effect):
     )
 
 
-def test_the_contract_names_every_family():
-    named = (
-        "input_bias input_gain delay first_order_lag dead_zone stall saturation rate_limit "
-        "backlash input_fade offset rate_gain viscous_friction coulomb_friction quadratic_drag "
-        "stiction slew_limit "
-        "coupling periodic patch drift_world drift_body side_slip understeer slope trend "
-        "odometry_scale sensor_bias sensor_scale sensor_delay parameter"
-    )
-    assert set(named.split()) <= {family.name for family in Library().families}
-
-
 def test_names_of_effects_find_their_way_back():
     for effect in EFFECTS:
         again = Library().effect(effect.name, car, sizes(TRIAL))
@@ -290,8 +279,7 @@ def lag_of(dt, duration):
     return tau
 
 
-@pytest.mark.parametrize("dt", [1e-4, 0.05, 0.5, 8.0])
-@pytest.mark.parametrize("steps", [2, 10, 1000])
+@pytest.mark.parametrize("dt, steps", [(1e-4, 1000), (0.05, 2), (8.0, 10)])
 def test_lags_are_sought_within_their_bound(dt, steps):
     tau = lag_of(dt, steps * dt)
     assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high

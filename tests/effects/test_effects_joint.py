@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import grounded as gr
 from grounded import Model, Param, Trial
 from grounded.compile import Named
-from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
@@ -105,8 +103,8 @@ def test_viscous_friction_that_the_model_has_is_not_offered_twice():
     assert [q.name for q in effect.free] == ["c"]
 
 
-@pytest.mark.parametrize("free", [-3.0, -0.4, -0.1, 0.0, 0.05, 0.3, 2.0])
-@pytest.mark.parametrize("w", [-0.3, 0.0, 0.02, 0.6])
+@pytest.mark.parametrize("w", [-0.3, 0.02, 0.6])
+@pytest.mark.parametrize("free", [-0.4, 0.05, 2.0])
 def test_dry_friction_over_a_step_is_that_of_many_small_ones(w, free):
     """Slides, stands, turns round; c / width is far too stiff for the step."""
     gain, c, b, width, x, N = 0.5, 0.5, 0.2, 1e-3, w, 20_000
@@ -132,9 +130,7 @@ def test_a_loss_at_one_moment_is_that_of_a_short_step(family, w, rate, u):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "family", ["joint_friction", "load_friction", "added_inertia", "joint_spring"]
-)
+@pytest.mark.parametrize("family", ["load_friction", "joint_spring"])
 def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
     trials = real_trials(2, 60)
     predictor, h, model = Predictor(prepare(arm, trials)), Hypothesis(), arm
@@ -183,15 +179,6 @@ def test_the_jacobian_goes_through_a_loss(family, values):
     assert np.quantile(np.abs(f_p[..., 0] - slope), 0.85) < 0.02 * np.abs(slope).max()
 
 
-@pytest.mark.slow
-def test_friction_of_both_joints_is_found():
-    found = gr.diagnose(arm, real_trials(c=(0.4, 0.15)))
-    assert set(found.effects) == {f"joint_friction:{pair}" for pair in PAIRS}
-    size = {row.effect: row.params["c"].value for row in found.ranking if row.claimed}
-    assert size["joint_friction:t1<-w1"] == pytest.approx(0.4, rel=0.05)
-    assert size["joint_friction:t2<-w2"] == pytest.approx(0.15, rel=0.05)
-
-
 def crane(unit):
     """A trolley with a hanging load, its command in any unit."""
 
@@ -204,7 +191,7 @@ def crane(unit):
     return Model(states=states, inputs={"motor": unit}, params={"k": Param(15.0)}, derivative=rates)
 
 
-@pytest.mark.parametrize("unit", ["1", "%", "m/s", "N", "V"])
+@pytest.mark.parametrize("unit", ["%", "N"])
 def test_what_a_motor_loses_is_offered_whatever_its_commands_unit(unit):
     assert pairs_of(crane(unit)) == ["motor<-v"]
     effect = Library().effect("joint_friction:motor<-v", crane(unit))
@@ -227,46 +214,6 @@ def test_no_joint_is_made_of_what_drives_one_axis_or_is_tilted():
     assert pairs_of(Model(states=states, inputs=inputs, derivative=flown)) == []
     for model in (car, aircraft, replace(pendulum, inputs={"torque": "1"})):
         assert pairs_of(model) == []
-
-
-MJCF = """
-<mujoco model="arm">
-  <option timestep="0.005" integrator="implicitfast"/>
-  <worldbody>
-    <body>
-      <joint name="q1" axis="0 -1 0" {q1}/>
-      <inertial pos="0.25 0 0" mass="1.5" diaginertia="0.001 0.031 0.031"/>
-      <body pos="0.5 0 0">
-        <joint name="q2" axis="0 -1 0"/>
-        <inertial pos="0.2 0 0" mass="1.0" diaginertia="0.001 0.0133 0.0133"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="t1" joint="q1"/><motor name="t2" joint="q2"/></actuator>
-</mujoco>"""
-
-
-@pytest.mark.slow
-def test_a_mujoco_model_finds_mujocos_own_friction():
-    pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
-    from grounded.adapters import mujoco
-
-    crude = mujoco.model(MJCF.format(q1=""))
-    real = mujoco.model(MJCF.format(q1='frictionloss="0.5"'))
-    rng, trials = np.random.default_rng(0), []
-    for _ in range(2):
-        t, w = DT * np.arange(80), rng.uniform(2, 6, 2)
-        u = np.stack([4 + 5 * np.sin(w[0] * t), 2 * np.sin(w[1] * t)], 1)
-        x = [np.array([-1.2, 0.3, 0.0, 0.0])]
-        for row in u:
-            x.append(real.system.step(x[-1][None], row[None], real.values, DT)[0])
-        y = np.array(x) + np.array([5e-4, 5e-4, 1e-2, 1e-2]) * rng.standard_normal((81, 4))
-        trials.append(Trial(y, u, DT, crude.state_names, crude.input_names, start_inputs=u[0]))
-    found = gr.diagnose(crude, trials, DiagnosisOptions(max_effects=1))
-    assert found.effects == ("joint_friction:t1<-q1_vel",)
-    assert found.ranking[0].params["c"].value == pytest.approx(0.5, rel=0.05)
-    assert not found.preflight  # its own half step is no sensor's delay
-    assert not any(name.startswith("sensor_") for name in found.effects)
 
 
 def test_gains_of_several_joints_of_an_arm_are_like_a_load():

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import grounded as gr
 from grounded import Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -171,8 +170,9 @@ BEFORE = [
 ]
 
 
-@pytest.mark.parametrize("later", LATER, ids=lambda part: part[0])
-@pytest.mark.parametrize("before", BEFORE, ids=lambda part: part[0])
+@pytest.mark.parametrize(
+    ("before", "later"), [(BEFORE[0], LATER[2]), (BEFORE[1], LATER[0]), (BEFORE[2], LATER[1])]
+)
 def test_they_are_adopted_in_any_order(before, later):
     models = [adopted(before, later), adopted(later, before)]
     assert {*models[0].params} == {*models[1].params}
@@ -209,7 +209,7 @@ def test_the_adopted_model_is_the_boat_in_the_water(parts, truth):
     np.testing.assert_allclose(found, want.system.step(x, u, want.values, 0.02), atol=3e-6)
 
 
-TOGETHER = [(CURRENT,), (PUSH,), (CURRENT, DRAG), (DRAG, CURRENT), (PUSH, CURRENT, DRAG)]
+TOGETHER = [(CURRENT,), (PUSH, CURRENT, DRAG)]
 
 
 @pytest.mark.parametrize("parts", TOGETHER, ids=lambda p: "+".join(n.split(":")[0] for n, _ in p))
@@ -246,38 +246,6 @@ def test_its_slopes_are_those_of_its_steps(parts):
         near(by_param[..., k], [predictor.advance(one, x, u, data.time) for one in moved])
 
 
-SEA = [
-    ({"water": (0.15, -0.08)}, "current:u+v"),
-    ({"push": (0.12, 0.2)}, "push_world:u+v"),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("truth", "name"), SEA, ids=lambda v: v if isinstance(v, str) else "")
-def test_the_cause_is_found_with_its_size(truth, name):
-    """Of a boat whose drag is not known either."""
-    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(**truth, steps=100))
-    first = found.ranking[0]
-    assert found.verdict.effects == (name,) and first.effect == name and first.claimed
-    (size,) = truth.values()
-    for q, value in zip("ab", size, strict=True):
-        assert first.params[q].value == pytest.approx(value, abs=0.012)
-
-
-ADDED = [
-    ((0.0, 0.0, 0.5), "r", "rad/m^2"),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("added", "rate", "unit"), ADDED)
-def test_the_product_that_added_masses_change_is_found_with_its_size(added, rate, unit):
-    found = gr.diagnose(boat, driven(added=added, steps=100))
-    assert found.verdict.effects == (f"coriolis:{rate}",)
-    size = found.ranking[0].params["k"]
-    assert size.unit == unit and size.value == pytest.approx(sum(added), rel=0.1)
-
-
 def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():
     model = adopted(CURRENT)
     data, h = prepare(model, TRIALS[:1]), hypothesis(DRAG, model=model)
@@ -292,10 +260,3 @@ def joined(part: tuple[str, dict[str, float]], model: Model) -> Model:
     """The model with one more effect."""
     name, values = part
     return wrap(Library().effect(name, model), values, DT)
-
-
-@pytest.mark.slow
-def test_none_is_claimed_in_still_water():
-    found = gr.diagnose(boat_of(X=0.5, XX=0.3, Y=1.6), driven(steps=100))
-    told = ("current", "push_world", "coriolis")
-    assert not {n for n in found.verdict.effects if n.startswith(told)}

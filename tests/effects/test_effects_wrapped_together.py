@@ -31,7 +31,7 @@ PAIRS = [
     (SLEW, GAIN),
     (TREND, UNDERSTEER),
 ]
-BOTH_ORDERS = PAIRS + [(b, a) for a, b in PAIRS]
+BOTH_ORDERS = PAIRS[::2] + [(b, a) for a, b in PAIRS[1::2]]
 
 
 def names(parts):

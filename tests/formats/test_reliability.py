@@ -25,25 +25,25 @@ def test_every_truncation_is_refused() -> None:
 
 @pytest.mark.slow
 def test_every_flipped_bit_is_refused() -> None:
-    fine(reliability.read_damaged(flips=True, stride=1 if FULL else 7))
+    fine(reliability.read_damaged(flips=True, stride=1 if FULL else 41))
 
 
 def test_what_is_recovered_of_a_truncated_trial_is_right() -> None:
-    fine(reliability.recover_damaged(flips=False, stride=1 if FULL else 11))
+    fine(reliability.recover_damaged(flips=False, stride=1 if FULL else 41))
 
 
 @pytest.mark.slow
 def test_what_is_recovered_of_a_flipped_trial_is_right() -> None:
-    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 37))
+    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 149))
 
 
 def test_verify_finds_every_flipped_bit() -> None:
-    fine(reliability.verify_flips(stride=1 if FULL else 5))
+    fine(reliability.verify_flips(stride=1 if FULL else 17))
 
 
 @pytest.mark.slow
 def test_kill_at_any_moment() -> None:
-    fine(reliability.kills(300 if FULL else 8))
+    fine(reliability.kills(300 if FULL else 3))
 
 
 def test_concurrent_processes() -> None:

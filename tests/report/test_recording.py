@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from facts import holding
 from grounded_trials.report.figures.paths import ended
 from grounded_trials.report.recording.layout import entity_of, over_time
 from grounded_trials.report.recording.recording import write_recording
-from pace import slowness
 from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
@@ -80,16 +78,6 @@ def test_crashes_are_marked_where_and_when(car, tmp_path):
     assert f"/trials/{first.trial.id}/state/ended " in found
     write_recording(findings, path)
     assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
-
-
-@pytest.mark.slow
-def test_fifty_trials_of_3000_steps_stay_small_and_quick(tmp_path):
-    findings = many_flights(50)
-    path = tmp_path / "many.rrd"
-    start = time.process_time()
-    write_recording(findings, path)
-    assert time.process_time() - start < 5.0 * slowness()
-    assert path.stat().st_size < 40e6
 
 
 def test_a_recording_of_nothing_and_of_runs_with_gaps(tmp_path):

@@ -35,7 +35,7 @@ def runs(pieces, cost=10.0):
 def test_intervals_from_two_repeats_hold_as_often_as_they_say():
     rng = np.random.default_rng(0)
     inside, least, width = [], [], []
-    for _ in range(2000):
+    for _ in range(600):
         pair = runs(rng.normal(size=(2, PIECES)))
         scatter = Repeats([pair]).near(pair.utility)
         error = scatter.error(2)
@@ -97,10 +97,10 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     seen = Noise(measurement={"x": 0.1, "v": 0.1})
     plant = Plant(task.model, noise=seen)
     clean = task.utility(drive(task, Plant(task.model), proposal.candidate))
-    runs = [drive(task, plant, proposal.candidate, seed) for seed in range(40)]
+    runs = [drive(task, plant, proposal.candidate, seed) for seed in range(15)]
     lost = clean - np.mean([task.utility(run) for run in runs])
     assert lost > -clean
-    assert noise_cost(task, policy, noise) == pytest.approx(lost, rel=0.15)
+    assert noise_cost(task, policy, noise) == pytest.approx(lost, rel=0.25)
     made = proposal.candidate
     now = standing(task, [made], runs[:1], SearchOptions(), made.model)
     told = now.history[0].noise_cost

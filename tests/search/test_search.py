@@ -314,7 +314,7 @@ def test_a_trial_longer_than_the_horizon_counts_up_to_it():
     np.testing.assert_array_equal(a.policy.feedforward, b.policy.feedforward)
 
 
-@pytest.mark.parametrize(("off", "repeats", "least"), [(0.02, 3, -0.9), (0.3, 1, -1.35)])
+@pytest.mark.parametrize(("off", "repeats", "least"), [(0.3, 1, -1.35)])
 def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
     """The robot starts slightly (or far) off s_0. With the exact start: from -1.349 to -0.881."""
     rng = np.random.default_rng(0)
@@ -324,11 +324,9 @@ def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
         return PLANT.run(candidate.policy, start, rng)
 
     found = learn(TASK, run, SearchOptions(max_trials=12 * repeats, repeats=repeats))
-    now, candidates, trials = found.standing, found.candidates, found.trials
+    now, candidates = found.standing, found.candidates
     assert now.iteration >= 1 and len(candidates) >= 3
     assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
-    if repeats == 3:  # scatter is not a gain: the search ends before max_trials
-        assert now.phase == "converged" and len(trials) <= 30
 
 
 def test_max_trials_ends_the_search():
@@ -436,7 +434,7 @@ EVENTS = {
     st.sampled_from([1, 2]),
     st.sampled_from(["damped", "full"]),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
     """Crashes, noise, changed models, repeats: no exception, no worse policy."""
     story = Story(repeats=repeats, step=step, max_halvings=2, max_trials=8)
@@ -502,8 +500,16 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("options", [{}, {"step": "full"}, {"method": "policy-gradient"}], ids=str)
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *((name, {}) for name in ODD),
+        ("one step", {"step": "full"}),
+        ("huge weights", {"step": "full"}),
+        ("one step", {"method": "policy-gradient"}),
+        ("a target out of reach", {"method": "policy-gradient"}),
+    ],
+)
 def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
     task = cart_task(**ODD[name])
     plant = Plant(other(task.model, 1.5), latency={"force": 0.02})

@@ -11,7 +11,7 @@ from attacks import ATTACKS
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "seconds"), [("mutants", 0.7), ("configurations", 0.7), ("flips", 0.5)]
+    ("name", "seconds"), [("mutants", 0.3), ("configurations", 0.3), ("flips", 0.3)]
 )
 def test_a_little_of_each_attack_breaks_nothing(name: str, seconds: float) -> None:
     tally = ATTACKS[name][1](random.Random(5), seconds)
@@ -19,7 +19,7 @@ def test_a_little_of_each_attack_breaks_nothing(name: str, seconds: float) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "seconds"), [("kills", 4), ("short writes", 4), ("crowds", 1)])
+@pytest.mark.parametrize(("name", "seconds"), [("short writes", 1)])
 def test_commands_that_are_attacked_break_nothing(name: str, seconds: float) -> None:
     tally = ATTACKS[name][1](random.Random(5), seconds)
     assert tally.failures == [] and tally.tries > 0

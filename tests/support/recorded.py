@@ -20,7 +20,6 @@ def record(
     seed=0,
     until=None,
     after=1.0,
-    jog=0.0,
     rate=RATE,
     late=0,
     noise=(0.002, 0.01),
@@ -55,7 +54,7 @@ def record(
         if step + ahead >= policy.horizon:
             force = 0.0
         if k < begin:
-            force = jog * np.sin(k / rate * 4) if k < 0.4 * begin else 0.0
+            force = 0.0
         rows.append([1000 + k / rate, *felt, force])
         push = (-0.7 if turned else 0.7) * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
         z = model.system.step(z[None], np.array([[push]]), model.values, 1 / rate)[0]

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
+from grounded import Trial
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
@@ -33,62 +32,6 @@ def pushed(friction, trials=4, steps=120, seed=0):
         y = np.array(states) + np.array([0.002, 0.01]) * rng.standard_normal((steps + 1, 2))
         found.append(Trial(y, u[:, None], DT, ("x", "v"), ("u",), start_inputs=np.zeros(1)))
     return model, found
-
-
-@pytest.mark.slow
-def test_the_width_of_a_large_friction_is_found():
-    model, trials = pushed(FRICTION)
-    found = diagnose(model, trials)
-    assert found.effects == ("coulomb_friction:v",)
-    row = found.ranking[0]
-    assert row.fixed["width"] == pytest.approx(WIDTH, rel=0.25)
-    assert row.params["c"].value == pytest.approx(FRICTION, rel=0.05)
-
-
-@pytest.mark.slow
-def test_frictions_are_compared_at_the_width_that_each_needs():
-    crude, trials = carts(0.02)
-    found = diagnose(crude, trials)
-    row = found.ranking[0]
-    assert row.effect == "joint_friction:force<-v"
-    assert "load_friction:force<-v" not in found.effects
-    assert row.params["c"].value == pytest.approx(1.0, rel=0.15)
-    assert row.fixed["width"] == pytest.approx(0.02, rel=0.5)
-
-
-def carts(width, trials=2, steps=120):
-    """A cart with a hanging pole that a dry friction of 1 N opposes, and its crude model."""
-
-    def rates(s, a, p, friction):
-        force = a.force - p.b * s.v - friction * np.tanh(s.v / width)
-        sn, c = np.sin(s.th), np.cos(s.th)
-        push = (force + 0.2 * sn * (0.4 * s.w**2 + 9.81 * c)) / (p.M + 0.2 * sn**2)
-        return {"x": s.v, "th": s.w, "v": push, "w": (-push * c - 9.81 * sn) / 0.4}
-
-    crude, true = (
-        Model(
-            name="cart-pole",
-            states={"x": "m", "th": "rad", "v": "m/s", "w": "rad/s"},
-            inputs={"force": "N"},
-            params={"M": Param(1.0, "kg", 0.3, 3.0), "b": Param(0.1, "N s/m", 0.0, 2.0)},
-            roles={"position": ("x",), "hanging": ("th",)},
-            derivative=lambda s, a, p, friction=friction: rates(s, a, p, friction),
-        )
-        for friction in (0.0, 1.0)
-    )
-    part, found = np.clip(np.arange(steps) / 100, 0, 1), []
-    aim = 0.5 * part**3 * (10 - 15 * part + 6 * part**2)  # from rest to rest, 0.5 m
-    for k in range(trials):
-        states, inputs = [np.zeros((1, 4))], []
-        for there in aim:
-            x = states[-1]
-            inputs.append((15.0 + 5 * k) * (there - x[0, 0]) - 3.0 * x[0, 2])
-            for _ in range(10):
-                x = true.system.step(x, np.array([[inputs[-1]]]), true.values, 0.002)
-            states.append(x)
-        names = crude.state_names, crude.input_names
-        found.append(Trial(np.concatenate(states), np.array(inputs)[:, None], 0.02, *names))
-    return crude, found
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.orders import first, orders
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.variations import reordered, variations, varied
@@ -113,55 +112,3 @@ def test_a_delay_of_each_input_replaces_one_of_all_and_more_of_some(search, more
     found = names_of(search, both, (later, {name: 0.01}), limit)
     assert (DELAY, "delay:b", LIMIT) in found
     assert names_of(search, both) == [(DELAY, "delay:b")]
-
-
-AXES = Model(
-    name="axes",
-    states={"x": "m", "y": "m", "v": "m/s", "w": "m/s"},
-    inputs={"a": "1", "b": "1"},
-    params={"tau": Param(0.15, "s")},
-    derivative=lambda s, a, p: {
-        "x": s.v,
-        "y": s.w,
-        "v": (0.6 * a.a - s.v) / p.tau,
-        "w": (0.8 * a.b - s.w) / p.tau,
-    },
-)
-
-
-def levels(rng, steps):
-    """Levels that are held for 0.25 to 0.9 s each, (steps, 2)."""
-    held = [
-        np.repeat(rng.uniform(-0.9, 0.9, steps), rng.integers(12, 45, steps))[:steps]
-        for _ in range(2)
-    ]
-    return np.stack(held, axis=1)
-
-
-def stepped(trials=3, steps=450, late=2):
-    """A valve that loses a dead zone of 0.08, then has an offset of 0.14, 40 ms late."""
-    rng, found, gain = np.random.default_rng(1), [], np.array([0.6, 0.8])
-    for _ in range(trials):
-        u = levels(rng, steps)
-        x, v, rows = np.zeros(2), np.zeros(2), [np.zeros(4)]
-        for old, now in zip(np.vstack([np.zeros((late, 2)), u]), u, strict=False):
-            zone = np.sign(old[0]) * max(abs(old[0]) - 0.08, 0.0) + 0.14
-            for _ in range(10):
-                v = v + DT / 10 * (gain * [zone, now[1]] - v) / 0.15
-                x = x + DT / 10 * v
-            v = v + rng.normal(0, 2e-3, 2)
-            rows.append(np.array([*x, *v]))
-        noisy = np.array(rows) + rng.normal(0, 1, (steps + 1, 4)) * [5e-4, 5e-4, 4e-3, 4e-3]
-        found.append(Trial(noisy, u, DT, AXES.state_names, AXES.input_names))
-    return found
-
-
-@pytest.mark.slow
-def test_an_offset_found_before_a_dead_zone_acts_after_it():
-    found = diagnose(AXES, stepped(steps=300))
-    assert set(found.effects) == {"dead_zone:a", "input_bias:a", DELAY}, found.sentence
-    assert found.acting.index("dead_zone:a") < found.acting.index("input_bias:a")
-    values = {row.effect: row.values for row in found.ranking if row.claimed}
-    assert values["dead_zone:a"]["c"] == pytest.approx(0.08, rel=0.1)
-    assert values["input_bias:a"]["b"] == pytest.approx(0.14, rel=0.05)
-    assert values[DELAY]["d"] == pytest.approx(0.04, rel=0.1)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -21,18 +20,13 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.step import bounded
 from grounded.effects import Library
-from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
-from grounded.experiments.pendulum import model as real_pendulum
 from grounded.filter.kalman import innovations, smoother
 from grounded.models.arm import model as arm
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
-from grounded.plant import Noise, Plant
-from grounded.search.ask_tell import learn
-from grounded.search.step.step_size import SearchOptions
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_bounded_step_is_the_best_one_inside(seed):
     """With the unknowns that stopped held where they are, nothing else wants to move."""
     rng = np.random.default_rng(seed)
@@ -114,46 +108,6 @@ def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
     step = bounded(G, np.array([2.0, np.nan, 3.0]), -wide, wide)
     np.testing.assert_allclose(step, [-1.0, 0.0, -3.0])
     assert not bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
-
-
-@pytest.mark.slow
-def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
-    """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
-    task = pendulum_task(pendulum)
-    noise = Noise(process={"omega": 0.01}, measurement={"theta": 0.002, "omega": 0.01})
-    plant, rng = Plant(real_pendulum, noise=noise), np.random.default_rng(0)
-
-    def run(candidate):
-        return plant.run(candidate.policy, {}, rng)
-
-    trials = learn(task, run, SearchOptions(max_trials=4)).trials
-    found = diagnose(task, trials)
-    mass, row = found.ranking[:2]  # both are its causes, and nothing else is claimed
-    assert (mass.effect, row.effect) == ("parameter:m", "coulomb_friction:omega")
-    assert mass.claimed and row.claimed
-    assert mass.params["d"].value == pytest.approx(HEAVIER - 1, rel=0.03)  # of 1 kg
-    assert row.params["c"].value == pytest.approx(FRICTION / (HEAVIER * 0.25), rel=0.1)
-    # it builds up over 0.05 rad/s; from 0.05 to the likeliest, 0.061, evidence rises by 1.7 nats
-    assert row.fixed["width"] == pytest.approx(0.05, abs=0.015)
-    same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
-    assert set(found.effects) <= {"coulomb_friction:omega", *same}
-    assert found.gap.before > 50 * found.gap.after and found.gap.after < 3
-
-
-@pytest.mark.slow
-def test_without_noise_the_demo_names_the_friction_alone():
-    """The last digits of a step are no claim."""
-    task = pendulum_task(pendulum)
-    plant, rng = Plant(real_pendulum), np.random.default_rng(0)
-    trials = learn(
-        task, lambda candidate: plant.run(candidate.policy, {}, rng), SearchOptions(max_trials=3)
-    ).trials
-    found = diagnose(task, trials)
-    assert found.effects == ("coulomb_friction:omega",)
-    c = found.ranking[0].params["c"]
-    assert c.value == pytest.approx(FRICTION / (HEAVIER * 0.25), rel=0.03, abs=3 * c.std)
-    assert c.std < 0.02 * c.value
-    assert found.parameters["m"].value == pytest.approx(HEAVIER, rel=0.03)
 
 
 def test_a_rate_that_is_another_state_has_one_name():

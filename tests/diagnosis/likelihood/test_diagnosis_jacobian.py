@@ -7,7 +7,6 @@ import pytest
 
 from grounded.challenge.cases import make
 from grounded.diagnosis.hypotheses.explored import no_limits, price
-from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities, step_jacobian
@@ -129,20 +128,6 @@ def test_a_threshold_of_the_model_has_a_slope(cars):
     track = np.tile(x[0], (*data.y.shape[:2], 1))
     d = linearise(Predictor(near), replace(drag, spread=1.0), track, whole=True)[1]
     assert d[..., 2 + stall].any()  # also beside effects
-
-
-@pytest.mark.slow
-def test_a_stall_that_is_off_is_calibrated_not_blamed_on_another_effect():
-    case = next(iter(make("none", 1, 20, only="car", noise="white")))  # its throttle passes there
-    crude = case.model.with_values({"stall": 1.15 * case.model.params["stall"].value})
-    data = prepare(crude, case.trials, case.latency)
-    search = HypothesisSearch(data, Library().candidates(crude, data.scales))
-    with np.errstate(all="ignore"):
-        search.nulls()
-    fit = search.best_null()
-    assert fit.hypothesis.spread > 0
-    found = fit.hypothesis.shift[crude.param_names.index("stall")] / crude.params["stall"].value
-    assert found == pytest.approx(1 / 1.15 - 1, abs=0.04)
 
 
 def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):

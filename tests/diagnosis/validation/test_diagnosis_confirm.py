@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Search, Trial
-from grounded.diagnosis.diagnose import diagnose
+from grounded import Model, Param, Trial
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
@@ -19,10 +18,6 @@ from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.measured import credited, losses
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
-from grounded.experiments.pendulum import model as real_pendulum
-from grounded.experiments.pendulum import pendulum_task
-from grounded.models.pendulum import model as crude_pendulum
-from grounded.plant import Plant
 
 DT = 0.02
 FRICTION, BIAS, WAVE = 0.4, -0.08, 0.05
@@ -132,17 +127,6 @@ def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
     assert not rivals(1.0, beside=worth + 100)  # it is another cause, not another name of this one
 
 
-@pytest.mark.slow
-def test_one_long_log_is_held_out_by_pieces():
-    model, trials = axis(WAVE, trials=1, steps=300)
-    data = prepare(model, trials, np.zeros(1))
-    assert len(np.unique(data.folds)) == 5
-    found = diagnose(model, trials)
-    assert found.prediction_error[0].held_out == "pieces" and found.effects
-    short = diagnose(model, [trials[0].until(60)])
-    assert short.no_cause and short.prediction_error[0].held_out == "no"
-
-
 def pushed_hard_once(seed=0):
     """Five runs with friction; half a second of the fourth is beyond the drive's limit."""
     model = Model(
@@ -198,57 +182,3 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare):
     vague = replace(ahead, with_effects={name: 1e3 * e for name, e in errors.items()})
     assert not unconfirmed(claims, decision.doubtful, (), vague)  # a trifle beside such errors
     assert Unconfirmed.from_json(one.to_json()) == one
-
-
-@pytest.mark.slow
-def test_what_is_left_without_the_only_effect_is_the_calibrated_model():
-    task, trials = pendulum_task(crude_pendulum), []
-    search, plant = Search(task), Plant(real_pendulum, {})
-    for _ in range(3):
-        trials.append(plant.run(search.ask().policy, {}, np.random.default_rng(0)))
-        search.tell(trials[-1])
-    found = diagnose(task, trials)
-    assert found.effects == ("coulomb_friction:omega",)
-    without = {one.of: one.without_it for one in found.credit}
-    assert set(without) == {"coulomb_friction:omega", "calibration"}
-    row = [r for r in found.prediction_error if not r.whole_trial][-1]
-    assert dict(without["coulomb_friction:omega"]) == pytest.approx(dict(row.calibrated))
-
-
-def slid(trials, rate, low=-1.0, steps=240):
-    """Runs of a sled, v' = `rate`(v, u, t), under steps of its drive; little noise."""
-    rng, found = np.random.default_rng(3), []
-    for _ in range(trials):
-        u = np.repeat(rng.uniform(low, 1, steps // 12), 12)
-        x, states = np.zeros(2), [np.zeros(2)]
-        for k, value in enumerate(u):
-            for part in range(10):
-                t = 0.05 * k + 0.005 * part
-                x = x + 0.005 * np.array([x[1], rate(x[1], value, t)])
-            states.append(x)
-        y = np.array(states) + 2e-3 * rng.standard_normal((steps + 1, 2))
-        found.append(Trial(y, u[:, None], 0.05, ("x", "v"), ("u",), start_inputs=u[:1]))
-    return found
-
-
-SLED = Model(
-    states={"x": "m", "v": "m/s"},
-    inputs={"u": "m/s^2"},
-    params={
-        "k": Param(1.0, "1", std=0.3),
-        "c": Param(0.2, "m/s^2", std=0.2),
-        "b": Param(0.5, "1/s", std=0.2),
-    },
-    derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u + p.c - p.b * s.v},
-    roles={"position": ("x",), "speed": "v"},
-    name="sled",
-)
-
-
-@pytest.mark.slow
-def test_a_bias_and_a_trend_are_no_slow_wave():
-    trials = slid(4, lambda v, u, t: u + 0.5 - 0.06 * t - 0.5 * v)
-    data = prepare(SLED, trials, np.zeros(1))
-    _, best = attribute(data, Library().candidates(SLED, data.scales), max_effects=2)
-    families = {name.partition(":")[0] for name in best.hypothesis.names}
-    assert len(families) == 2 and "trend" in families and families & {"input_bias", "offset"}

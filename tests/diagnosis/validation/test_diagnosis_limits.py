@@ -11,7 +11,6 @@ from grounded.accounts.finding import Finding
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.tables import error_table
 from grounded.diagnosis.validation.limits import (
     joints_without_input,
     knowable,
@@ -31,14 +30,6 @@ def stuck(trials, *states):
         y = trial.states.copy()
         y[:, list(states)] = 0.25
         yield replace(trial, states=y)
-
-
-@pytest.mark.slow
-def test_states_that_never_moved_give_no_cause():
-    found = diagnose(pendulum, list(stuck(swings(), 0, 1)))
-    assert found.kind == "unknown" and not found.effects
-    (one,) = [one for one in found.findings if one.code == "model.still"]
-    assert one.about == ("theta", "omega") and found.verdict.limit == one.code
 
 
 def test_what_acts_on_a_state_that_never_moved_is_not_offered():
@@ -139,15 +130,6 @@ def test_all_that_stands_still_takes_one_sentence():
     assert said.about == ("u1", "q1", "w1")
     (said,) = limits(prepare(pendulum, list(stuck(swings(), 0, 1)))).findings
     assert said.about == ("theta", "omega")
-
-
-@pytest.mark.slow
-def test_joints_that_stand_still_do_not_hide_a_delay_of_the_others():
-    found = diagnose(ARM, two_of_three())
-    assert found.effects == ("delay:u2+u3",)
-    assert found.ranking[0].values["d"] == pytest.approx(0.06, abs=0.002)
-    rows, _ = error_table(found)
-    assert rows and not any(row[0].startswith(("q1", "w1")) for row in rows)
 
 
 def test_a_model_that_is_no_number_at_a_measured_state_says_where():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
     without_others,
@@ -41,22 +40,6 @@ def carts(speeds, params=None):
 
 APART = (1.1, 1.7, 2.6, 3.4)
 shake = {"A": WAVE, "B": 0.0, "omega": OMEGA}
-
-
-@pytest.mark.xfail(reason="worse by the choice by one test: issue 67, open")
-@pytest.mark.slow
-def test_a_wave_is_a_cause_only_where_motions_differ():
-    model, trials = carts(APART)
-    found = diagnose(model, trials)
-    assert found.effects == ("periodic:v",) and found.motions == 4
-    assert not any(one.repeats for one in found.unconfirmed)
-    model, trials = carts([1.7] * 4)
-    found = diagnose(model, trials)
-    assert "periodic:v" not in found.effects and found.motions == 1
-    one = next(one for one in found.unconfirmed if one.repeats)
-    family = Library().family(one.effect.partition(":")[0])
-    assert family.loose and one.seen == (4, 4) and one.evidence > 20
-    assert found.leftover and found.next_trial
 
 
 @pytest.mark.parametrize(("speeds", "free"), [(APART, True), ([1.7] * 4, False)])

@@ -84,15 +84,3 @@ def test_a_trial_beside_itself_confirms_nothing():
     few = DiagnosisOptions(library=Library((Library().family("coulomb_friction"),)))
     found = diagnose(model, [trials[0], trials[0]], few)
     assert found.no_cause and not found.effects and found.trials == 1
-
-
-@pytest.mark.slow
-def test_without_repeats_noise_is_a_bound_unless_what_is_left_is_white():
-    model, trials = pushed_cart(asymmetric=0.8, trials=4)
-    poor = DiagnosisOptions(library=Library((Library().family("trend"),)))
-    found = diagnose(model, trials, poor)
-    assert all(row.floor_at_most for row in found.prediction_error)
-    assert found.leftover[0].floor_at_most
-    white = diagnose(*pushed_cart())
-    assert not any(row.floor_at_most for row in white.prediction_error)
-    assert white.kind == "none"

@@ -21,28 +21,12 @@ from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
-from shared_data import data, files, needs_data
+from shared_data import data, needs_data
 
 
 def by_name(log, states, inputs):
     """Return the guesses for states and inputs of which only the names are known."""
     return assigned(log, dict.fromkeys(states, ""), dict.fromkeys(inputs, ""))
-
-
-@pytest.mark.slow
-@needs_data
-def test_every_shared_log_can_be_inspected() -> None:
-    paths = files("*/*.mcap") + files("mcap_format_fixtures/*/*.mcap")
-    assert len(paths) > 30
-    for path in paths:
-        if path.name in ("zero_bytes.mcap", "magic_only.mcap"):
-            with pytest.raises(GroundedError):
-                inspect_log(path)
-            continue
-        report = inspect_log(path)
-        assert bool(report.damage) == ("derived_corrupt" in str(path)), path.name
-        for topic in report.topics:
-            assert topic.problem == "" or topic.encoding == "wrong_format", (path.name, topic)
 
 
 @needs_data
@@ -157,15 +141,7 @@ def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, s
 
 
 @needs_data
-@pytest.mark.parametrize(
-    ("bag", "named"),
-    [
-        ("pitch-45bag", "@rpy.pitch"),
-        ("yx3bag", "0.930 s"),
-        ("yx4bag", "/cf_logpos.position.x"),
-        ("flybag", "/cf_command"),
-    ],
-)
+@pytest.mark.parametrize(("bag", "named"), [("yx3bag", "0.930 s"), ("flybag", "/cf_command")])
 def test_the_crazyflie_bags_defects_are_found(bag: str, named: str) -> None:
     report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
     assert any(named in remark for remark in report.remarks), report.remarks

@@ -10,11 +10,10 @@ from cli import grounded
 from grounded.findings import Finding
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.candidates import rest_at_end
 from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.candidates.first_plan import Plan, in_another_unit
 from grounded_trials.workspace.folder import Folder
-from workspaces import blank, edit, make
+from workspaces import blank, edit
 
 HEAD = "from grounded import Model, Param\nfrom numpy import cos, sin\n"
 LIFTED = f"""{HEAD}
@@ -109,9 +108,7 @@ DRIFT = '{name = "offset:v", c = 0.1214}'
     [
         ("", 0.0),
         (DRIFT, -0.1214 / 7.0),
-        ('{name = "sensor_bias:th", b = -0.0173}', -0.0173),
         (f'{DRIFT}, {{name = "coulomb_friction:v", c = 0.04, width = 0.001}}', -0.1214 / 7.0),
-        (f'{DRIFT}, {{name = "sensor_lag:v", tau = 0.06}}', -0.1214 / 7.0),
     ],
 )
 def test_a_free_state_rests_where_the_adopted_effects_let_it(tmp_path, effects, shown):
@@ -232,18 +229,6 @@ def test_rest_of_a_free_state_is_asked_for_at_the_end_only(ball):
     assert grounded("-C", ball.folder, "target", "step", "--to", "x=1", "--rest").code == 2
 
 
-def test_a_weight_at_the_end_is_bounded_by_the_noise_of_its_state(ball, monkeypatch):
-    noise = np.array([0.01, 0.01, 0.002, 0.05])
-    monkeypatch.setattr(rest_at_end, "sensor_noise", lambda *_: noise)
-    drawn(ball, *LINE, "--rest")
-    ends = reward_of(ball)["terminal"]
-    assert (ends["th"], ends["w"]) == (1000.0, 8.0)
-    file = ball.folder / "grounded.toml"
-    file.write_text(file.read_text().replace("w = 8.0", "w = 30.0"))
-    drawn(ball, *LINE, "--rest")
-    assert reward_of(ball)["terminal"]["w"] == 30
-
-
 def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(ball):
     drawn(ball, "line", "--to", "x=0.3", "--seconds", "1")
     edit(ball.folder, safety="x = [-0.1, 0.33]")
@@ -283,10 +268,3 @@ def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_p
     values = np.column_stack([columns[n] for n in names])
     np.savetxt(w.folder / "target.csv", values, "%.5f", ",", header=",".join(names), comments="")
     assert len(found()) == 1
-
-
-def test_a_first_plan_that_is_refused_for_its_gains_asks_for_other_weights(tmp_path, monkeypatch):
-    monkeypatch.setattr("grounded.search.safety.MAX_GAIN", 1e-3)
-    proposed = Workspace(make(tmp_path / "w").folder).propose()
-    assert proposed.candidate is None and proposed.standing.ending == "gains too large"
-    assert proposed.then.verb == "propose"

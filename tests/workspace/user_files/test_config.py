@@ -258,7 +258,7 @@ GOOD = tomllib.loads(CONFIG + LOG)
 
 @pytest.mark.slow
 @given(st.sampled_from(sorted(keys_of(GOOD))), VALUES)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, value):
     from grounded_trials.workspace.user_files import config as module
 

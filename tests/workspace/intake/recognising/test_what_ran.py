@@ -72,24 +72,6 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
         assert suspicion(learnt.task, logged, own, candidates).why is None
 
 
-@pytest.mark.parametrize("share", [0.01, 0.03])
-def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(learnt, share):
-    """The robot acted on other samples than the log has: up to 2 steps older, another noise."""
-    rng = np.random.default_rng(2)
-    for own, trial, _ in runs(learnt):
-        clean, T = np.array(trial.states), trial.steps
-        noise = share * np.ptp(clean, axis=0)
-        for _ in range(5):
-            age = np.maximum(np.arange(T) - rng.integers(0, 3, T), 0)
-            acted = clean[age] + noise * rng.normal(size=(T, clean.shape[1]))
-            logged = replace(
-                trial,
-                states=clean + noise * rng.normal(size=clean.shape),
-                inputs=own.policy.commands(acted[None], own.policy.past)[0],
-            )
-            assert suspicion(learnt.task, logged, own, [own]).why is None
-
-
 @pytest.mark.parametrize("kind", OTHERS)
 def test_other_commands_are_not_the_candidate_s(learnt, kind):
     for own, trial, candidates in runs(learnt):
@@ -103,14 +85,6 @@ def test_every_pair_of_candidates_is_told_apart(learnt):
         for other in candidates:
             why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates).why
             assert why.facts["other"] == own.id if other.id != own.id else why is None
-
-
-def test_a_takeover_is_dated(learnt):
-    own, trial, candidates = runs(learnt)[0]
-    inputs = np.array(trial.inputs)
-    inputs[25:] = -inputs[25:] + 2
-    why = suspicion(learnt.task, replace(trial, inputs=inputs), own, candidates).why
-    assert 1.0 <= why.facts["until"].value < 1.4
 
 
 @pytest.fixture
@@ -173,18 +147,6 @@ def said_to_have_run(candidate, run, to, steps=sys.maxsize, nudge=0.0):
     return to
 
 
-def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
-    w, ran, _ = waiting
-    again = said_to_have_run("", ran, tmp_path / "again.mcap")
-    with pytest.raises(GroundedError, match="those of c0001") as refused:
-        w.ingest(again)
-    arguments = (str(again), "--candidate", "c0001")
-    assert refused.value.then == NextCommand("ingest", arguments)
-    done = grounded("-C", w.folder, "next", again, "--candidate", "c0001")
-    assert done.code == 0, done.err
-    assert w.ingest(again, candidate="c0001").candidate == "c0001"
-
-
 def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
     w, ran, _ = waiting
     other = said_to_have_run("c0002", ran, tmp_path / "x.mcap")
@@ -204,22 +166,6 @@ def test_a_run_that_ended_early_says_how_to_take_it_back(waiting, tmp_path):
         assert (told.facts["steps"], told.facts["trial"]) == (20, found.trial)
         assert bool(told.facts["complete"]) == (candidate == "c0001")
         assert found.verdict == "crashed" or candidate == "c0001"
-
-
-def test_a_candidate_that_crashed_before_names_the_run_that_did(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    ran = w.run(w.propose().candidate.id).trial_file
-    short = w.ingest(said_to_have_run("c0001", ran, tmp_path / "short.mcap", 20))
-    assert short.crashed == (short.trial,)
-    run = said_to_have_run("c0001", ran, tmp_path / "run.mcap", nudge=1e-9)
-    done = grounded("-C", w.folder, "ingest", run)
-    told = " ".join(done.out.split())
-    assert holds(told, "t0002", f"{short.trial} did not") and "it did not run" not in told
-    again = w.ingest(run)
-    assert (again.verdict, again.crashed) == ("crashed", ("t0001",))
-    assert np.isfinite(again.utility) and again.to_json()["crashed"] == ["t0001"]
-    w.discard(short.trial)
-    assert (w.ingest(run).verdict, w.ingest(run).crashed) == ("first", ())
 
 
 def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
@@ -245,14 +191,6 @@ def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     assert w.discard("t0002").discarded == {"t0002": ""}  # and again
 
 
-def test_a_discarded_trial_that_is_ingested_again_stays_aside(waiting):
-    w, ran, _ = waiting
-    w.discard("t0001")
-    found = w.ingest(ran)
-    assert found.known and any("set aside" in text for text in found.warnings)
-    assert w.status().standing.trials == 0
-
-
 def test_a_name_that_no_trial_has(waiting):
     w, _, _ = waiting
     with pytest.raises(GroundedError, match=r"T0009.*t0001"):
@@ -269,39 +207,6 @@ def test_a_damaged_note_is_named_and_the_trial_does_not_come_back_silently(waiti
     assert [one.file for one in w.verify().damaged] == [str(note)]
     with pytest.raises(GroundedError, match="is damaged"):
         w.status()
-
-
-FOREIGN = CONFIG.replace("[system]", "[unused]").split("[unused]")[0] + (
-    '[log]\nclock = "publish"\n[log.state.x]\npath = "/state.x"\n[log.state.v]\n'
-    'path = "/state.v"\n[log.input.force]\npath = "/input.force"\nresample = "hold"\n'
-)
-
-
-def test_several_foreign_logs_are_taken_in_one_after_another(tmp_path):
-    w = make(tmp_path / "w", config=FOREIGN)
-    paths = [tmp_path / f"{k}.mcap" for k in range(3)]
-    for k, path in enumerate(paths):
-        foreign_log(path, k)
-    for path in paths:
-        assert not ingest_log(w, path, data=True).known
-    assert grounded("-C", w.folder, "ingest", "--data", *paths).code == 0
-    assert len(w.store.list()) == 3
-
-
-def foreign_log(path, seed):
-    """A log that is no trial of ours: the same channels, without the table `grounded`."""
-    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
-
-    values = np.random.default_rng(seed).normal(size=(81, 3))
-    with path.open("wb") as stream:
-        log = LogWriter(stream)
-        state = log.channel("/state", "State", ["x", "v"])
-        force = log.channel("/input", "Input", ["force"])
-        rows = zip(encode_doubles(values[:, :2]), encode_doubles(values[:, 2:]), strict=True)
-        for k, (x, u) in enumerate(rows):
-            log.message(state, k * 25_000_000, x)
-            log.message(force, k * 25_000_000, u)
-        log.finish()
 
 
 def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discarded(tmp_path):
@@ -338,17 +243,6 @@ def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_disca
     assert w.propose().candidate.id == "c0003"
 
 
-def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
-    """A third policy's run, nearer to one candidate than to the other, is neither's."""
-    (own, _, candidates), _, (_, theirs, _) = runs(learnt)
-    inputs = theirs.inputs + 0.25 * np.sin(np.arange(theirs.steps) / 8)[:, None]
-    seen = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
-    assert seen.why.code == "log.another" and seen.other == ""
-    seen = suspicion(learnt.task, theirs, own, candidates)
-    why, name = seen.why, seen.other
-    assert why and name == theirs.candidate != own.id
-
-
 LOGGED = (
     CONFIG
     + """
@@ -374,22 +268,7 @@ def recorded(path, trial, before, rng):
     np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
 
 
-@pytest.mark.parametrize("before", [0.0, 1.0, 3.23])
-def test_a_recording_may_begin_before_the_run(tmp_path, before):
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
-    recorded(tmp_path / "run.csv", trial, before, np.random.default_rng(0))
-    taken = w.ingest(tmp_path / "run.csv")
-    assert taken.candidate == "c0001" and taken.utility == pytest.approx(
-        w.task.utility(trial), rel=0.02
-    )
-    (stored,) = w.trials()
-    np.testing.assert_allclose(stored.trial.inputs, trial.inputs, atol=1e-4)
-    assert [f"{before:.2f}" in one for one in taken.notes] == [True] * (before > 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("given", ["start = 0.0", 'start = "first-input"'])
+@pytest.mark.parametrize("given", ["start = 0.0"])
 def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_path, given):
     config = LOGGED + f"[log.span]\n{given}\n"
     w = Workspace(make(tmp_path / "w", config=config).folder)
@@ -440,7 +319,7 @@ def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
     assert not there.ingest(log.trial_file, data=True).notes
 
 
-@pytest.mark.parametrize("before", [0.0, 0.7])
+@pytest.mark.parametrize("before", [0.7])
 def test_a_run_without_its_feedback_is_named(tmp_path, before):
     w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
     alone = replace(w.propose().candidate.policy, gain=None, reference=None)

@@ -7,7 +7,6 @@ import pytest
 
 from cli import grounded
 from facts import holds, of_code
-from grounded.accounts.inputs import beyond_limits
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
@@ -34,7 +33,7 @@ def w(tmp_path):
     return Workspace(make(tmp_path / "w", config=NARROW).folder)
 
 
-@pytest.mark.parametrize("most, said", [(2.15, True), (1.17, False), (1.175, False)])
+@pytest.mark.parametrize("most, said", [(2.15, True), (1.175, False)])
 def test_data_beyond_the_limits_are_told_how_far(w, tmp_path, most, said):
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
     told = of_code(w.ingest(tmp_path / "d.mcap", data=True), "log.limits")
@@ -87,7 +86,7 @@ def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
     assert at_limits()["force"] > 0.5
 
 
-@pytest.mark.parametrize(("most", "far"), [(0.0204, True), (0.9, False)])
+@pytest.mark.parametrize(("most", "far"), [(0.0204, True)])
 def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path, most, far):
     seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
     w = Workspace(make(tmp_path / "w", config=seen).folder)
@@ -111,14 +110,6 @@ def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
     assert told["facts"]["log"] == "a.csv"
 
 
-def test_a_side_without_a_limit_has_no_beyond(w):
-    free = replace(w.task, low=np.array([-np.inf]), high=np.array([np.inf]))
-    assert not beyond_limits(free, driven(1e6).inputs).any()
-    one = replace(w.task, low=np.array([-np.inf]))
-    assert beyond_limits(one, driven(2.15).inputs).max() == pytest.approx(0.98, abs=1e-3)
-    assert not beyond_limits(w.task, np.full((5, 1), np.nan)).any()
-
-
 @pytest.mark.parametrize("limit, said", [(0.3, True), (5.0, False)])
 def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
     config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
@@ -128,7 +119,7 @@ def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, lim
     assert all(one.about == ("force",) for one in told)
 
 
-@pytest.mark.parametrize(("most", "said"), [(40.0, True), (0.9, False), (400.0, False)])
+@pytest.mark.parametrize(("most", "said"), [(40.0, True), (0.9, False)])
 def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path, most, said):
     """An encoder in degrees without a rate sensor: nothing else in the log contradicts it."""
     w = make(tmp_path / "w", "pendulum")
@@ -180,7 +171,7 @@ def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_fa
     assert of_code(same, "run.moved_on", "run.let_go")  # of the log that it was told of
 
 
-@pytest.mark.parametrize(("knows", "holds_it"), [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize(("knows", "holds_it"), [(True, True)])
 def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, knows, holds_it):
     model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
     made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)

@@ -14,7 +14,6 @@ from grounded_trials.logs.signals import SignalSpec
 from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults
 from ros_bags import rover_bag
-from tests.accounts.test_mismatch import BOAT, folded, logged
 
 CAR = Model(
     states={"psi": "rad", "qz": "1", "z": "m"},
@@ -79,11 +78,3 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
     assert (fault.code, fault.about) == ("log.unit", ("rudder",))
     assert fault.facts["by"] == pytest.approx(1 / 57.29578)
     assert holds(fault.sentence, "[log.input.rudder]", "0.017453293")
-
-
-def test_a_heading_in_degrees_is_told_at_ingest_though_unwrapping_folded_it():
-    sound, odd = (logged(BOAT, *fault)[0] for fault in ((), (folded,)))
-    assert not column_faults(SimpleNamespace(base_model=BOAT), sound)
-    (fault,) = column_faults(SimpleNamespace(base_model=BOAT), odd)
-    assert (fault.code, fault.about) == ("log.folded", ("psi",))
-    assert holds(fault.sentence, "[log.state.psi]", "0.017453293")

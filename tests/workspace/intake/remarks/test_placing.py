@@ -16,7 +16,7 @@ from grounded_trials.workspace.discarding import set_aside
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.remarks import initial_state
 from grounded_trials.workspace.placing import placing
-from workspaces import CONFIG, make
+from workspaces import make
 
 
 @pytest.fixture
@@ -53,18 +53,6 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     assert found.then.verb == "propose"
 
 
-def test_a_first_start_that_changes_part_of_its_cost_counts(w, tmp_path, monkeypatch):
-    ran, *_ = read_trial(run(w))
-    changes = 0.35 * w.task.utility(ran)
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: changes)
-    for off in (0.2, -0.15):
-        found = placed(w, tmp_path, ran, off)
-        (told,) = of_code(found, "run.start*")
-        assert (told.code, told.facts["change"]) == ("run.start", pytest.approx(changes))
-        assert told.facts["unknown"] and found.then.verb != "discard"
-        w.forget()
-
-
 def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, tmp_path):
     ran, *_ = read_trial(run(w))
     for off in (0.01, -0.01, 0.9):
@@ -72,17 +60,6 @@ def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, 
     set_aside(w, "discard", [last], "")
     w.forget()
     assert placing(w).rms[0] == pytest.approx(0.01)
-
-
-def test_a_start_as_usual_counts_though_earlier_ones_happened_to_agree(w, tmp_path, monkeypatch):
-    ran, *_ = read_trial(run(w))
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: 5 * w.task.utility(ran))
-    monkeypatch.setattr(initial_state, "_always_there", lambda *_: None)
-    monkeypatch.setattr(initial_state, "_scatter", lambda *_: 0.0)
-    for off in (0.19, 0.15, 0.20):
-        placed(w, tmp_path, ran, off)
-    told, far = (placed(w, tmp_path, ran, off) for off in (-0.30, -0.90))
-    assert of_code(told, "run.start") and of_code(far, "run.start_spoils")
 
 
 def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
@@ -97,17 +74,6 @@ def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
     assert told.facts["change"] == pytest.approx(whole)
 
 
-def test_runs_of_an_earlier_task_count_by_their_own_start(w, tmp_path):
-    ran, *_ = read_trial(run(w))
-    for off in (0.05, -0.05):
-        placed(w, tmp_path, ran, off)
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text().replace("[task]", "[task]\nstart = { x = 0.4 }"))
-    w.forget()
-    known = placing(w)
-    assert np.allclose(np.sort(known.off[:, 0]), [-0.05, 0.05])
-
-
 def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
     ran, *_ = read_trial(run(w))
     for off in (-0.09, -0.1, -0.08):
@@ -117,17 +83,6 @@ def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
     toml.write_text(toml.read_text().replace("[task]", "[task]\nstart = { x = -0.09 }"))
     w.forget()
     assert np.allclose(np.sort(placing(w).off[:, 0]), [-0.01, 0.0, 0.01], atol=1e-6)
-
-
-def test_next_names_the_way_on_that_status_names(w, tmp_path):
-    ran, *_ = read_trial(run(w))
-    moved = np.array(ran.states)
-    moved[0, 0] += 0.6
-    write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-    out = grounded("-C", w.folder, "next", tmp_path / "t.mcap", "--candidate", "c0001").out
-    said = grounded("-C", w.folder, "status").out
-    assert "discard t0001" in " ".join(out.partition("next:")[2].replace("\\\n", " ").split())
-    assert all("or go on with it: `propose`" in " ".join(one.split()) for one in (out, said))
 
 
 def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
@@ -145,10 +100,3 @@ def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
     assert with_error(expected, known["std"]) in said
     assert all(one["end_std"] == 0 for one in found.to_json()["off_target"])
     assert found.predicted.facts["runs"] == 3
-
-
-def test_before_the_first_run_a_promise_says_that_it_lacks_the_placing(tmp_path):
-    w = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
-    said = " ".join(grounded("-C", w.folder, "propose").out.split())
-    assert "starts exactly at [task] start" in said
-    assert grounded("-C", w.folder, "propose", "--json").json["from_usual_starts"] is None
