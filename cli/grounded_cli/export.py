@@ -1,4 +1,4 @@
-"""grounded export: write a candidate as a file that the robot's own program reads."""
+"""grounded export: write a candidate for the robot's own program, or the model for a simulator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 from grounded.errors import NextCommand
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import anyway, as_json
-from grounded_cli.console.terminal import sentence, show, show_json, tell
+from grounded_cli.console.terminal import sentence, show, show_json, table, tell
 from grounded_cli.console.workspace_option import (
     in_workspace,
     next_line,
@@ -27,7 +27,7 @@ USES = {
 
 
 @click.command("export")
-@click.argument("candidate", metavar="ID", shell_complete=complete.candidates)
+@click.argument("candidate", metavar="ID", required=False, shell_complete=complete.candidates)
 @click.option(
     "--format",
     "form",
@@ -45,14 +45,18 @@ USES = {
     is_flag=True,
     help="Write npz, and beside it grounded_runner.py, which runs it and needs only numpy.",
 )
+@click.option(
+    "--model", is_flag=True, help="Write the model with the values found: MJCF, URDF or model.py."
+)
 @anyway
 @in_workspace
 @as_json
 def command(
-    candidate: str,
+    candidate: str | None,
     form: str | None,
     output: str | None,
     runner: bool,
+    model: bool,
     anyway: bool,
     json_: bool,
 ) -> None:
@@ -64,7 +68,14 @@ def command(
     `best` names the best candidate so far. A candidate that must not be run any more (see
     `grounded run`) is refused. One that was run in an earlier task is allowed if it keeps to the
     current [limits] and [safety].
+
+    --model writes the model as it is now, fitted values and adopted effects, in the form that it
+    came in; all else of that file stays as it is.
     """
+    if (candidate is None) != model or (model and (form or runner or anyway)):
+        raise click.UsageError("expected a candidate, or --model, without other options but -o")
+    if candidate is None:
+        return _model(output, json_)
     named = Path(output or "").suffix.lstrip(".").lower()
     run = candidate.lower().startswith("t") or form == "bag"
     if form is not None and named in USES and named != form:
@@ -93,3 +104,14 @@ def command(
                 show(next_line(NextCommand("report", ("--html",))))
             else:
                 show(f"\ncopy both to the robot, run it, record a log, then\n{next_line(then)}")
+
+
+def _model(output: str | None, json_: bool) -> None:
+    """Write the model, and tell its values."""
+    done = open_workspace().export_model(output)
+    tell(done.findings, all_=True)
+    if json_:
+        return show_json(done.to_json())
+    show(f"the model is written to {', '.join(map(str, (done.file, *done.others)))}")
+    rows = [(one.name, f"{one.was:g}", one.now.text) for one in done.values]
+    show("\n" + table(rows, ("", "was", "now")) if rows else "  nothing in it is changed")

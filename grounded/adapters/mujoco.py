@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.adapters.beside import located
 from grounded.adapters.mujoco_body import MujocoBody
 from grounded.adapters.mujoco_files import load
 from grounded.adapters.mujoco_names import (
@@ -110,6 +111,7 @@ def model(
     values = {s.name: s.param(given) for s, given in zip(settings, named.values(), strict=True)}
     several = threads or min(os.cpu_count() or 1, MOST_THREADS)
     stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, several)
+    stepper.source = None if str(xml).lstrip().startswith("<") else located(xml).resolve()
     angles = [
         joint_name(compiled, j)
         for j in range(compiled.njnt)
@@ -141,6 +143,8 @@ def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, t
 
 class MujocoStepper(Stepper):
     """Computes control steps of MuJoCo for many samples at a time."""
+
+    source: Path | None = None  # the file that it was loaded from
 
     def __init__(
         self,

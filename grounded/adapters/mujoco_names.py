@@ -186,6 +186,7 @@ SLIDE_UNITS = {"N m s/rad": "N s/m", "N m": "N", "kg m^2": "kg", "N m/rad": "N/m
 class Setting:
     """A parameter: its name in the Model, its unit, its value in the file, and its places."""
 
+    spec: str  # "element.field"
     name: str
     unit: str
     nominal: float
@@ -243,7 +244,7 @@ def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
             raise GroundedError(f"'{spec}': the body '{element}' has no mass")
         inertia = np.array(compiled.body_inertia[at]) / nominal
         places = (*places, ("body_inertia", at, inertia))
-    return Setting(identifier(f"{element}_{name}"), unit, nominal, places)
+    return Setting(spec, identifier(f"{element}_{name}"), unit, nominal, places)
 
 
 def _places(compiled: Any, field: Field, at: int) -> tuple[Place, ...]:

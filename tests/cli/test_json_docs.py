@@ -62,6 +62,7 @@ COMMANDS = [
     ("discard", "t0002"),
     ("export", "best", "-o", "{folder}/best.npz", "--runner"),
     ("adopt", "viscous_friction:v"),
+    ("export", "--model", "-o", "{folder}/found.py"),
     ("inspect", "{trial}"),
     ("ingest", "{trial}"),
 ]

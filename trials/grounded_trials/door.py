@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.candidates.running import Ran
     from grounded_trials.workspace.discarding import SetAside
     from grounded_trials.workspace.fitting import Fitted
+    from grounded_trials.workspace.home.taking_home import TakenHome
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.intake.ingest import Ingested
     from grounded_trials.workspace.looping import NextRun
@@ -388,6 +389,19 @@ class Workspace(Folder):
 
             return export_run(here, candidate, form, file, runner=runner)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
+
+    def export_model(self, path: str | Path | None = None) -> TakenHome:
+        """Write the model as it is now, in the form that it came in, for other programs.
+
+        An MJCF or URDF file, or a model.py, with the values of fitted parameters and of adopted
+        effects; what the form can't hold is among the findings, with its equation.
+
+        Args:
+            path: the file; None: named after the model's, in the current folder.
+        """
+        from grounded_trials.workspace.home.taking_home import export_model
+
+        return export_model(self.forget(), Path(path) if path else None)
 
     def verify(self) -> Verified:
         """Check all stored files for changes, damage, deletion and replacement.

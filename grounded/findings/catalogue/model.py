@@ -143,4 +143,26 @@ ENTRIES: dict[str, Entry] = {
         "target.csv is still the logged drive, {about}",
         "draw the manoeuvre first (`grounded target --help`), or propose to repeat that drive",
     ),
+    # taken home
+    "not_held": Entry(
+        "warn",
+        "{about} has no place in this form: {equation}, with {values}",
+        "add it to the program that steps the model",
+    ),
+    "no_place": Entry(
+        "warn",
+        "{about} = {value} has no place in the file",
+        "set it where the model is loaded",
+    ),
+    "reads": Entry("note", "the file reads {about}", "put {about:it/them} beside it"),
+    "no_file": Entry(
+        "refuse",
+        "the model is not in a file of its own that can be written with other values",
+        "put it into an MJCF, URDF or Python file that model.py names",
+    ),
+    "other_form": Entry(
+        "refuse",
+        "{file} can't be written: the model comes from {source}, which stays as it is",
+        "name another file with the same ending",
+    ),
 }

@@ -1,0 +1,216 @@
+"""export --model: the model as it is now, in the form that it came in."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.errors import GroundedError
+from grounded.policy import Policy
+from grounded.rollout import simulate
+from grounded_trials import Workspace
+from workspaces import make
+
+mj = pytest.importorskip("mujoco")
+
+ARM = """<?xml version="1.0"?>
+<!-- two links, ä -->
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default>
+    <joint damping="0.02"/>
+    <default class="big"><joint armature="0.001"/></default>
+  </default>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <body name="fore" pos="0 0 -0.3">
+        <joint name="elbow"   axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.02" mass="0.3"/>
+      </body>
+      <joint name='shoulder' axis="0 1 0" class="big" />
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="0.6"/>
+    </body>
+  </worldbody>
+  {actuators}
+</mujoco>
+"""
+ACTUATORS = """<actuator>
+    <motor name="m1" joint="shoulder" gear="2"/>
+    <motor name="m2" joint="elbow"/>
+  </actuator>"""
+MODEL = """from grounded.adapters import mujoco
+
+model = mujoco.model("arm.xml", params={"fore.mass": (0.1, 1.0), "elbow.damping": (0, 1)})
+"""
+FOUND = """params = { fore_mass = 0.35, elbow_damping = 0.05 }
+effects = [
+    { name = "joint_friction:m1<-shoulder_vel", c = 0.1, b = 0.03, width = 0.01 },
+    { name = "added_inertia:m2<-elbow_vel", J = 0.004 },
+    { name = "delay:m1+m2", d = 0.03 },
+    { name = "first_order_lag:m1", tau = 0.05 },
+    EFFECT
+]
+
+[task]"""
+WANTED = {
+    "fore.mass": 0.35,
+    "elbow.damping": 0.05,
+    "shoulder.frictionloss": 0.2,
+    "shoulder.damping": 0.08,
+    "elbow.armature": 0.004,
+    "m1.delay": 0.03,
+    "m2.delay": 0.03,
+    "m1.lag": 0.05,
+}
+
+
+def adopted(folder: Path, files: dict[str, str], effect: str = "") -> Workspace:
+    """A workspace of an arm with parameters and effects in its grounded.toml."""
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    w = Workspace.create(folder / "w", model=folder / "model.py")
+    toml = w.folder / "grounded.toml"
+    found = FOUND.replace("EFFECT", effect)
+    toml.write_text(toml.read_text("utf-8").replace("[task]", found, 1), encoding="utf-8")
+    return Workspace(w.folder)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    files = {"arm.xml": ARM.replace("{actuators}", ACTUATORS), "model.py": MODEL}
+    effect = '{ name = "dead_zone:m2", c = 0.02 },'
+    return adopted(tmp_path_factory.mktemp("arm") / "a", files, effect)
+
+
+def test_the_file_has_the_values_and_the_rest_of_it_to_the_byte(arm, tmp_path):
+    done = arm.export_model(tmp_path / "found.xml")
+    assert {one.name: one.now.value for one in done.values} == pytest.approx(WANTED)
+    before = done.source.read_bytes().splitlines()
+    after = done.file.read_bytes().splitlines()
+    old = [
+        line[2:]
+        for line in difflib.ndiff([*map(repr, before)], [*map(repr, after)])
+        if line[0] == "-"
+    ]
+    assert len(old) == 4  # the lines of two joints and two actuators, nothing else
+    compiled = mj.MjModel.from_xml_path(str(done.file))
+    assert compiled.dof_damping[compiled.joint("shoulder").dofadr[0]] == pytest.approx(0.08)
+    assert compiled.dof_armature == pytest.approx([0.001, 0.004])  # that of the class stays
+    assert compiled.actuator_delay == pytest.approx([0.03, 0.03])
+
+
+def test_what_the_format_can_not_hold_is_told_with_its_equation(arm, tmp_path):
+    done = grounded("-C", arm.folder, "export", "--model", "-o", tmp_path / "x.xml", "--json").json
+    (lost,) = [one for one in done["findings"] if one["code"] == "model.not_held"]
+    assert lost["about"] == ["dead_zone:m2"] and "sign(u)" in lost["facts"]["equation"]
+    assert lost["facts"]["equation"] in (tmp_path / "x.xml").read_text("utf-8")
+
+
+def test_the_users_own_file_is_never_overwritten(arm, tmp_path):
+    for path in (arm.folder / "arm.xml", tmp_path / "arm.urdf"):
+        with pytest.raises(GroundedError) as error:
+            arm.export_model(path)
+        assert error.value.finding.code == "model.other_form"
+
+
+def test_an_included_file_that_changes_is_written_beside(tmp_path):
+    files = {
+        "arm.xml": ARM.replace("{actuators}", '<include file="motors.xml"/>'),
+        "motors.xml": f"<mujocoinclude>{ACTUATORS}</mujocoinclude>",
+        "model.py": MODEL,
+    }
+    w = adopted(tmp_path / "a", files)
+    done = w.export_model(w.folder / "found.xml")
+    assert {one.name: one.now.value for one in done.values} == pytest.approx(WANTED)
+    assert (w.folder / "motors.xml").read_text("utf-8") == files["motors.xml"]
+    assert [path.parent for path in done.others] == [w.folder]
+    assert mj.MjModel.from_xml_path(str(done.file)).actuator_delay == pytest.approx([0.03, 0.03])
+
+
+def test_mujoco_with_the_file_moves_as_the_model_predicts(tmp_path):
+    files = {"arm.xml": ARM.replace("{actuators}", ACTUATORS), "model.py": MODEL}
+    w = adopted(tmp_path / "a", files)
+    done, plan = w.export_model(tmp_path / "found.xml"), w.planner.plan
+    steps = np.arange(plan.horizon)
+    u = np.stack([0.8 * np.sin(0.2 * steps), 0.3 * np.cos(0.35 * steps)], axis=1)
+    wide, n = np.full(2, np.inf), plan.model.n
+    policy = Policy(
+        feedforward=u,
+        low=-wide,
+        high=wide,
+        dt=plan.dt,
+        state_names=plan.model.state_names,
+        input_names=plan.model.input_names,
+        depths=(1, 1),
+        angles=(False,) * n,
+        past=np.zeros(2),
+    )
+    ahead = simulate(plan.problem(exact=True), w.planner.widened(policy)).states[:, :4]
+    model = mj.MjModel.from_xml_path(str(done.file))
+    data, path = mj.MjData(model), []
+    for now in u:
+        path.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = now
+        mj.mj_step(model, data, round(plan.dt / model.opt.timestep))
+    off = np.abs(np.array(path) - ahead[:-1])[:30, :2].max(axis=0)
+    assert (off < 0.1 * np.std(path[:30], axis=0)[:2]).all()
+
+
+def test_a_model_py_keeps_all_but_its_numbers(tmp_path):
+    w = make(tmp_path / "w")
+    toml = w.folder / "grounded.toml"
+    text = toml.read_text("utf-8").replace("[task]", "params = { mass = 1.4 }\n\n[task]", 1)
+    toml.write_text(text, encoding="utf-8")
+    done = Workspace(w.folder).export_model(tmp_path / "found.py")
+    own = [
+        line for line in done.file.read_text("utf-8").splitlines(keepends=True) if line[0] != "#"
+    ]
+    before = (w.folder / "model.py").read_text("utf-8")
+    assert "".join(own) == before.replace("Param(1.0,", "Param(1.4,")
+
+
+URDF = """<robot name="arm">
+  <link name="base"/>
+  <link name="fore">
+    <inertial>
+      <origin xyz="0 0 -0.1"/>
+      <mass value="0.3"/>
+      <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.0001"/>
+    </inertial>
+  </link>
+  <joint name="elbow" type="continuous">
+    <parent link="base"/> <child link="fore"/>
+    <axis xyz="0 1 0"/>
+  </joint>
+</robot>
+"""
+
+
+def test_a_urdf_has_masses_damping_and_friction_and_no_armature(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
+    fields = 'params={"fore.mass": (0.1, 1.0), "elbow.damping": (0, 1), "elbow.armature": (0, 1)}'
+    own = MODEL.replace("arm.xml", "arm.urdf")
+    own = own[: own.index("params")] + fields + ")\n"
+    (tmp_path / "model.py").write_text(own, encoding="utf-8")
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "model.py")
+    toml = w.folder / "grounded.toml"
+    found = """params = { fore_mass = 0.6, elbow_damping = 0.05, elbow_armature = 0.01 }
+effects = [ { name = "coulomb_friction:elbow_vel", c = 2.0, width = 0.01 } ]
+
+[task]"""
+    toml.write_text(toml.read_text("utf-8").replace("[task]", found, 1), encoding="utf-8")
+    done = Workspace(w.folder).export_model(tmp_path / "found.urdf")
+    assert [(one.code, one.about) for one in done.findings] == [
+        ("model.no_place", ("elbow.armature",))
+    ]
+    compiled = mj.MjModel.from_xml_path(str(done.file))
+    assert compiled.body_mass[-1] == pytest.approx(0.6)
+    assert compiled.dof_damping == pytest.approx([0.05])
+    M = 0.004 + 0.6 * 0.1**2 + 0.01  # kg m^2, about the joint
+    assert compiled.dof_frictionloss == pytest.approx([2.0 * M])

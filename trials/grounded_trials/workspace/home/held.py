@@ -1,0 +1,302 @@
+"""Which number of an MJCF file holds which value of the model: a parameter, or an adopted effect.
+
+An effect that acts where an input enters is a torque of the joint that the input drives: a unit of
+the input is `gain gear` N m there, and T = c sign(w) + b w is frictionloss and damping. One that
+acts on the rate of a joint with a constant inertia M of its own is M times as much.
+
+    parameter             the number of that name
+    joint_friction        frictionloss + c push, damping + b push
+    coulomb_friction:w    frictionloss + c M        viscous_friction:w    damping + k M
+    added_inertia         armature + J push         rate_gain:w           armature - g M / (1 + g)
+    joint_spring          stiffness + k push, springref - b / k
+    input_gain            gear (1 + g), or the gain where a force is limited or fed back
+    delay, latency        delay of the actuator     first_order_lag       filterexact with tau
+
+Everything else is told with its equation.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.adapters.mujoco import MujocoStepper
+from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS
+from grounded.adapters.stepper import library
+
+Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
+STILL = 2e-3  # relative change of a joint's inertia with the pose below which it is constant
+POSES = 8  # poses at which that is looked at
+HINGE, SLIDE, JOINT = 3, 2, 0  # mjtJoint, mjTRN_JOINT
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of the file with its value now.
+
+    Attributes:
+        kind: body, joint, actuator or geom.
+        index: of the element in MjModel.
+        name: of the element and the field, `elbow.damping`.
+        field: damping, mass, ...
+        value: its value now.
+        was: its value in the file.
+        std: its standard deviation, NaN if it is not known.
+        unit: of the three.
+    """
+
+    kind: str
+    index: int
+    name: str
+    field: str
+    value: float
+    was: float
+    std: float
+    unit: str
+
+
+class Held:
+    """Collects the numbers of a file that parameters and effects change."""
+
+    def __init__(
+        self, stepper: MujocoStepper, file: Any, params: Mapping[str, tuple[float, float]]
+    ) -> None:
+        """Start with the model's own parameters.
+
+        Args:
+            stepper: of the model.
+            file: its file as it is, compiled.
+            params: value and standard deviation of each parameter.
+        """
+        self.mj, self.stepper, self.file = library("mujoco"), stepper, file
+        self.now = copy.deepcopy(self.file)
+        self._delta = dict[Key, tuple[float, float]]()  # what is added, and its variance
+        for setting in stepper.settings:
+            value, std = params[setting.name]
+            setting.write(self.now, value)
+            element, _, field = setting.spec.rpartition(".")
+            kind = FIELDS[field].element
+            index = self.mj.mj_name2id(self.file, _object(self.mj, kind), element)
+            if value != setting.nominal:
+                self.add(kind, index, field, value - setting.nominal, std)
+        self.mj.mj_setConst(self.now, self.mj.MjData(self.now))
+
+    def add(self, kind: str, index: int, field: str, by: float, std: float) -> None:
+        """Add to a number."""
+        value, variance = self._delta.get((kind, index, field), (0.0, 0.0))
+        self._delta[kind, index, field] = value + by, variance + std**2
+
+    def adopt(self, effect: str, c: Mapping[str, float], std: Mapping[str, float]) -> bool:
+        """Add an effect's values; return whether the format can hold it."""
+        family, _, target = effect.partition(":")
+        rule = _RULES.get(family)
+        return rule is not None and rule(self, target, c, std)
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """The numbers that differ from those of the file."""
+        found = []
+        for (kind, index, field), (by, variance) in self._delta.items():
+            was, std = value_of(self.file, kind, index, field), math.sqrt(variance)
+            name = f"{self._called(kind, index)}.{field}"
+            unit = self._unit(kind, index, field)
+            found.append(Number(kind, index, name, field, was + by, was, std, unit))
+        return tuple(found)
+
+    def without(self, lost: Sequence[Number]) -> tuple[Number, ...]:
+        """Return the numbers but some."""
+        return tuple(one for one in self.numbers if one not in lost)
+
+    # -- where an effect acts
+
+    def dof(self, state: str) -> int:
+        """Return the degree of freedom of a hinge's or slide's velocity or position, else -1."""
+        names, nv = self.stepper.states, self.file.nv
+        dof = names.index(state) % nv if state in names[: 2 * nv] else -1
+        single = dof >= 0 and self.file.jnt_type[self.file.dof_jntid[dof]] >= SLIDE
+        return dof if single else -1
+
+    def actuator(self, name: str) -> int:
+        """Return the index of the actuator of an input, -1 for the torque of a joint."""
+        controls = self.stepper.controls
+        one = controls.columns[controls.names.index(name)]
+        plain = getattr(self.file, "nactuator", self.file.nu) == self.file.nu
+        return int(one) if plain and not controls.torques else -1
+
+    def push(self, name: str) -> float:
+        """Return the torque on its joint by a unit of an input; 0 if it is not proportional."""
+        i = self.actuator(name)
+        if i < 0:
+            return float(self.stepper.controls.torques)
+        single = self.now.actuator_trntype[i] == JOINT and self.now.actuator_dyntype[i] == 0
+        if not single or self.now.actuator_gaintype[i]:
+            return 0.0
+        return float(self.now.actuator_gainprm[i, 0] * self.now.actuator_gear[i, 0])
+
+    def inertia(self, dof: int) -> float:
+        """Return a joint's inertia if it is constant and its own, else 0."""
+        mj, model = self.mj, self.now
+        rng, data, unit = np.random.default_rng(0), mj.MjData(model), np.eye(model.nv)[[dof]]
+        pushed = np.zeros((POSES, model.nv))  # rates by a unit of torque
+        for row in pushed:
+            data.qpos[:] = model.qpos0
+            mj.mj_integratePos(model, data.qpos, rng.uniform(-2, 2, model.nv), 1.0)
+            mj.mj_forward(model, data)
+            mj.mj_solveM(model, data, row[None], unit)
+        own = pushed[0, dof]
+        apart = np.abs(pushed - own * unit).max()
+        return float(1 / own) if apart < STILL * own else 0.0
+
+    def _called(self, kind: str, index: int) -> str:
+        name = self.mj.mj_id2name(self.file, _object(self.mj, kind), index)
+        return name or f"{kind}{index}"
+
+    def _unit(self, kind: str, index: int, field: str) -> str:
+        unit = FIELDS[field].unit if field in FIELDS else MORE[field][1]
+        slides = kind == "joint" and self.file.jnt_type[index] == SLIDE
+        return SLIDE_UNITS.get(unit, unit) if slides else unit
+
+
+def value_of(model: Any, kind: str, index: int, field: str) -> float:
+    """Return a number of a compiled model."""
+    if field in MORE:
+        return float(MORE[field][0](model, index))
+    array, column, factor = FIELDS[field].places[0]
+    at: Any = index if column is None else (index, column)
+    at = int(model.jnt_dofadr[index]) if array.startswith("dof_") else at
+    return float(np.ravel(getattr(model, array)[at])[0]) / factor
+
+
+def _tau(model: Any, i: int) -> float:
+    return float(model.actuator_dynprm[i, 0]) * bool(model.actuator_dyntype[i])
+
+
+# fields that no parameter of the adapter names: how to read them, and their units
+MORE: dict[str, tuple[Callable[[Any, int], float], str]] = {
+    "springref": (lambda m, i: float(m.qpos_spring[m.jnt_qposadr[i]]), "rad"),
+    "delay": (lambda m, i: float(getattr(m, "actuator_delay", np.zeros(m.nu))[i]), "s"),
+    "lag": (_tau, "s"),
+}
+
+Values = Mapping[str, float]
+
+
+def _object(mj: Any, kind: str) -> int:
+    return int(getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"))
+
+
+def _friction(held: Held, target: str, c: Values, std: Values) -> bool:
+    tau, _, w = target.partition("<-")
+    dof, push = held.dof(w), held.push(tau)
+    return _on_joint(held, dof, push, {"frictionloss": "c", "damping": "b"}, c, std)
+
+
+def _on_joint(
+    held: Held, dof: int, factor: float, fields: Mapping[str, str], c: Values, std: Values
+) -> bool:
+    """Add quantities of an effect, times a factor, to fields of the joint of a dof."""
+    if dof < 0 or not factor:
+        return False
+    joint = int(held.file.dof_jntid[dof])
+    for field, name in fields.items():
+        if c.get(name):
+            spread = abs(factor) * std.get(name, math.nan)
+            held.add("joint", joint, field, factor * c[name], spread)
+    return True
+
+
+def _on_rate(field: str, name: str) -> Callable[[Held, str, Values, Values], bool]:
+    """Return the rule of a friction that acts on the rate of a joint."""
+
+    def rule(held: Held, target: str, c: Values, std: Values) -> bool:
+        dof = held.dof(target)
+        return dof >= 0 and _on_joint(held, dof, held.inertia(dof), {field: name}, c, std)
+
+    return rule
+
+
+def _armature(held: Held, target: str, c: Values, std: Values) -> bool:
+    tau, _, w = target.partition("<-")
+    push = held.push(tau)
+    return _inertia(held, held.dof(w), push * c["J"], push * std.get("J", math.nan))
+
+
+def _rate_gain(held: Held, target: str, c: Values, std: Values) -> bool:
+    dof = held.dof(target)
+    M = held.inertia(dof) if dof >= 0 else 0.0
+    slope = -M / (1 + c["g"]) ** 2
+    return _inertia(held, dof, -c["g"] * M / (1 + c["g"]), slope * std.get("g", math.nan))
+
+
+def _inertia(held: Held, dof: int, by: float, std: float) -> bool:
+    """Add to a joint's armature, which can't be negative."""
+    if dof < 0 or not by or held.now.dof_armature[dof] + by < 0:
+        return False
+    held.add("joint", int(held.file.dof_jntid[dof]), "armature", by, abs(std))
+    held.now.dof_armature[dof] += by  # frictions of its rate are of the inertia now
+    return True
+
+
+def _spring(held: Held, target: str, c: Values, std: Values) -> bool:
+    tau, _, q = target.partition("<-")
+    dof, push = held.dof(q), held.push(tau)
+    if dof < 0 or not push * c["k"] > 0:
+        return False
+    joint = int(held.file.dof_jntid[dof])
+    if held.now.jnt_stiffness[joint]:
+        return False
+    held.add("joint", joint, "stiffness", push * c["k"], abs(push) * std.get("k", math.nan))
+    rest = value_of(held.file, "joint", joint, "springref")
+    held.add("joint", joint, "springref", -c["b"] / c["k"] - rest, std.get("b", math.nan) / c["k"])
+    return True
+
+
+def _each(held: Held, target: str) -> list[int]:
+    """Return the actuators of inputs joined by "+"; none if one of them is not an actuator."""
+    found = [held.actuator(name) for name in target.split("+")]
+    return found if min(found) >= 0 else []
+
+
+def _gain(held: Held, target: str, c: Values, std: Values) -> bool:
+    each = _each(held, target)
+    for i in each:
+        now = held.now
+        plain = not (now.actuator_biastype[i] or now.actuator_forcelimited[i])
+        field = "gear" if plain else "gain"
+        was = float(now.actuator_gear[i, 0] if plain else now.actuator_gainprm[i, 0])
+        held.add("actuator", i, field, was * c["g"], abs(was) * std.get("g", math.nan))
+    return bool(each)
+
+
+def _delay(held: Held, target: str, c: Values, std: Values) -> bool:
+    each = _each(held, target) if hasattr(held.file, "actuator_delay") else []
+    for i in each:
+        held.add("actuator", i, "delay", c["d"], std.get("d", math.nan))
+    return bool(each)
+
+
+def _lag(held: Held, target: str, c: Values, std: Values) -> bool:
+    each = _each(held, target)
+    if any(held.file.actuator_dyntype[i] for i in each):
+        return False  # two lags in a row
+    for i in each:
+        held.add("actuator", i, "lag", c["tau"], std.get("tau", math.nan))
+    return bool(each)
+
+
+_RULES: dict[str, Callable[[Held, str, Values, Values], bool]] = {
+    "joint_friction": _friction,
+    "coulomb_friction": _on_rate("frictionloss", "c"),
+    "viscous_friction": _on_rate("damping", "k"),
+    "added_inertia": _armature,
+    "rate_gain": _rate_gain,
+    "joint_spring": _spring,
+    "input_gain": _gain,
+    "delay": _delay,
+    "first_order_lag": _lag,
+}

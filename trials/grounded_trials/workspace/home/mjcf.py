@@ -1,0 +1,227 @@
+"""Writes numbers into an MJCF file and the files that it includes.
+
+A number is written on its own element, also where the file has it from a default class. A vector
+keeps the numbers behind the first one. Of an actuator's shortcuts (motor, velocity ...) some have
+no attribute for a gain or a lag: such an element becomes the `general` one that it stands for.
+A body whose mass follows from its geoms gets an `inertial` element.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.adapters.mujoco_names import FIELDS
+from grounded_trials.workspace.home.held import Number
+from grounded_trials.workspace.home.xml_text import Element, XmlText
+
+VECTORS = {"gear": "actuator_gear", "friction": "geom_friction"}  # written as a whole if new
+# shortcuts that `general` can replace, and what each says in attributes of its own
+SHORTCUTS = {
+    "motor": (),
+    "position": ("kp", "kv", "dampratio", "timeconst", "inheritrange"),
+    "velocity": ("kv",),
+    "general": (),
+}
+# the attribute of a shortcut that holds a field
+OWN = {
+    ("position", "kp"): "kp",
+    ("position", "kv"): "kv",
+    ("velocity", "kv"): "kv",
+    ("position", "tau"): "timeconst",
+    ("position", "lag"): "timeconst",
+}
+GAINS, BIASES = ("fixed", "affine"), ("none", "affine")  # mjtGain, mjtBias
+LAGS = {0: "none", 2: "filter", 3: "filterexact"}  # mjtDyn
+
+
+class Mjcf:
+    """An MJCF file with what it includes, and the elements of its compiled model."""
+
+    def __init__(self, path: Path, compiled: Any) -> None:
+        self.path, self.compiled = path, compiled
+        self.texts = dict[Path, XmlText]()
+        self._includes = dict[Path, Element]()  # the element that names each included file
+        self.main = self._read(path)
+        tops = list(self._inside(self.main.root))
+        self.worlds = [one for one in tops if one.tag == "worldbody"]
+        self.bodies = [one for world in self.worlds for one in self._bodies(world)]
+        groups = (self._inside(one) for one in tops if one.tag == "actuator")
+        self.actuators = [one for group in groups for one in group]
+
+    def element(self, kind: str, index: int) -> Element | None:
+        """Return the element of a body, joint, geom or actuator of the compiled model.
+
+        None if the file makes its elements in another way (replicate, attach).
+        """
+        model = self.compiled
+        if kind == "actuator":
+            found, name = self.actuators, model.actuator(index).name
+        elif kind == "body":
+            found, name, index = self.bodies, model.body(index).name, index - 1
+        else:
+            body = int(getattr(model, "jnt_bodyid" if kind == "joint" else "geom_bodyid")[index])
+            inside = self.worlds if body == 0 else self.bodies[body - 1 : body]
+            tags = ("joint", "freejoint") if kind == "joint" else ("geom",)
+            found = [one for each in inside for one in self._inside(each) if one.tag in tags]
+            first = model.body_jntadr if kind == "joint" else model.body_geomadr
+            name = getattr(model, kind)(index).name
+            index -= int(first[body])
+        named = [one for one in found if name and one.get("name") == name]
+        if named:
+            return named[0]
+        one = found[index] if 0 <= index < len(found) else None
+        return None if one is None or one.get("name") != name else one
+
+    def write(self, numbers: Sequence[Number]) -> list[Number]:
+        """Write numbers into the text; return those that have no place in it."""
+        return [one for one in numbers if not self._write(one)]
+
+    def files(self, to: Path, comment: str) -> Mapping[Path, bytes]:
+        """Return the contents of the file to write, and of changed ones that it includes.
+
+        An included file is never overwritten: a changed one gets a name of its own beside `to`.
+        """
+        found = dict[Path, bytes]()
+        for path, text in reversed(self.texts.items()):  # an included file before what includes it
+            if path == self.path or not text.changed:
+                continue
+            there = to.with_name(f"{to.stem}-{path.name}")
+            found[there] = text.written()
+            include = self._includes[path]
+            include.text.set(include, "file", there.name)
+        self.main.insert(self.main.root.begin, comment)
+        return {to: self.main.written(), **found}
+
+    def _read(self, path: Path) -> XmlText:
+        self.texts[path] = XmlText(path.read_bytes(), str(path))
+        return self.texts[path]
+
+    def _inside(self, element: Element) -> Iterator[Element]:
+        """Yield what is directly in an element, also by an include or in a frame."""
+        for one in element.children:
+            if one.tag == "include":
+                path = (self.path.parent / one.get("file")).resolve()
+                if path not in self.texts:
+                    self._includes[path] = one
+                    self._read(path)
+                yield from self._inside(self.texts[path].root)
+            elif one.tag == "frame":
+                yield from self._inside(one)
+            else:
+                yield one
+
+    def _bodies(self, element: Element) -> Iterator[Element]:
+        """Yield bodies in the order of MjModel: each before those in it."""
+        for one in self._inside(element):
+            if one.tag == "body":
+                yield one
+                yield from self._bodies(one)
+
+    def _write(self, number: Number) -> bool:
+        element = self.element(number.kind, number.index)
+        if element is None:
+            return False
+        if number.field == "mass":
+            return self._mass(element, number)
+        if number.kind == "actuator":
+            return self._actuator(element, number)
+        value = number.value
+        if number.field == "springref" and self._degrees():
+            value = math.degrees(value)
+        self._first(element, number.field, value, number.index)
+        return True
+
+    def _first(self, element: Element, name: str, value: float, index: int) -> None:
+        """Set the first number of an attribute."""
+        rest = element.get(name).split()[1:]
+        if not element.get(name) and name in VECTORS:
+            rest = [f"{one:.12g}" for one in getattr(self.compiled, VECTORS[name])[index, 1:]]
+        element.text.set(element, name, " ".join([f"{value:.8g}", *rest]))
+
+    def _degrees(self) -> bool:
+        stated = [one.get("angle") for one in self.main.root.below() if one.tag == "compiler"]
+        return "radian" not in stated
+
+    def _mass(self, element: Element, number: Number) -> bool:
+        """Scale the mass and the inertia of a body."""
+        factor, text = number.value / number.was, element.text
+        inertial = next((one for one in self._inside(element) if one.tag == "inertial"), None)
+        if inertial is None:
+            model, i = self.compiled, number.index
+            row = {
+                "pos": model.body_ipos[i],
+                "quat": model.body_iquat[i],
+                "mass": [number.value],
+                "diaginertia": model.body_inertia[i] * factor,
+            }
+            inertial = text.child(element, "inertial")
+            for name, each in row.items():
+                text.set(inertial, name, " ".join(f"{x:.10g}" for x in each))
+            return True
+        text.set(inertial, "mass", f"{number.value:.8g}")
+        for name in ("diaginertia", "fullinertia"):
+            if given := inertial.get(name):
+                scaled = np.array(given.split(), float) * factor
+                text.set(inertial, name, " ".join(f"{x:.10g}" for x in scaled))
+        return True
+
+    def _actuator(self, element: Element, number: Number) -> bool:
+        text, field, value = element.text, number.field, number.value
+        if field == "delay":
+            samples = math.ceil(value / self.compiled.opt.timestep - 1e-9) + 1
+            for name, new in (("delay", f"{value:.8g}"), ("nsample", f"{samples}")):
+                text.set(element, name, new)
+            text.set(element, "interp", "linear")
+            return True
+        if field == "gear":
+            self._first(element, "gear", value, number.index)
+            return True
+        if own := OWN.get((element.tag, field)):
+            text.set(element, own, f"{value:.8g}")
+            return True
+        return self._general(element, number)
+
+    def _general(self, element: Element, number: Number) -> bool:
+        """Write a gain, a lag or a fed-back gain as the attributes of a `general` actuator."""
+        model, i, text = self.compiled, number.index, element.text
+        kinds = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
+        if element.tag not in SHORTCUTS or max(kinds[:2]) > 1 or int(kinds[2]) not in LAGS:
+            return False
+        if element.tag != "general":
+            for name in SHORTCUTS[element.tag]:
+                text.set(element, name, None)
+            self._typed(element, i)
+            text.rename(element, "general")
+        if number.field == "lag":
+            text.set(element, "dyntype", "filterexact")
+            text.set(element, "dynprm", f"{number.value:.8g}")
+            return True
+        for array, column, factor in FIELDS[number.field].places:
+            name = array.removeprefix("actuator_")
+            given = element.get(name).split() or _trimmed(getattr(model, array)[i])
+            given += ["0"] * (int(column or 0) + 1 - len(given))
+            given[int(column or 0)] = f"{factor * number.value:.8g}"
+            text.set(element, name, " ".join(given))
+        return True
+
+    def _typed(self, element: Element, i: int) -> None:
+        """Say in a `general` element what its shortcut said."""
+        model, text = self.compiled, element.text
+        text.set(element, "gaintype", GAINS[model.actuator_gaintype[i]])
+        text.set(element, "gainprm", " ".join(_trimmed(model.actuator_gainprm[i])))
+        text.set(element, "biastype", BIASES[model.actuator_biastype[i]])
+        text.set(element, "biasprm", " ".join(_trimmed(model.actuator_biasprm[i])))
+        if model.actuator_dyntype[i]:
+            text.set(element, "dyntype", LAGS[int(model.actuator_dyntype[i])])
+            text.set(element, "dynprm", " ".join(_trimmed(model.actuator_dynprm[i])))
+
+
+def _trimmed(values: Any) -> list[str]:
+    """Return numbers without the zeros at their end, at least one."""
+    last = int(np.flatnonzero(np.append(True, values[1:] != 0))[-1])
+    return [f"{one:.12g}" for one in values[: last + 1]]

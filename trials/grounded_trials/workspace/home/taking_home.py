@@ -1,0 +1,255 @@
+"""export --model: the model as it is now, in the form that it came in.
+
+A model of MuJoCo is written as its MJCF or URDF file, any other as its model.py. Every other byte
+of the file stays. A comment lists each value with its +-, and the date. What the form can't hold is
+listed with its equation, there and as a finding.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from grounded.adapters.mujoco import MujocoStepper
+from grounded.adapters.mujoco_files import files_of, load
+from grounded.diagnosis.parts import Estimate
+from grounded.effects import param_name
+from grounded.errors import GroundedError
+from grounded.findings import Finding, settle
+from grounded.findings import found as finding
+from grounded.result import Result
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.adopted import installed_effects
+from grounded_trials.workspace.adopting import as_adopted
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.home.held import Held, Number, value_of
+from grounded_trials.workspace.home.mjcf import Mjcf
+from grounded_trials.workspace.home.python_file import with_values
+from grounded_trials.workspace.home.urdf import Urdf
+from grounded_trials.workspace.home.xml_text import XmlText, commented
+
+SAME = 1e-6  # relative difference of a value from the one whose +- is known
+WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number of the exported file."""
+
+    name: str  # elbow.damping
+    now: Estimate
+    was: float  # in the file that the model came from
+
+    def to_json(self) -> dict[str, Any]:
+        """Return its entry in the document of `export --model`."""
+        std = self.now.std if math.isfinite(self.now.std) else None
+        return {"value": self.now.value, "std": std, "unit": self.now.unit, "was": self.was}
+
+
+@dataclass(frozen=True, repr=False)
+class TakenHome(Result):
+    """An exported model: its file, its numbers, and what the file can't hold."""
+
+    file: Path
+    source: Path
+    date: str
+    values: tuple[Value, ...]
+    findings: tuple[Finding, ...]
+    others: tuple[Path, ...] = ()  # files that it includes, written beside it
+
+    def summary(self) -> str:
+        """Return the file."""
+        return str(self.file)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `export --model --json`."""
+        return {
+            "file": str(self.file),
+            "source": str(self.source),
+            "date": self.date,
+            "values": {one.name: one.to_json() for one in self.values},
+            "others": [str(path) for path in self.others],
+            "findings": [one.to_json() for one in self.findings],
+        }
+
+
+def export_model(workspace: Folder, path: Path | None) -> TakenHome:
+    """Write the workspace's model with fitted values and adopted effects, see `Workspace`.
+
+    Raises:
+        GroundedError: if the model has no file, or `path` is that file or of another form.
+    """
+    model = workspace.base_model
+    simulated = isinstance(model.step, MujocoStepper)
+    source = model.step.source if isinstance(model.step, MujocoStepper) else _python_file(workspace)
+    if source is None or not source.is_file():
+        raise GroundedError(finding("model.no_file"))
+    path = path or Path(f"{source.stem}-found{source.suffix}")
+    if path.suffix != source.suffix or path.resolve() == source:
+        raise GroundedError(finding("model.other_form", file=str(path), source=source.name))
+    return (_simulated if simulated else _python)(workspace, source, path)
+
+
+def known_values(workspace: Folder) -> dict[str, Estimate]:
+    """Return the values of parameters and adopted effects, by parameter name, with their +-.
+
+    The +- is that of the adoption, NaN if the value is another one now.
+    """
+    adopted, now = as_adopted(workspace), dict[str, Estimate]()
+    for name, param in workspace.base_model.params.items():
+        now[name] = Estimate(param.value, unit=param.unit)
+    for effect in workspace.config.model.effects:
+        units = units_of(workspace, str(effect["name"]))
+        for q, value in effect.items():
+            if q != "name":
+                name = param_name(str(effect["name"]), q)
+                now[name] = Estimate(float(value), unit=units.get(q, ""))
+    for name, one in now.items():
+        known = adopted.get(name)
+        if known and math.isclose(known.value, one.value, rel_tol=SAME, abs_tol=1e-12):
+            now[name] = Estimate(one.value, known.std, unit=one.unit)
+    return now
+
+
+def units_of(workspace: Folder, effect: str) -> dict[str, str]:
+    """Return the units of an effect's quantities."""
+    try:
+        known = installed_effects().effect(effect, workspace.base_model).quantities
+    except GroundedError:  # beside another adopted effect, or of a package that is not installed
+        return {}
+    return {q.name: q.unit for q in known}
+
+
+def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
+    """Write an MJCF or URDF file."""
+    model, file, values = workspace.base_model, load(source), known_values(workspace)
+    assert isinstance(model.step, MujocoStepper)
+    own = {s.name: (values[s.name].value, values[s.name].std) for s in model.step.settings}
+    held = Held(model.step, file, own)
+    lost = list(_adopted(workspace, held, values))
+    dropped = list[Number]()
+    for _ in range(2):  # again without what the written file does not compile to
+        form = Urdf(source) if _is_urdf(source) else Mjcf(source, file)
+        numbers = held.without(dropped)
+        dropped += form.write(numbers)
+        numbers = held.without(dropped)
+        taken = [Value(n.name, Estimate(n.value, n.std, unit=n.unit), n.was) for n in numbers]
+        told = [*lost, *(_no_place(one) for one in dropped)]
+        date, comment = _comment(workspace, taken, told)
+        files = form.files(path, commented(comment))
+        if not (missed := _missed(source, path, files, numbers)):
+            break
+        dropped += missed
+    for name, data in files.items():
+        write_atomically(name, data)
+    if path.resolve().parent != source.parent:
+        beside = [os.path.relpath(one, source.parent) for one in files_of(source)[1:]]
+        told += [finding("model.reads", *sorted(beside))] if beside else []
+    others = tuple(name for name in files if name != path)
+    return TakenHome(path, source, date, tuple(taken), settle(told), others)
+
+
+def _adopted(workspace: Folder, held: Held, values: Mapping[str, Estimate]) -> Any:
+    """Add latencies and adopted effects to what a file holds; yield those that it can't."""
+    for name, late in workspace.config.task.latency.items():
+        if late and not held.adopt(f"delay:{name}", {"d": late}, {"d": 0.0}):
+            yield _not_held(f"delay:{name}", {"d": Estimate(late, unit="s")})
+    for effect in workspace.config.model.effects:
+        name = str(effect["name"])
+        c = {q: values[param_name(name, q)] for q in effect if q != "name"}
+        known = {q: one.value for q, one in c.items()}
+        if not held.adopt(name, known, {q: one.std for q, one in c.items()}):
+            yield _not_held(name, c)
+
+
+def _not_held(effect: str, c: Mapping[str, Estimate]) -> Finding:
+    """Return the finding of an effect that a form can't hold: its equation with its values."""
+    equation = installed_effects().family(effect.partition(":")[0]).equation
+    values = tuple(f"{q} = {one.text}" for q, one in c.items() if q != "width")
+    return finding("model.not_held", effect, equation=equation, values=values)
+
+
+def _no_place(number: Number) -> Finding:
+    """Return the finding of a number that the file has no place for."""
+    text = Estimate(number.value, number.std, unit=number.unit).text
+    return finding("model.no_place", number.name, value=text)
+
+
+def _missed(
+    source: Path, path: Path, files: Mapping[Path, bytes], numbers: Sequence[Number]
+) -> list[Number]:
+    """Return the numbers that the written files do not compile to, tried in a folder of its own."""
+    read = [one.resolve() for one in files_of(source)]
+    top = Path(os.path.commonpath([one.parent for one in read]))
+    with tempfile.TemporaryDirectory() as place:
+        for one in read:
+            copy = Path(place) / one.relative_to(top)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(one, copy)
+        folder = Path(place) / source.parent.relative_to(top)
+        for name, data in files.items():
+            (folder / name.name).write_bytes(data)
+        compiled = load(folder / path.name)
+    apart = [abs(value_of(compiled, n.kind, n.index, n.field) - n.value) for n in numbers]
+    return [n for n, far in zip(numbers, apart, strict=True) if far > WRITTEN * abs(n.value)]
+
+
+def _is_urdf(source: Path) -> bool:
+    return XmlText(source.read_bytes(), str(source)).root.tag == "robot"
+
+
+def _python_file(workspace: Folder) -> Path | None:
+    """Return the file of a model that Python defines."""
+    from grounded_trials.workspace.user_files.model_file import load_module
+
+    table = workspace.config.model
+    named = load_module(workspace.folder, table.file, table.module).__file__
+    return Path(named).resolve() if named else None
+
+
+def _python(workspace: Folder, source: Path, path: Path) -> TakenHome:
+    """Write a model.py."""
+    values, written = known_values(workspace), workspace.origin.model.params
+    changed = {
+        name: values[name] for name, param in written.items() if values[name].value != param.value
+    }
+    text, hidden = with_values(source, {name: one.value for name, one in changed.items()})
+    taken = [Value(n, one, written[n].value) for n, one in changed.items() if n not in hidden]
+    told = [finding("model.no_place", n, value=changed[n].text) for n in hidden]
+    for effect in workspace.config.model.effects:
+        name = str(effect["name"])
+        c = {q: values[param_name(name, q)] for q in effect if q != "name"}
+        told.append(_not_held(name, c))
+    date, comment = _comment(workspace, taken, told)
+    head, rest = _head(text)
+    lines = "".join(f"# {line}".rstrip() + "\n" for line in comment)
+    write_atomically(path, f"{head}{lines}{rest}".encode())
+    return TakenHome(path, source, date, tuple(taken), settle(told))
+
+
+def _head(text: str) -> tuple[str, str]:
+    """Split off the lines that must come first in a Python file: how to run and to read it."""
+    lines = text.splitlines(keepends=True)
+    first = 0
+    while first < min(2, len(lines)) and (
+        lines[first].startswith("#!") or "coding" in lines[first]
+    ):
+        first += 1
+    return "".join(lines[:first]), "".join(lines[first:])
+
+
+def _comment(
+    workspace: Folder, values: Sequence[Value], told: Sequence[Finding]
+) -> tuple[str, list[str]]:
+    """Return the date, and the lines of the comment that goes into the file."""
+    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+    lines = [f"grounded, {date}: values found in {workspace.folder.resolve().name}"]
+    lines += [f"{one.name} = {one.now.text} (was {one.was:g})" for one in values]
+    return date, lines + [one.what for one in told]
