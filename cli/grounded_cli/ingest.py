@@ -83,9 +83,13 @@ def command(
     are stored unchanged; other logs are mapped by the [log] table (`grounded inspect LOG` prints
     one).
     """
+    from pathlib import Path
+
+    from grounded_trials.logs.log_files import logs_in
+
     workspace = open_workspace()
     done = []
-    for name in files:
+    for name in (str(log) for file in files for log in logs_in(Path(file))):
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data, group=group))
         if not json_:

@@ -80,6 +80,16 @@ def npz(folder):
     return path
 
 
+def parquet(folder):
+    arrow = pytest.importorskip("pyarrow", reason="needs the extra parquet")
+    from pyarrow.parquet import write_table
+
+    path = folder.with_suffix(".parquet")
+    columns = {"time": arrow.array(STAMPS, arrow.timestamp("ns")), "name": ["a"] * N}
+    write_table(arrow.table(columns | {"rate": list(np.column_stack([X, X]))}), path)
+    return path
+
+
 def ulog(folder):
     def message(kind, body):
         return struct.pack("<HB", len(body), ord(kind)) + body
@@ -108,6 +118,7 @@ LOGS = {
     "csv": (table, "/csv.rate"),
     "csv with semicolons": (lambda f: table(f, ";"), "/csv.rate"),
     "npz": (npz, "/npz.rate"),
+    "parquet": (parquet, "/parquet.rate[1]"),
     "px4": (ulog, "/gyro.rate[2]"),
 }
 

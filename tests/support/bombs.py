@@ -300,6 +300,19 @@ def _archive(arrays: Mapping[str, bytes]) -> bytes:
     return out.getvalue()
 
 
+def _parquet() -> bytes:
+    """Return a table of a few kilobytes: one value, a thousand million times."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    out = io.BytesIO()
+    rows = pa.table({"t": np.zeros(10**7), "x": np.zeros(10**7)})
+    with pq.ParquetWriter(out, rows.schema, compression="zstd") as writer:
+        for _ in range(30):
+            writer.write_table(rows)
+    return out.getvalue()
+
+
 def _npy(array: np.ndarray) -> bytes:
     out = io.BytesIO()
     np.save(out, array)
@@ -318,6 +331,7 @@ OTHERS: dict[str, tuple[str, Callable[[], bytes], str]] = {
     "ROS 1, bz2": ("bomb.bag", lambda: _bag("BZ2", 600_000_000), "/t.data[0]"),
     "ROS 1, lz4": ("bomb.bag", lambda: _bag("LZ4", 1_500_000_000), "/t.data[0]"),
     "a table, zstd": ("bomb.csv.zst", lambda: _packed_table(3 * 10**9), "/csv.x"),
+    "parquet, one value": ("bomb.parquet", _parquet, "/parquet.x"),
     "PX4, types of types": ("bomb.ulg", _ulog, "/t.timestamp"),
     "SQLite, generated columns": (
         "bomb.db3",

@@ -128,6 +128,7 @@ ENTRIES: dict[str, Entry] = {
         "{about} can't be read[[ as a {kind}]]: {why}",
         "[[{kind:ROS 2 bag=`sqlite3 FILE .recover` saves what can be saved,ROS 1 bag="
         "`rosbag reindex` repairs it if it was not closed,PX4 log=,NumPy archive=,MCAP log=,"
+        "parquet table=,LeRobot data set=,MATLAB file=,"
         "table=,bag=,zstd file=,TOML file=,CSV=,candidate=,trial=}]]",
     ),
     "unwritable": Entry(
@@ -149,7 +150,7 @@ ENTRIES: dict[str, Entry] = {
     "no_log": Entry(
         "refuse",
         "{about} is not a log: it begins with {head}",
-        "expected MCAP, ROS 2 .db3, ROS 1 .bag, .csv, .npz or PX4 .ulg",
+        "expected MCAP, ROS 2 .db3, ROS 1 .bag, .csv, .npz, .parquet, .mat or PX4 .ulg",
     ),
     "no_log_inside": Entry(
         "refuse",
@@ -157,6 +158,12 @@ ENTRIES: dict[str, Entry] = {
         "give the log itself[[, {tables} as one .npz if they are one run: see "
         "docs/log-reference.md, two tables with two clocks]]",
     ),
+    "objects": Entry(
+        "refuse",
+        "{file}: {about} {about:is/are} of the class {kinds}, which MATLAB alone can read",
+        "save plain numbers there: `run.t = q.Time; run.q = q.Data; save('run.mat', 'run')`",
+    ),
+    "no_episode": Entry("refuse", "{about} is no episode: the data set has {count}"),
     "listed": Entry(
         "refuse", "{about} lists {name}, which is not in the folder", "give its files one by one"
     ),

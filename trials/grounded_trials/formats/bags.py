@@ -22,7 +22,6 @@ from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 
-SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0\n"  # how the files begin
 BATCH, ROOM = 20_000, 64 * 2**20  # messages, bytes
 
 Piece = tuple[int, int, bytes]  # channel, time [ns], message

@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, needs
+from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 from grounded_trials.formats.messages import Floats
 
-ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
 ROWS = 50_000  # rows in a batch
-STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
+STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps", "tout")
 CANDIDATE = {"candidate", "feedforward", "law"}  # names of arrays in an exported one
 TICKS = {  # an Arduino's functions, and their units in full
     "millis": "ms",
@@ -110,12 +109,7 @@ def _columns(array: Floats, names: list[str], table: str) -> list[tuple[str, str
 
 
 def ulog_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a PX4 log, read with pyulog.
-
-    Raises:
-        GroundedError: if pyulog is not installed.
-    """
-    needs("pyulog", "px4")
+    """Yield the records of a PX4 log, read with pyulog."""
     from pyulog import ULog
 
     # pyulog prints problems, and does not close a file that it opened itself

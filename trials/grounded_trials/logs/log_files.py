@@ -1,24 +1,28 @@
 """The files of a log, and the records of each, in any supported format.
 
 A log is a file, several files in order, or a bag's folder with split files. The format is detected
-by the first bytes, not by the name: MCAP, ROS 2 SQLite, ROS 1, NumPy, PX4, any of them compressed
-with zstd, else a text table. Every format is converted to MCAP records, so callers need not know
-it.
+by the first bytes (`FORMATS`), not by the name, in a file compressed with zstd as well; else it is
+a text table. An episode of a LeRobot data set is a log whose path is no file: FOLDER/episode_000003
+(`parquet`). Every format is converted to MCAP records, so callers need not know it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 from zipfile import BadZipFile, ZipFile
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, needs
 from grounded.findings import found
-from grounded_trials.formats.mcap_records import Messages, Metadata, Record
+from grounded_trials.formats import parquet
+from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.plain_file import open_file, read_file
 from grounded_trials.within import within
@@ -26,7 +30,7 @@ from grounded_trials.within import within
 P = ParamSpec("P")
 T = TypeVar("T")
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
-KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
+KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".mat", ".parquet")
 NEWEST = 3  # most logs named in place of one that does not exist
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -38,13 +42,46 @@ _NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a
 _DIGITS = re.compile(r"(\d+)")
 
 
+@dataclass(frozen=True)
+class Format:
+    """A log format: how its files begin, and what reads them."""
+
+    kind: str  # its name in messages
+    begins: bytes  # the first bytes of a file
+    reader: str  # module of `formats`, and its function (path) -> records
+    library: str = ""  # that the reader needs
+    extra: str = ""  # of grounded's, with which the library comes
+
+
+TABLE = Format("table", b"", "text_tables.csv_records")
+EPISODE = Format("LeRobot data set", b"", "parquet.episode_records", "pyarrow.parquet", "parquet")
+FORMATS = (
+    Format("ROS 2 bag", b"SQLite format 3\0", "bags.sqlite_records"),
+    Format("ROS 1 bag", b"#ROSBAG", "bags.ros1_records"),
+    Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_records", "pyulog", "px4"),
+    Format("NumPy archive", b"PK\x03\x04", "tables.npz_records"),
+    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_records", "scipy.io"),
+    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_records", "h5py", "matlab"),
+    Format("parquet table", b"PAR1", "parquet.parquet_records", "pyarrow.parquet", "parquet"),
+)
+
+
+def logs_in(path: Path) -> list[Path]:
+    """Return the logs that a path names: each episode of a LeRobot data set, else itself.
+
+    Raises:
+        GroundedError: if the data set can't be used.
+    """
+    return parquet.episodes(path) if parquet.is_dataset(path) else [path]
+
+
 def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
     """Return the files of a log in order.
 
     Args:
         paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml lists its
             files in order; without it, all *.mcap, else *.db3, sorted by the numbers in their
-            names.
+            names. Of a LeRobot data set it is the first episode.
 
     Raises:
         GroundedError: if a file is missing, or a folder has none.
@@ -52,9 +89,12 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     files: list[Path] = []
     for path in map(Path, given):
-        files.extend(_bag(path) if path.is_dir() else [path])
+        if path.is_dir():
+            files.extend(logs_in(path)[:1] if parquet.is_dataset(path) else _bag(path))
+        else:
+            files.append(path)
     for path in files:
-        if not path.exists():
+        if not path.exists() and not parquet.is_episode(path):
             raise _missing(path)
     if not files:
         raise GroundedError(found("file.missing", "a log"))
@@ -167,6 +207,9 @@ def log_records(path: Path) -> Iterator[Record]:
     Raises:
         GroundedError: if it can't be read, is damaged, or is not a log.
     """
+    if parquet.is_episode(path):
+        yield from _read_as(EPISODE, path)
+        return
     with open_log(path) as stream:
         head = stream.read(16)
         if not head:
@@ -182,24 +225,30 @@ def log_records(path: Path) -> Iterator[Record]:
 
 
 def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
-    from grounded_trials.formats import bags, tables, text_tables
-
-    begins: dict[bytes, tuple[str, Callable[[Path], Iterator[Record]]]] = {
-        bags.SQLITE: ("ROS 2 bag", bags.sqlite_records),
-        bags.ROS1: ("ROS 1 bag", bags.ros1_records),
-        tables.ULOG: ("PX4 log", tables.ulog_records),
-        tables.ZIP: ("NumPy archive", tables.npz_records),
-    }
-    reader = next((one for magic, one in begins.items() if head.startswith(magic)), None)
     if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
-        reader = "MCAP log", lambda path: read_records(stream, str(path))
-    elif reader is None and path.suffix in (".csv", ".tsv", ".txt"):
-        reader = "table", text_tables.csv_records
-    if reader is None:
+        yield from _guarded("MCAP log", path, read_records(stream, str(path)))
+    elif (format := _format_of(path, head)) is not None:
+        yield from _read_as(format, path)
+    else:
         raise GroundedError(found("file.no_log", str(path), head=repr(head[:8])))
-    kind, read = reader
+
+
+def _format_of(path: Path, head: bytes) -> Format | None:
+    """Return the format of a file that is no MCAP log, by its first bytes, else by its name."""
+    known = next((one for one in FORMATS if head.startswith(one.begins)), None)
+    return TABLE if known is None and path.suffix in (".csv", ".tsv", ".txt") else known
+
+
+def _read_as(format: Format, path: Path) -> Iterator[Record]:
+    _load(format)
+    module, function = format.reader.split(".")
+    read = getattr(import_module(f"grounded_trials.formats.{module}"), function)
+    yield from _guarded(format.kind, path, read(path))
+
+
+def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Record]:
     try:
-        yield from map(_plain, read(path))
+        yield from map(_plain, records)
     except GroundedError:
         raise
     except Exception as error:  # a decoder raises whatever a damaged file leads to
@@ -245,8 +294,49 @@ def read_apart(
         GroundedError: as `log_files` and `within`.
     """
     files = log_files(paths)
-    size = sum(file.stat().st_size for file in files)
+    size = sum(one.stat().st_size for file in files for one in on_disk(file))
+    for file in files:
+        _load_library(file)
     return within(files[0], size, function, files, *args, **kwargs)
+
+
+def on_disk(log: Path) -> list[Path]:
+    """Return the files on the disk that a log's file is read from; several for an episode."""
+    return parquet.episode_files(log) if parquet.is_episode(log) else [log]
+
+
+def _load_library(file: Path) -> None:
+    """Import the library that reads a file: its own memory is then not counted as the file's."""
+    if parquet.is_episode(file):
+        format: Format | None = EPISODE
+    else:
+        with open_log(file) as stream:
+            format = _format_of(file, stream.read(16))
+    _load(format)
+
+
+def _load(format: Format | None) -> None:
+    if format is not None and format.library:
+        needs(format.library, format.extra)
+
+
+def digest_of(log: Path) -> str:
+    """Return the SHA-256 of what is read of an episode, whatever else its files hold.
+
+    Raises:
+        GroundedError: if it can't be read.
+    """
+    return read_apart(log, _digest)
+
+
+def _digest(files: tuple[Path, ...]) -> str:
+    hasher = hashlib.sha256()
+    for record in log_records(files[0]):
+        if isinstance(record, Schema):
+            hasher.update(record.data)
+        elif isinstance(record, Messages):
+            hasher.update(record.buffer)
+    return hasher.hexdigest()
 
 
 def kind_of(path: Path) -> str:

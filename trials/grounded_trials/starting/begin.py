@@ -216,7 +216,8 @@ def _begin(
     if chosen == "generic" and not own:
         given = {name: one.path for name, one in moving(report).items()}
         matched = assigned(report, built.states, built.inputs, built, joints, given)
-        notes = (*notes, *_left_out(report, built), TO_COMPLETE)
+        driven = any(one.value for name, one in built.params.items() if name.startswith("gain_"))
+        notes = (*notes, *_left_out(report, built), *[TO_COMPLETE] * (not driven))
     states, inputs = matched
     units = {**built.states, **built.inputs}
     if chosen == "balance" and not own:
@@ -273,8 +274,8 @@ def _begin(
 
 
 def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
-    """Reduce an archive of runs with the same columns to its first run, with a note."""
-    runs = [t for t in report.topics if t.type.startswith("npz")]
+    """Reduce a file of runs with the same columns to its first run, with a note."""
+    runs = [t for t in report.topics if t.type.startswith(("npz", "mat"))]
     columns = {tuple(f.path.removeprefix(t.topic) for f in t.fields) for t in runs}
     same = [t for t in runs if len(t.fields) == max(len(c) for c in columns)] if columns else []
     if len(same) < 2:

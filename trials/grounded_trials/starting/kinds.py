@@ -30,7 +30,8 @@ MOST, INPUTS = 6, 4  # largest number of states and of guessed inputs of a gener
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
-    r"|goal|control|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande|comando"
+    r"|goal|control|\baction\b|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
+    "|comando"
 )
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
@@ -89,10 +90,10 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     """Return a skeleton for any robot, with the numbers of the log as states and inputs.
 
     A state whose rate is another state gets that as its derivative; every other state follows the
-    inputs with a first-order lag. Numbers of noise alone are no states. Without `inputs`, the
-    inputs are the numbers that are named like commands, else those held constant over several
-    samples while others move, else those named after an actuator, else forces, torques and
-    voltages.
+    inputs with a first-order lag, its own command alone if each input is the command of a state.
+    Numbers of noise alone are no states. Without `inputs`, the inputs are the numbers that are
+    named like commands, else those held constant over several samples while others move, else
+    those named after an actuator, else forces, torques and voltages.
 
     Args:
         log: the log.
@@ -113,9 +114,12 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
                     "of a skeleton: record a log in which it changes"
                 )
             raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
-    if not inputs:
-        names = list(reversed(found))
-        called = [n for n in names if called_input(n, found[n].path)]
+    names = list(reversed(found))
+    called = [n for n in names if called_input(n, found[n].path)]
+    followers = _followers(found, list(inputs) or called)
+    if not inputs and followers:
+        inputs = list(followers.values())[:MOST]
+    elif not inputs:
         held = [n for n in names if found[n].held > HELD]
         driven = [n for n in names if ACTUATOR.search(n.lower())]
         held = held if 2 * len(held) < len(names) else []
@@ -130,11 +134,19 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         if unit.get(known_as) == "1" != unit[position]:
             unit[known_as] = f"{unit[position]}/s"
     per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
+    drives = {s: [followers[s]] if s in followers else inputs for s in states if s not in rates}
+    named_gains = {
+        (s, i): f"gain_{s}" if s in followers else f"gain_{s}_{i}"
+        for s, drive in drives.items()
+        for i in drive
+    }
     gains = {
-        f"gain_{s}_{i}": f'0.0, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'
-        for s in states
-        for i in inputs
-        if s not in rates
+        name: f'{1.0 * (s in followers)}, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'
+        for (s, i), name in named_gains.items()
+    }
+    sums = {
+        s: " + ".join(f"p.{named_gains[s, i]} * a.{i}" for i in drive)
+        for s, drive in drives.items()
     }
     turned = {s: found[s] for s in states if unit.get(s) == "rad"}
     return Skeleton(
@@ -144,14 +156,22 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         {i: unit.get(i, "1") for i in inputs},
         {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,
         [
-            f'"{s}": {rates[s]}'
-            if s in rates
-            else f'"{s}": ({" + ".join(f"p.gain_{s}_{i} * a.{i}" for i in inputs)} - s.{s})'
-            f" / p.tau_{s}"
+            f'"{s}": {rates[s]}' if s in rates else f'"{s}": ({sums[s]} - s.{s}) / p.tau_{s}'
             for s in states
         ],
         tuple(s for s, one in turned.items() if min(-(one.low or 0.0), one.high or 0.0) > 3.0),
     )
+
+
+def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[str, str]:
+    """Return each state's command by its name, `/action.elbow` for elbow, `v_cmd` for v.
+
+    {} unless each input is the command of one state.
+    """
+    own = {name: _word(bare_command(found[name].path)) for name in inputs if name in found}
+    states = {name for name in found if name not in own}
+    followed = {state: name for name, state in own.items() if state in states}
+    return followed if len(followed) == len(inputs) else {}
 
 
 def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:

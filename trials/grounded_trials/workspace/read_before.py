@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_files import digest_of, log_files
 from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.folder import Folder
@@ -125,7 +125,7 @@ def last_again(workspace: Folder, trials: Sequence[StoredTrial]) -> NextCommand 
 
 def hashed(files: Sequence[Path]) -> str:
     """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
-    hashes = [hash_file(file) for file in files]
+    hashes = [hash_file(file) if file.is_file() else digest_of(file) for file in files]
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, found
 from grounded.trial import Trial, scattered
-from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_files import log_files, on_disk
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.exported_files import to_run
@@ -263,7 +263,7 @@ def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
     if not known or not trial.candidate:
         return ""
     waiting = standing_in(workspace).outstanding
-    files = log_files(path) if path.is_dir() else [path]
+    files = [one for file in log_files(path) for one in on_disk(file)]
     written = max(file.stat().st_mtime_ns for file in files)
     fresh = written > known[-1].path.stat().st_mtime_ns
     return known[-1].id if fresh and waiting and waiting.id == trial.candidate else ""
