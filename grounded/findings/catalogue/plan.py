@@ -150,11 +150,6 @@ ENTRIES: dict[str, Entry] = {
         "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
         "(`target`): target.csv is the run in that log]]",
     ),
-    "costly_inputs": Entry(
-        "note",
-        "{share:%} of the plan's cost is [reward] input and input_change",
-        "weigh them less (a tenth, say), and errors count for more",
-    ),
     "another_unit": Entry(
         "note",
         "{what} of {state} is {given}, far beyond what it reaches in any log ({seen})",
@@ -176,14 +171,6 @@ ENTRIES: dict[str, Entry] = {
         "the plan ends with {what} {off:size} from the end of the target: either [reward] makes "
         "getting closer too costly, or the model can't get there in time",
         "weigh inputs and their changes less, draw a slower target, or check model.py",
-    ),
-    "outweighed": Entry(
-        "note",
-        "the plan is off {what} by {off:size} {how}, and by {closer:size} with {factor:.6g} times "
-        "the weight on it",
-        "[[helps? weigh it so in [reward] state ({weights}) if that matters more than the other "
-        "states]][[!helps? check its weight in [reward] state, and whether the model and [limits] "
-        "allow the target]]",
     ),
     "rough": Entry(
         "note",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, found
-from grounded.frozen import Array
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -27,8 +26,6 @@ from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates.rest_at_end import drawn
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import (
-    cost_of_inputs,
-    reaches,
     still_logged,
     tracking_error,
     weighed_groups,
@@ -40,14 +37,10 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal
 
-MOSTLY = 0.9  # share of the cost due to inputs above which it is told
 LIMITED = 0.25  # share of a plan at the limits of an input, which keep it off its target then
 MISSED = 0.1  # share of the target's extent above which an error is told; SHORT: at the plan's end
 SHORT = 0.25
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
-ASIDE = 0.01  # share of the target's extent by which a plan may be off, as an rms
-NARROW, LEAST = 0.02, 0.2  # or of its smallest range, counted as at least this of the largest
-CLOSER, ENOUGH = 10.0, 0.6  # factor tried on the position's weights; share of the error then left
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
 FAR = 5.0  # times the largest command in any stored log: limits beyond it may be in another unit
@@ -81,16 +74,6 @@ class Plan:
     def logs(self) -> list[Trial]:
         """The stored trials of this robot."""
         return [t.trial for t in self.workspace.whole_trials() if self.workspace.fits(t.trial)]
-
-    @cached_property
-    def off_path(self) -> tuple[float, float, float]:
-        """How far the plan is off its path, its extent, and what is near, see `_off_path`."""
-        return (0.0, 0.0, 0.0) if self.made is None else _off_path(self.task, self.made)
-
-    @property
-    def astray(self) -> bool:
-        """Whether the plan is off its path."""
-        return self.off_path[0] > self.off_path[2]
 
     def at_limits(self, made: Candidate) -> Iterator[tuple[str, float]]:
         """Yield the share of a plan for which each input is at one of its limits."""
@@ -179,22 +162,6 @@ def limits_of_log(plan: Plan) -> Iterator[Finding]:
     )
 
 
-def costly_inputs(plan: Plan) -> Iterator[Finding]:
-    """Nearly all of the plan's cost is that of its inputs, by weights that nobody chose."""
-    if plan.made is None or not plan.made.predicted_utility < 0:
-        return
-    share = cost_of_inputs(plan.task, plan.made.predicted_run) / -plan.made.predicted_utility
-    if share > MOSTLY and (plan.astray or not _chosen(plan.workspace)):
-        yield found("plan.costly_inputs", share=share)
-
-
-def _chosen(workspace: Folder) -> bool:
-    """Return whether the weights on input changes are not those that `init` or `target` wrote."""
-    made = made_changes(workspace.config.file.read_text(encoding="utf-8"))
-    names, weights = workspace.base_model.input_names, workspace.task.reward.input_change
-    return not made or any(made.get(n) != w for n, w in zip(names, weights, strict=True))
-
-
 def in_another_unit(plan: Plan) -> Iterator[Finding]:
     """The target, start or [safety] of a state seems to be in another unit, by the logs."""
     task = plan.task
@@ -260,7 +227,7 @@ def off_target(plan: Plan) -> Iterator[Finding]:
     task, limited = plan.task, [*plan.at_limits(plan.made)]
     what, off, share = _most_missed(task, plan.made.predicted_run)
     at = [name for name, part in limited if part > LIMITED]
-    if at and (share > MISSED or plan.astray):
+    if at and share > MISSED:
         most = max(part for _, part in limited)
         yield found("plan.at_limits", *at, share=most, what=what, off=off)
         return
@@ -270,72 +237,11 @@ def off_target(plan: Plan) -> Iterator[Finding]:
     short, extent = float(np.linalg.norm(last)), _extent(task, states)
     if short > SHORT * extent > 0:
         yield found("plan.falls_short", what=what, off=Quantity(short, unit))
-    elif plan.astray and plan.off_path[1]:
-        yield from _outweighed(plan, plan.made, groups, states, unit)
-
-
-def _outweighed(
-    plan: Plan,
-    made: Candidate,
-    groups: list[tuple[list[str], str]],
-    states: list[int],
-    unit: str,
-) -> Iterator[Finding]:
-    """The plan leaves the path because [reward] weighs other states as much.
-
-    That is tried: the finding gives the error of a plan with larger weights on the position.
-    """
-    from grounded.search.first_policy import finished
-
-    task, aim, off = plan.task, plan.workspace.planner.aim, plan.off_path[0]
-    if len(groups) < 2 or aim.model.system.how != "compiled":
-        return
-    ends, (names, what) = reaches(task), groups[0]
-    if not (ends or len(names) > 1) or not task.reward.state[states].all():
-        return
-    state, terminal = aim.reward.state.copy(), aim.reward.terminal.copy()
-    state[states], terminal[states] = CLOSER * state[states], CLOSER * terminal[states]
-    reward = replace(aim.reward, state=state, terminal=terminal)
-    closer = finished(replace(aim, reward=reward).problem(), made.predicted_inputs)
-    left, *_ = _off_path(task, replace(made, predicted_states=closer.z[:, : task.model.n]))
-    yield found(
-        "plan.outweighed",
-        *names,
-        what=what,
-        off=Quantity(off, unit),
-        how="at its end" if ends else "rms",
-        closer=Quantity(left, unit),
-        factor=CLOSER,
-        helps=int(left < ENOUGH * off),
-        weights=", ".join(f"{names[k]} = {state[i]:.4g}" for k, i in enumerate(states)),
-    )
-
-
-def _off_path(task: Task, made: Candidate) -> tuple[float, float, float]:
-    """Return the error of a plan in the first weighed group, the group's extent, and what is near.
-
-    It is the error at the end if the task is to reach a point, else the rms error. What is near is
-    a share of the extent or, of a path that is long and narrow, of its width.
-    """
-    groups = weighed_groups(task)
-    if not groups:
-        return 0.0, 0.0, 0.0
-    states = [task.model.state_names.index(name) for name in groups[0][0]]
-    error = task.model.difference(made.predicted_states, task.target)[:, states]
-    off = np.linalg.norm(error[-1:] if reaches(task) else error, axis=1)
-    extent, ranges = _extent(task, states), _ranges(task, states)
-    near = min(ASIDE * extent, NARROW * max(ranges.min(), LEAST * ranges.max()))
-    return float(np.sqrt(np.mean(off**2))), extent, float(near)
 
 
 def _extent(task: Task, states: Sequence[int]) -> float:
     """Return the diagonal of the box that the start and the target of some states span."""
-    return float(np.linalg.norm(_ranges(task, states)))
-
-
-def _ranges(task: Task, states: Sequence[int]) -> Array:
-    """Return the ranges of some states in the start and the target."""
-    return np.asarray(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0))
+    return float(np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)))
 
 
 def _most_missed(task: Task, run: Trial) -> tuple[str, Quantity, float]:
@@ -419,7 +325,6 @@ CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (
     no_limits,
     without_effect,
     limits_of_log,
-    costly_inputs,
     in_another_unit,
     of_other_limits,
     off_target,
