@@ -41,6 +41,7 @@ T = TypeVar("T")
 COMMANDS = {
     "init": ("init", "Make a workspace from a log or an example."),
     "target": ("target", "Draw the manoeuvre: line, circle, figure-8, step, swing-up, a run."),
+    "excite": ("excite", "Write the drive to record first, before there is a target."),
     "propose": ("propose", "Say what to run next and write its candidate file."),
     "run": ("learn", "Run the candidate on the system of grounded.toml."),
     "ingest": ("ingest", "Check, resample and store the log of a run."),

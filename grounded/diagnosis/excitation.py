@@ -90,14 +90,16 @@ class Probe:
 
 
 @dataclass(frozen=True, eq=False)
-class _Noise:
+class KnownNoise:
     """The noise of a diagnosis; `hidden` states (adopted memories) have neither kind of noise."""
 
     model: NoiseModel
     hidden: tuple[str, ...]
 
     @classmethod
-    def of(cls, model: Model, diagnosis: Diagnosis) -> _Noise:
+    def of(cls, model: Model, diagnosis: Diagnosis) -> KnownNoise:
+        """Return the noise that a diagnosis found."""
+
         def logs(levels: Mapping[str, float]) -> Array:
             return np.array([2 * np.log(levels.get(n, 0.0) + 1e-12) for n in model.state_names])
 
@@ -107,6 +109,7 @@ class _Noise:
         return cls(noise, tuple(n for n in model.state_names if n not in known.process))
 
     def data(self, task: Task, runs: Sequence[Trial]) -> Data:
+        """Return runs of a task as data of the likelihood."""
         return prepare(task.model, runs, task.latency, task.past, self.hidden)
 
 
@@ -135,7 +138,7 @@ def probe(
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
     task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
-    noise = _Noise.of(task.model, diagnosis)
+    noise = KnownNoise.of(task.model, diagnosis)
     second = _adapted(task, list(trials[-REPLAYED:]), second, noise)
     again = [_replayed(task, h, policy, trials) for h in (first, second)]
     ways = [_Way(task, noise, first, second, again[0]), _Way(task, noise, second, first, again[1])]
@@ -146,7 +149,7 @@ def probe(
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
-        safe = [run for run in runs if run is not None and _safe(task, run)]
+        safe = [run for run in runs if run is not None and safe(task, run)]
         if len(safe) < len(runs):
             continue
         expected = min(way.adds(run) for way, run in zip(ways, safe, strict=True))
@@ -179,7 +182,7 @@ def _teaching(
             return None
         h = h.plus(effect, row.values)
         spreads |= {f"{q.name} of {name}": row.params[q.name] for q in effect.free}
-    noise, best = _Noise.of(task.model, diagnosis), None
+    noise, best = KnownNoise.of(task.model, diagnosis), None
     data = noise.data(task, trials)
     sizes = {data.model.param_names[i]: float(param_scale(data.model)[i]) for i in calibrated(data)}
     if known:
@@ -189,7 +192,7 @@ def _teaching(
     std = np.array([s if np.isfinite(s) else 0.0 for s in each.values()])
     if not std.any():
         return None
-    groups = _information(task, trials, h, noise)
+    groups = information(task, trials, h, noise)
     if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
         return None
     F = groups.sum(axis=0)
@@ -200,10 +203,10 @@ def _teaching(
     unseen = np.isnan(np.concatenate([trial.states for trial in trials])).all(axis=0)
     for words, candidate in probes(policy, task.model, range(task.model.m)):
         run = _run(task, h, candidate)
-        if not _safe(task, run):
+        if not safe(task, run):
             continue
         assert run is not None
-        J = _information(task, [run], h, noise, unseen)
+        J = information(task, [run], h, noise, unseen)
         if J.shape[1:] != F.shape or not np.isfinite(J).all():
             continue
         J = J * np.outer(unit_of, unit_of)
@@ -263,8 +266,8 @@ def _misfit(diagnosis: Diagnosis) -> float:
     return float(max(1.0, diagnosis.where.tempering**-0.5, *left))
 
 
-def _information(
-    task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise, unseen: Array | None = None
+def information(
+    task: Task, runs: Sequence[Trial], h: Hypothesis, noise: KnownNoise, unseen: Array | None = None
 ) -> Array:
     """Return the Fisher information of each run on a hypothesis' values, (S, C, C).
 
@@ -344,7 +347,7 @@ def _effect(
     return delay_again(effect, float(adopted.effects[name]["d"]), float(late.min()))
 
 
-def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: _Noise) -> Hypothesis:
+def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: KnownNoise) -> Hypothesis:
     """Return a hypothesis with the values fitted to some runs."""
     data = noise.data(task, runs)
     start = [(h, noise.model, data.y.copy())]
@@ -411,7 +414,8 @@ def _wrapped(task: Task, h: Hypothesis) -> Model:
     return model
 
 
-def _safe(task: Task, run: Trial | None) -> bool:
+def safe(task: Task, run: Trial | None) -> bool:
+    """Return whether a run stays inside [safety]; one that diverged, None, does not."""
     if run is None or task.safety_low is None or task.safety_high is None:
         return run is not None
     inside = (run.states >= task.safety_low) & (run.states <= task.safety_high)
@@ -432,7 +436,7 @@ class _Way:
     def __init__(
         self,
         task: Task,
-        noise: _Noise,
+        noise: KnownNoise,
         true: Hypothesis,
         rival: Hypothesis,
         trials: Sequence[Trial],

@@ -58,6 +58,7 @@ COMMANDS = [
     ("fit",),
     ("verify",),
     ("propose",),
+    ("excite", "--seconds", "3"),
     pytest.param(("diagnose",), marks=pytest.mark.slow),
     ("discard", "t0002"),
     ("export", "best", "-o", "{folder}/best.npz", "--runner"),

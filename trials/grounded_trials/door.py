@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.candidates.proposing import Proposed, Status
     from grounded_trials.workspace.candidates.running import Ran
     from grounded_trials.workspace.discarding import SetAside
+    from grounded_trials.workspace.exciting import Excited
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.home.taking_home import TakenHome
     from grounded_trials.workspace.inspecting import Inspected
@@ -200,6 +201,20 @@ class Workspace(Folder):
         from grounded_trials.starting.drawing import draw
 
         return draw(self.forget(), asked)
+
+    def excite(self, seconds: float | None = None) -> Excited:
+        """Write the drive to record first, which makes uncertain parameters identifiable.
+
+        Args:
+            seconds: its duration; None: as long as it takes, up to 40 s.
+
+        Raises:
+            GroundedError: if no parameter is uncertain, [limits] or [safety] are missing, or no
+                drive stays inside [safety].
+        """
+        from grounded_trials.workspace.exciting import excite_in
+
+        return excite_in(self.forget(), seconds)
 
     def learn(
         self,

@@ -304,4 +304,31 @@ ENTRIES: dict[str, Entry] = {
         STOP + ", switch to a holding controller once the runner is done, or let the target come "
         "to rest inside",
     ),
+    # a drive that excites the model's parameters
+    "nothing_uncertain": Entry(
+        "refuse",
+        "no parameter of the model is uncertain, so there is nothing to excite",
+        "give a Param in {file} its bounds (low, high) or a std",
+    ),
+    "drive_unlimited": Entry(
+        "refuse",
+        "{about} {about:has/have} no [limits], so a drive has no size",
+        "enter them in grounded.toml",
+    ),
+    "drive_unbounded": Entry(
+        "refuse",
+        "[safety] bounds no state, and no log shows where the robot may go",
+        "enter where it may go, such as [safety] {state} = [-1.0, 1.0]",
+    ),
+    "drive_length": Entry("refuse", "a drive takes 2 to {most} control steps of {dt}"),
+    "no_drive": Entry(
+        "refuse",
+        "by the model, no drive stays inside [safety] from [task] start",
+        "widen [safety], start where there is room, or make it shorter (--seconds)",
+    ),
+    "drive_weak": Entry(
+        "note",
+        "the drive leaves {about} weak",
+        "make it longer (--seconds), or hold one of those that only act together constant",
+    ),
 }

@@ -248,7 +248,7 @@ def _probe(
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
     offer = write or bool(ties)
-    plan = _near(planner, trials)
+    plan = near(planner, trials)
     for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
@@ -291,7 +291,7 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
     )
 
 
-def _near(planner: Planner, trials: Sequence[Trial]) -> Task:
+def near(planner: Planner, trials: Sequence[Trial]) -> Task:
     """Bound the states without [safety] to the range of the trials, extended by half on each side.
 
     Without it, a probe may go anywhere (doublets took a quadrotor 100 m below the ground). States

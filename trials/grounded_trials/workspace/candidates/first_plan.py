@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from grounded.search.standing import Proposal
 
 LIMITED = 0.25  # share of a plan at the limits of an input, which keep it off its target then
-MISSED = 0.1  # share of the target's extent above which an error is told; SHORT: at the plan's end
+MISSED = 0.05  # share of the target's extent above which an error is told; SHORT: at the plan's end
 SHORT = 0.25
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
