@@ -123,9 +123,10 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         if not logged.enough:
             return None
         # the shift that the model as it is likes best, then its neighbours, calibrated
-        moved = {k: later(k).plain(ones).score for k in range(least, reach + 1, every)}
-        about = min(moved, key=lambda k: moved[k])
-        if moved[about] > logged.plain(ones).score - HINT:
+        shifts = np.arange(least, reach + 1, every)
+        moved = later(0).advanced(trial.inputs, shifts)
+        about = int(shifts[int(np.argmin(moved))])
+        if moved.min() > logged.plain(ones).score - HINT:
             return None
         near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
         fits = {k: as_told(later(k)) for k in near}
@@ -213,8 +214,9 @@ def _scores(ahead: Ahead) -> tuple[Array, Array]:
     gains = np.vstack([np.ones(m), 1.0 - np.eye(m), 1.0 - 2.0 * np.eye(m)])
     nats, shares = np.full((m, 3), np.nan), np.full(m, np.nan)
     least = np.full(m, np.inf)
-    for late in ahead.delays:
-        off = ahead.missed(gains, ahead.model.values, late)
+    late = np.repeat(np.array(ahead.delays), len(gains))
+    every = ahead.missed(np.tile(gains, (len(ahead.delays), 1)), ahead.model.values, late)
+    for off in every.reshape(len(ahead.delays), len(gains), *every.shape[1:]):
         by = off[:1] - off[1 : m + 1]  # what each input does (m, N, k)
         bent = off[:1] - off[m + 1 :] - 2 * by
         size = np.square(by / ahead.least).sum(axis=(0, 2))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -26,8 +27,8 @@ from grounded.accounts.kinematics import (
     kinematic_rows,
     turned,
 )
-from grounded.accounts.motion import Ahead, Fit, horizon_of
-from grounded.accounts.table import Account, Told, of_motion, of_rows
+from grounded.accounts.motion import Ahead, Fit, horizon_of, plainly_missed
+from grounded.accounts.table import Account, Told, of_motion, of_rows, versions
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
@@ -348,14 +349,14 @@ def _by_motion(
     """Yield the account that predictions of some trials show and none contradicts, if any."""
     some = _examined(trials, shown)
     found = dict[Account, dict[int, tuple[Fit, Fit, float]]]()
-    against = dict[Account, set[int]]()
     table = list(of_motion(model, shown, [trials[k] for k in some]))
-    for k in some:
-        for account, fits in _each(model, trials[k], rows, shown, table):
-            if fits is None:
-                against.setdefault(account, set()).add(k)
-            else:
-                found.setdefault(account, {})[k] = fits
+    examined = {k: _Seen(model, trials[k], rows, shown, table) for k in some}
+    for k, one in examined.items():
+        for account, fits in one.better():
+            found.setdefault(account, {})[k] = fits
+    against = {
+        account: {k for k, one in examined.items() if one.worse(account)} for account in found
+    }
     # a trial in another unit may be one of many; columns are exchanged in all of a kind
     whole = {
         account: fits
@@ -388,38 +389,65 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(FAR))[:TRIALS]})
 
 
-def _each(
-    model: Model,
-    trial: Trial,
-    rows: Sequence[Row],
-    shown: Sequence[int],
-    table: Sequence[Account],
-) -> Iterator[tuple[Account, tuple[Fit, Fit, float] | None]]:
-    """Yield each account on which a trial is informative, with the fits as logged and mended.
+class _Seen:
+    """A trial as it would be by each account of a table, and what the model misses of each.
 
-    None in place of the fits if the log is better as it is.
+    Args:
+        model: however crude.
+        trial: of its states and inputs.
+        rows: the kinematic rows.
+        shown: indices of the states with a sensor.
+        table: the accounts.
     """
-    known, ones, seconds = _known(trial, shown), np.ones(model.m), horizon_of(trial, shown)
-    logged = Ahead(model, trial, known, FEWER, horizon=seconds)
-    if not logged.enough or not np.isfinite(trial.inputs).all():
-        return
-    before, gains = gaps(model, trial, rows), dict[Account, float]()
-    plain, ahead = logged.plain(ones).missed, dict[Account, Ahead]()
-    for account in table:
-        mended = account.mended(trial)
-        entered = [row for row in before if row.states & account.touched]
-        after = gaps(model, mended, entered)
-        if not all(r in after and after[r].share <= max(MENDED, before[r].share) for r in entered):
-            continue  # the rows contradict it
-        made = Ahead(model, mended, known, FEWER, horizon=seconds)
-        if made.enough:
-            ahead[account], gains[account] = made, plain - made.plain(ones).missed
-    for account in sorted(gains, key=lambda one: -gains[one])[:SHORTLIST]:
-        if gains[account] > HINT and (fits := _compared(model, logged, ahead[account], account)):
-            yield account, (*fits, seconds)
-    for account, gain in gains.items():
-        if gain < -HINT:
-            yield account, None
+
+    def __init__(
+        self,
+        model: Model,
+        trial: Trial,
+        rows: Sequence[Row],
+        shown: Sequence[int],
+        table: Sequence[Account],
+    ) -> None:
+        self.model, self.trial, self.rows, self.known = model, trial, rows, _known(trial, shown)
+        self.seconds = horizon_of(trial, shown)
+        self.logged = Ahead(model, trial, self.known, FEWER, horizon=self.seconds)
+        unknown = {i for i in range(model.n) if i not in self.known}
+        self.table = [one for one in table if not one.touched & unknown]
+        self.gains = np.zeros(len(self.table))
+        if self.logged.enough and self.table and np.isfinite(trial.inputs).all():
+            each = plainly_missed(self.logged, versions(trial, [Account(""), *self.table]))
+            self.gains = np.nan_to_num(each[0] - each[1:])
+
+    def better(self) -> Iterator[tuple[Account, tuple[Fit, Fit, float]]]:
+        """Yield the accounts that the calibrated model clearly prefers, with both fits."""
+        left = SHORTLIST
+        for k in np.argsort(-self.gains, kind="stable"):
+            if self.gains[k] <= HINT or not left:
+                return
+            account = self.table[int(k)]
+            if not self._allowed(account):
+                continue
+            left -= 1
+            mended = account.mended(self.trial)
+            ahead = Ahead(self.model, mended, self.known, FEWER, horizon=self.seconds)
+            if ahead.enough and (fits := _compared(self.model, self.logged, ahead, account)):
+                yield account, (*fits, self.seconds)
+
+    def worse(self, account: Account) -> bool:
+        """Return whether the trial is better as logged."""
+        k = self.table.index(account) if account in self.table else -1
+        return k >= 0 and bool(self.gains[k] < -HINT) and self._allowed(account)
+
+    @cached_property
+    def _gaps(self) -> dict[Row, Gap]:
+        return gaps(self.model, self.trial, self.rows)
+
+    def _allowed(self, account: Account) -> bool:
+        """Return whether no kinematic row contradicts an account."""
+        entered = [row for row in self._gaps if row.states & account.touched]
+        after = gaps(self.model, account.mended(self.trial), entered)
+        most = {row: max(MENDED, self._gaps[row].share) for row in entered}
+        return all(row in after and after[row].share <= most[row] for row in entered)
 
 
 def _compared(

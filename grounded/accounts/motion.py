@@ -35,24 +35,27 @@ ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 Steps = NDArray[np.intp]
 
 
-def starts_from(model: Model, trial: Trial, shown: Sequence[int]) -> Array:
-    """Return the states that predictions start from at each sample, (T + 1, n).
+def starts_from(model: Model, states: Array, shown: Sequence[int]) -> Array:
+    """Return the states that predictions start from at each sample, (..., T + 1, n).
 
     States without a sensor are taken as 0, but the memory of adopted inputs' effects as the trial
     has it, where it follows the commands, and true values behind a delayed log as what is logged
     later.
     """
-    names, x = model.state_names, np.array(trial.states)
-    hidden, own = [i for i in range(model.n) if i not in shown], motion(model).state_names
+    names, x = model.state_names, np.array(states)
+    hidden = [i for i in range(model.n) if i not in shown]
+    if not hidden:
+        return x
+    own = motion(model).state_names
     known = np.isfinite(x) & np.array([name not in own for name in names])
-    x[:, hidden] = np.where(known, x, 0.0)[:, hidden]
+    x[..., hidden] = np.where(known, x, 0.0)[..., hidden]
     for i, k in true_values(names, [names[i] for i in hidden]).items():
         stem, _, steps = names[i].rpartition("_")
         stem, ago = (stem, int(steps)) if steps.isdigit() else (names[i], 0)
         late = sum(f"{stem}_{j + 1}" in names for j in range(model.n))  # up to one step too long
-        at = np.arange(len(x)) + late - ago
-        newer, older = (x[np.clip(at - j, 0, len(x) - 1)] for j in (0, 1 if late else 0))
-        x[:, i] = (older + 0.5 * model.difference(newer, older))[:, k]
+        at, last = np.arange(x.shape[-2]) + late - ago, x.shape[-2] - 1
+        newer, older = (x[..., np.clip(at - j, 0, last), :] for j in (0, 1 if late else 0))
+        x[..., i] = (older + 0.5 * model.difference(newer, older))[..., k]
     return x
 
 
@@ -129,7 +132,7 @@ class Ahead:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(horizon / trial.dt))
         self.delays = tuple(dict.fromkeys(round(d / trial.dt) for d in delays))
-        logged = starts_from(model, trial, self.shown)
+        logged = starts_from(model, trial.states, self.shown)
         good = np.asarray(np.isfinite(logged).all(axis=1))
         at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
         at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
@@ -177,6 +180,16 @@ class Ahead:
     def plain(self, gains: Array) -> Fit:
         """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
         return self._fit(self.size(self._off(gains, self.model.values, 0)[0]), gains)
+
+    def advanced(self, sent: Array, steps: Steps) -> Array:
+        """Return the errors of the uncalibrated model [nats] with later commands, (K,).
+
+        Args:
+            sent: commands (T, m), beyond the trial's end too.
+            steps: by how many steps later ones act, (K,).
+        """
+        off = self._with(sent)._off(np.ones(self.model.m), self.model.values, -steps)
+        return np.array([np.log(self.size(one)).sum() for one in off])
 
     def still(self) -> Fit:
         """Return the calibrated fit with every command at its mean: the commands have no effect."""
@@ -275,6 +288,30 @@ class Ahead:
         rms = np.ones(self.model.n)
         rms[self.shown] = size
         return Fit(rms, gains, self.moved)
+
+
+def plainly_missed(ahead: Ahead, versions: Array) -> Array:
+    """Return what the model as it is misses of K versions of a trial [nats], (K,), at most 0.
+
+    Args:
+        ahead: the predictions of the trial as it was logged; the versions start at its samples.
+        versions: states and inputs of each, (K, T + 1, n + m).
+    """
+    model, n, shown, K = ahead.model, ahead.model.n, ahead.shown, len(versions)
+    x = starts_from(model, versions[..., :n], shown)
+    first, last = x[:, ahead.at], x[:, ahead.at + ahead.steps]
+    stepped = stepper(model, np.tile(model.values, (K * len(ahead.at), 1)), ahead.dt)
+    now = first.reshape(-1, n)
+    for j in range(ahead.steps):
+        now = stepped(now, versions[:, ahead.at + j, n:].reshape(len(now), -1))
+        now = np.fmax(np.fmin(now, FAR), -FAR)
+    off = model.difference(now.reshape(first.shape), last)[..., shown]
+    moved = model.difference(last, first)[..., shown].std(axis=1)
+    size = np.sqrt(off.var(axis=1))  # a constant rate is removed
+    least = LITTLE * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
+    size = np.maximum(np.where(np.isfinite(size), size, FAR), least)
+    share = np.clip(size / np.maximum(moved, TINY), FLOOR, 1.0)
+    return np.asarray(np.log(share).sum(axis=-1))
 
 
 def basis(told: Array) -> Array:
