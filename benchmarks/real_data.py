@@ -5,7 +5,7 @@
 Prints for each the published cause, what is named, and held-out open-loop errors in units (crude,
 calibrated, as diagnosed, noise floor) beside those of the best model made by hand (SOURCE.md of
 each folder of ../shared/data, with a slightly different split and resampling). Models and logs are
-those of tests/support/real_systems.py. The diagnosis was developed on EMPS, SERVO and DART_*; BAM_*
+those of benchmarks/real_systems.py. The diagnosis was developed on EMPS, SERVO and DART_*; BAM_*
 (input: volts; in BAM_KP goal, gain and torque_enable) and the double pendulum (ACROBOT, SYSID) were
 held out, except that the w of BAM_QW was found to be a mean on it.
 """
@@ -21,6 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 import real_systems
+
 from grounded.diagnosis.diagnose import diagnose
 
 # system: published cause; families that are it; (seconds, or 0 for the whole run; channel, best)

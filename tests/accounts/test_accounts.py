@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accounts import ROBOTS, driven, faults, named, verdict
+from benchmarks.real_systems import ACROBOT, DART_STEERING, EMPS
 from facts import holds
 from grounded import Model, Param, Trial
 from grounded.accounts.commands import answers_early, how_inputs_act
@@ -13,7 +14,6 @@ from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.judge import contradicted, judge
 from grounded.accounts.sound_trials import sound_trials
 from grounded.accounts.table import DEGREES, Account, of_motion, units_of
-from real_systems import ACROBOT, DART_STEERING, EMPS
 from shared_data import needs_data
 
 ROBOT = {name: make() for name, make in ROBOTS.items()}

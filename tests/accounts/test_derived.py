@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Trial, diagnose
+from grounded import Model, Trial
 from grounded.accounts.finding import (
     a_mean,
     late_as_positions,
@@ -13,7 +13,6 @@ from grounded.accounts.finding import (
     put_right,
 )
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
@@ -83,64 +82,6 @@ def test_a_late_sensor_of_its_own_is_still_used(noise):
     (one,) = (f for f in found.findings if f.signal == "w")
     assert one.kind == "delay" and abs(one.delay_s - 2 * DT) < 0.1 * DT
     assert np.isfinite(found.trials[0].states[:, 1]).any()
-
-
-@pytest.mark.parametrize("noise", [2e-4, 2e-3])
-def test_a_slow_sensor_of_its_own_is_still_used(noise):
-    found = preflight(SWING, swung("slow", noise))
-    assert "smoothed" not in {f.kind for f in found.findings}
-    assert np.isfinite(found.trials[0].states[:, 1]).any()
-
-
-def test_a_signal_that_is_not_used_has_one_line():
-    for kind, keep in (("filtered", 0.5), ("filtered", 0.8)):
-        found = preflight(SWING, swung(kind, keep=keep)).findings
-        assert {"smoothed"} < {f.kind for f in found if f.signal == "w"}
-        (line,) = (one for one in instrument_lines(found) if one.startswith("w:"))
-        assert "left out" in line and "corrected here" not in line
-    late = put_right("w", "0.02 s later than the derivative of q", "delay", "delay_s = 0.02")
-    (line,) = instrument_lines([late, a_mean("w", "q", 0.04)])
-    assert "0.02 s later" in line and "mean over 0.04 s" in line and "delay_s = 0.02" in line
-    assert "corrected here" not in line and "corrected here" in instrument_lines([late])[0]
-
-
-BALL = Model(
-    name="ball",
-    states={"x": "m", "v": "m/s", "beam": "rad"},
-    inputs={"u": "rad/s"},
-    params={},
-    derivative=lambda s, a, p: {"x": s.v, "v": 7.0 * s.beam, "beam": a.u},
-)
-
-
-def rolled(late, steps=350):
-    """A ball is balanced; x is logged `late` steps late, v is a filter of differences of that."""
-    rng, s, true, u = np.random.default_rng(2), np.array([0.05, 0.0, 0.0]), [], np.zeros(steps)
-    for k in range(steps + 1):
-        true.append(s)
-        there = 0.1 * np.sin(0.8 * k * DT) * np.sign(np.sin(0.31 * k * DT))
-        wanted = -4 * (s[2] + 0.4 * (s[0] - there) + 0.5 * s[1]) + 0.3 * rng.standard_normal()
-        u[min(k, steps - 1)] = wanted
-        for _ in range(10):
-            s = s + DT / 10 * np.array([s[1], 7 * s[2], wanted])
-    true = np.array(true)
-    x = true[np.maximum(np.arange(steps + 1) - late, 0), 0] + 1e-3 * rng.standard_normal(steps + 1)
-    v = np.zeros(steps + 1)
-    for k in range(1, steps + 1):
-        v[k] = 0.7 * v[k - 1] + 0.3 * (x[k] - x[k - 1]) / DT
-    beam = true[:, 2] + 5e-4 * rng.standard_normal(steps + 1)
-    states = np.stack([x, v, beam], axis=1)[5:]
-    return Trial(states, u[5:, None], DT, ("x", "v", "beam"), ("u",))
-
-
-@pytest.mark.slow
-def test_a_speed_that_is_computed_from_a_late_position_is_as_late():
-    found = diagnose(BALL, [rolled(late=2)], DiagnosisOptions(max_effects=1))
-    assert found.effects == ("sensor_delay:x",)
-    late = found.late_sensors
-    assert late["sensor_delay:v"]["d"] == pytest.approx(found.values("sensor_delay:x")["d"])
-    assert late["sensor_delay:v"]["d"] == pytest.approx(2 * DT, abs=0.01)
-    assert late["sensor_lag:v"]["tau"] == pytest.approx(DT * 0.7 / 0.3, abs=0.03)
 
 
 def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted():

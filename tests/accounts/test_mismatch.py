@@ -8,7 +8,6 @@ from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.kinematics import kinematic_rows
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.frozen import Array
-from grounded.models.car import model as CAR
 from grounded.trial import Trial
 
 DT = 0.1
@@ -220,15 +219,6 @@ def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
     assert one.facts["by"] == pytest.approx(np.pi / 180)
 
 
-def test_of_several_trials_the_one_with_a_folded_heading_is_named():
-    trials = [*logged(BOAT)[:2], logged(BOAT, folded)[2]]
-    with pytest.raises(UnusableTrials) as error:
-        preflight(BOAT, trials)
-    (one,) = error.value.findings
-    assert (one.code, one.about, one.facts["which"]) == ("log.folded", ("psi",), ("t0002",))
-    assert error.value.then is not None and error.value.then.arguments == ("t0002",)
-
-
 def test_what_no_single_change_mends_is_stated():
     def other(x: Array) -> Array:
         y = np.array(x)
@@ -272,25 +262,6 @@ def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
     assert not delayed(preflight(BOAT, found.trials).findings)
 
 
-@pytest.mark.parametrize("alone", [1])
-def test_one_position_that_is_late_alone_does_not_make_both_late(alone, monkeypatch):
-    """Half of its delay is left along and across; noise may hide that, each by itself tells."""
-    monkeypatch.setattr("grounded.accounts.ages._left", lambda *_, **__: [(0.0, 0.0)])
-    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
-    found = preflight(BOAT, logged(BOAT, positions_late(0.15, (alone,))))
-    assert not delayed(found.findings)
-    assert "sensor_delay:" + "xy"[alone] not in found.settled
-
-
-def test_a_delay_that_a_constant_drift_makes_as_well_is_none(monkeypatch):
-    found = {False: (0.0, 0.013), True: (0.03, 0.013)}  # [s], after the shift and before it
-    name = "grounded.accounts.ages._left"
-    monkeypatch.setattr(name, lambda ways, steps, *_, **__: [found[steps == 0]])
-    assert not delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
-    found[True] = (0.15, 0.013)
-    assert delayed(preflight(BOAT, logged(BOAT, positions_late(0.15))).findings)
-
-
 @pytest.mark.parametrize("model", [BOAT])
 def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
     def ahead(x: Array) -> Array:  # an antenna 0.4 m behind the middle
@@ -312,21 +283,3 @@ def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
 
     for fault in (lambda x: x, ahead, slipping, drifting):
         assert not delayed(preflight(model, logged(model, fault)).findings)
-
-
-def test_a_steering_angle_is_no_speed_to_the_side(monkeypatch):
-    late_along_and_across = [(0.0, 0.003), (0.07, 0.003)]
-
-    def left(ways, steps, dt, *, apart):
-        return [(0.033 * (steps == 0), 0.006)] if not apart else late_along_and_across
-
-    monkeypatch.setattr("grounded.accounts.ages._left", left)
-    rng, t = np.random.default_rng(5), np.arange(200) * 0.05
-    u = np.column_stack([0.6 * np.sin(t), 0.6 + 0.25 * np.sin(0.5 * t)])
-    x = [np.zeros(6)]
-    for one in u:
-        x.append(CAR.system.step(x[-1][None], one[None], CAR.values, 0.05)[0])
-    behind = np.array(x[5:]) + 0.003 * rng.standard_normal((196, 6))
-    behind[:, 2:4] = np.array(x)[:-5, 2:4]
-    trial = Trial(behind, u[5:], 0.05, CAR.state_names, CAR.input_names)
-    assert not delayed(preflight(CAR, [trial]).findings)

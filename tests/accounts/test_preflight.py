@@ -180,12 +180,6 @@ def test_sound_sensors_are_left_alone():
             np.testing.assert_array_equal(before.states, after.states)
 
 
-def test_sensors_too_noisy_to_be_held_against_each_other_may_still_be_late():
-    rng = np.random.default_rng(1)
-    found = preflight(ARM, arm(lambda y: y + rng.standard_normal(y.shape) * [0.03, 0.3]))
-    assert not found.in_step and not found.settled
-
-
 @pytest.mark.parametrize("bias", [-0.02])
 def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
     """0.05 rad/s are 20 cm of way in a run of 4 s; which of the two is off, the physics says."""
@@ -239,28 +233,6 @@ def test_samples_that_show_nothing_become_missing(fault, kind, lost):
 
 def dead(x):
     return np.column_stack([x[:, 0], np.full(len(x), 0.25)])
-
-
-def test_a_velocity_that_shows_nothing_in_one_log_becomes_missing_there():
-    trials = arm()
-    trials[1] = replace(trials[1], states=dead(trials[1].states))
-    found = preflight(ARM, trials)
-    (one,) = (f for f in found.findings if f.kind == "stuck")
-    assert one.signal == "w" and one.corrected and "number 2" in one.finding
-    assert [bool(np.isnan(t.states[:, 1]).all()) for t in found.trials] == [
-        False,
-        True,
-        False,
-        False,
-    ]
-
-
-def test_a_velocity_that_no_log_shows_stops_the_diagnosis():
-    with pytest.raises(UnusableTrials) as stopped:
-        preflight(ARM, arm(dead))
-    one = stopped.value.finding
-    assert (one.code, one.about, one.facts["state"]) == ("log.dead", ("w",), "q")
-    assert one.facts["mean"] == pytest.approx(0.25)
 
 
 def of_another_axis(x):
@@ -381,15 +353,6 @@ def test_kinematics_come_from_the_model():
     assert set(names[:2]) == {"x", "y"} and names[2] == "psi"
 
 
-def test_noise_in_both_brackets_the_scale():
-    rng, t = np.random.default_rng(0), np.arange(2000) * DT
-    true = np.sin(1.3 * t) + np.sin(3.1 * t)
-    a = true + 0.3 * rng.standard_normal(2000)
-    lag = lag_between([(a, 1.2 * true + 0.3 * rng.standard_normal(2000))], DT)
-    assert lag is not None and lag.low < 1.2 < lag.high
-    assert abs(lag.delay) < 5 * lag.std < 0.02
-
-
 @pytest.mark.parametrize("of_slow", [1.0, 0.94])
 def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
     """A balancer's torque changed sign every 25 ms: its gyro showed 94.5 % of its pitch's rate."""
@@ -400,19 +363,6 @@ def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
     assert lag.scale < 0.96
     assert lag.slow == pytest.approx(of_slow, abs=0.01)
     assert lag.off(0.03) == (of_slow < 1)
-
-
-def test_a_whole_trial_in_degrees_is_named_and_corrected():
-    trials = arm()
-    odd = replace(trials[2], states=np.rad2deg(trials[2].states), id="t0003")
-    found = preflight(ARM, [*trials[:2], odd, trials[3]])
-    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [
-        ("q", "degrees", True),
-        ("w", "degrees", True),
-    ]
-    assert all("t0003" in f.finding for f in found.findings)
-    np.testing.assert_allclose(found.trials[2].states, trials[2].states)
-    np.testing.assert_array_equal(found.trials[1].states, trials[1].states)
 
 
 @pytest.mark.parametrize(("state", "factor"), [(0, np.pi / 180), (1, 180 / np.pi)])
@@ -569,20 +519,6 @@ def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
     assert (found.signal, found.corrected) == ("w", mended)
     assert ("rpm" in found.finding) == rpm
     assert found.log == "scale = 0.10471976" * mended
-
-
-def test_two_rates_in_rpm_are_no_clock():
-    trials, factor = [], 60 / (2 * np.pi)
-    for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
-        a, b = first.states, second.states
-        states = np.column_stack([a[:, 0], b[:, 0], factor * a[:, 1], factor * b[:, 1]])
-        trials.append(Trial(states, first.inputs, DT, BOTH.state_names, ("u",)))
-    looked = preflight(BOTH, trials)
-    assert [(one.signal, one.kind, one.corrected) for one in looked.findings] == [
-        ("w1", "degrees", True),
-        ("w2", "degrees", True),
-    ]
-    np.testing.assert_allclose(looked.trials[0].states[:, 2], trials[0].states[:, 2] / factor)
 
 
 TRUCK = Model(

@@ -7,9 +7,7 @@ import pytest
 
 from grounded import Trial
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.tables import instrument_lines
-from grounded.effects import Library
 from grounded.models.arm import model as arm
 
 DT, LATE, WHIRL = 0.02, 2, 10.0  # [s], steps, [N m]
@@ -67,12 +65,3 @@ def test_a_model_that_steps_by_itself_is_not_judged():
     own = replace(arm, derivative=None, step=step)
     looked = preflight(own, [driven(0, WHIRL), driven(1), driven(2)])
     assert not [one for one in looked.findings if one.kind == "unresolved"]
-
-
-def test_the_delay_behind_a_whirl_is_found_and_what_was_left_out_is_said():
-    library = Library(tuple(map(Library().family, ("delay", "viscous_friction", "input_gain"))))
-    options = DiagnosisOptions(library=library)
-    found = diagnose(arm, [driven(0, WHIRL), driven(1), driven(2)], options)
-    assert found.effects == ("delay:tau1+tau2",)
-    assert found.values("delay:tau1+tau2")["d"] == pytest.approx(LATE * DT, abs=0.002)
-    assert [one.signal for one in found.preflight if one.kind == "unresolved"]

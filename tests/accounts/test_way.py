@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from grounded import Model
-from grounded.accounts.ages import lag_of
 from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.judge import judge
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.frozen import Array
-from grounded.places import integrals
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults
 
@@ -120,13 +118,6 @@ def test_one_trial_with_speeds_in_other_axes_is_named_alone():
     assert stopped.value.then is not None and stopped.value.then.arguments == ("t0002",)
 
 
-@pytest.mark.parametrize("name", ["psi", "r"])
-def test_degrees_stay_degrees(name):
-    for trial in logged(times(180 / np.pi, name), 4):
-        (found,) = preflight(BOAT, [trial]).findings
-        assert (found.signal, found.kind) == (name, "degrees")
-
-
 @pytest.mark.parametrize("fault", [lambda x: x, times(0.0, "psi"), times(-1, "psi"), compass])
 def test_no_other_axes_are_blamed_for_a_heading(fault):
     """One that is stuck leaves as little as speeds that it is not to turn, and its gyro differs."""
@@ -145,23 +136,6 @@ def test_a_compass_heading_is_put_right_in_one_finding(seed):
     assert (one.signal, one.kind, one.scale) == ("psi", "sign", -1.0)
     assert one.log == "scale = -1, offset = 1.5707963"
     np.testing.assert_allclose(found.trials[0].states, sound.states, atol=1e-9)
-
-
-def test_a_compass_whose_gyro_counts_clockwise_too_is_two_findings_and_no_exchange():
-    odd = logged(lambda x: times(-1, "r")(compass(x)), 4)
-    found = preflight(BOAT, odd)
-    assert [(f.signal, f.log) for f in found.findings] == [
-        ("psi", "scale = -1, offset = 1.5707963"),
-        ("r", "scale = -1"),
-    ]
-    for trial, sound in zip(found.trials, SOUND, strict=True):
-        np.testing.assert_allclose(trial.states, sound.states, atol=1e-9)
-
-
-def test_an_offset_of_a_mirrored_heading_is_measured():
-    (one,) = preflight(BOAT, logged(lambda x: times(-1, "psi")(x + 0.8 * np.eye(6)[5]))).findings
-    scale, _, offset = one.log.partition(", offset = ")
-    assert scale == "scale = -1" and float(offset) == pytest.approx(-0.8, abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -189,24 +163,6 @@ def test_speeds_and_positions_in_another_unit_are_named_with_their_scale(unit, f
 def test_a_slip_or_a_scale_of_another_size_is_no_unit(factor):
     for trial in logged(times(factor, "u", "v"), 4):
         assert not {f.kind for f in preflight(BOAT, [trial]).findings} - {"mismatch"}
-
-
-def test_only_the_trial_in_another_unit_is_named():
-    """One boat in knots, one 2.5 times too fast, which no unit is."""
-    knots, faster = logged(times(1.943844, "u", "v"), 2), logged(times(2.5, "u", "v"), 2)
-    with pytest.raises(UnusableTrials) as no:
-        preflight(BOAT, [knots[0], faster[1]])
-    assert (no.value.finding.code, no.value.finding.facts["unit"]) == ("log.unit", "knots")
-    assert no.value.then.arguments == ("t0000",)
-
-
-def test_a_gyro_that_is_no_difference_of_the_heading_stays():
-    (heading,) = integrals(BOAT)
-    for seed in range(12):
-        for steps in (230, 300):
-            trial = sailed(seed + 10, steps)
-            lag = lag_of(BOAT, heading, [trial])
-            assert lag is not None and lag.mean == 0
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from facts import holds
 from grounded.policy import load
 from grounded_cli.main import COMMANDS
 from grounded_trials.starting.examples import EXAMPLES
-from workspaces import CONFIG, REAL, make
+from workspaces import make
 
 HERE = [n for n, (m, _) in COMMANDS.items() if importlib.util.find_spec(f"grounded_cli.{m}")]
 
@@ -164,26 +164,6 @@ def test_the_loop_by_hand(w):
     assert second["best_utility"] == status["utilities"][0]
 
 
-def test_propose_names_the_outstanding_candidate_again(w):
-    first = grounded("-C", w, "propose", "--json")
-    content = Path(first.json["file"]).read_bytes()
-    again = grounded("-C", w, "propose", "--json")
-    assert again.json["candidate"] == "c0001" and again.json["new"] is False
-    assert Path(again.json["file"]).read_bytes() == content
-    Path(first.json["file"]).unlink()
-    grounded("-C", w, "propose")
-    assert Path(first.json["file"]).read_bytes() == content
-
-
-def test_ingest_of_the_same_file_twice_is_a_success_that_names_the_trial(w):
-    _, run, first = step(w)
-    before = sorted(p.name for p in (w / "trials").iterdir())
-    again = grounded("-C", w, "ingest", run["trial_file"], "--json")
-    assert again.code == 0 and again.json["trials"][0]["known"] is True
-    assert again.json["trials"][0]["trial"] == first["trials"][0]["trial"] == "t0001"
-    assert sorted(p.name for p in (w / "trials").iterdir()) == before
-
-
 def test_learn_runs_to_the_end_and_says_what_is_next(w):
     part = grounded("-C", w, "learn", "--trials", "2", "--json")
     assert part.json["trials"] == 2 and part.code == 0
@@ -298,16 +278,6 @@ def test_a_closed_pipe_is_no_traceback(w):
         check=False,
     )
     assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
-
-
-def test_repeats_have_a_standard_error(tmp_path):
-    noisy = (
-        CONFIG.replace("[search]", "[search]\nrepeats = 3") + "noise = { process = { v = 0.02 } }\n"
-    )
-    folder = make(tmp_path / "w", config=noisy, real=REAL).folder
-    done = grounded("-C", folder, "learn", "--trials", "9", "--json").json
-    assert done["trials"] == 9 and len(done["history"][0]["trials"]) == 3
-    assert done["history"][0]["standard_error"] > 0
 
 
 def test_propose_sets_a_promise_beside_what_was_measured(tmp_path, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded_trials.store.trial_file import TrialWriter
 from workspaces import CONFIG, MODEL, make
 
 DART_LOG = """
@@ -65,19 +64,6 @@ def test_files_that_are_no_log(w, tmp_path):
             refused(w, "ingest", tmp_path / name, *how, holds=[name])
 
 
-def test_logs_of_the_shared_data_that_can_not_be_taken(w, tmp_path, shared):
-    damaged = sorted((shared / "mcap_format_fixtures" / "derived_corrupt").glob("*.mcap"))
-    assert len(damaged) == 6
-    for path in damaged:
-        refused(w, "ingest", path, "--data", holds=[path.name])
-    drone = next((shared / "crazyflie_p4_ros2_mcap").glob("**/*.mcap"))
-    refused(w, "ingest", drone, "--data", holds=["/vicon/jetracer1"])  # the topic that [log] names
-    car = next((shared / "dart_small_car").glob("*.mcap"))
-    refused(w, "ingest", car, holds=["--candidate ID", "--data"])  # it ran nothing
-    folder = make(tmp_path / "plain").folder
-    refused(folder, "ingest", car, "--data", holds=["[log]", "next: grounded inspect"])
-
-
 # trials of ours, but not this workspace's
 
 
@@ -119,13 +105,6 @@ def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
     refused(w, "ingest", trial, holds=["another task", "--data"])
     kept = grounded("-C", w, "ingest", trial, "--data", "--json").json["trials"][0]
     assert kept["candidate"] is None and kept["utility"] is None
-
-
-def test_one_bad_file_of_several(w, trial, tmp_path):
-    (tmp_path / "bad.mcap").write_bytes(b"")
-    done = grounded("-C", w, "ingest", trial, tmp_path / "bad.mcap")
-    assert done.code == 1 and "t0001" in done.out and "bad.mcap" in done.err
-    assert len(stored(w)) == 1
 
 
 # runs that went wrong on the robot
@@ -256,12 +235,6 @@ def test_a_target_that_is_wrong_names_line_and_column(tmp_path, name):
     assert holds(done.err, "target.csv", *parts), done.err
 
 
-def test_a_target_of_windows_and_excel_is_fine(tmp_path):
-    rows = "".join(f"{0.05 * i:.2f} , 0.5\r\n" for i in range(41))
-    folder = make(tmp_path / "w", target="\ufefft, x\r\n" + rows + "\r\n").folder
-    assert grounded("-C", folder, "propose").code == 0
-
-
 # [system]
 
 DRIVE = """import sys
@@ -327,14 +300,6 @@ def test_a_command_that_does_not_work_is_one_sentence(tmp_path, name):
     assert all(part in message for part in parts), done.err
 
 
-def test_a_command_that_writes_garbage_stores_nothing(tmp_path):
-    script = "import sys, pathlib; pathlib.Path(sys.argv[2]).write_text('it went well')\n"
-    folder = with_command(tmp_path, f"{sys.executable} drive.py {{candidate}} {{trial}}", script)
-    done = grounded("-C", folder, "learn")
-    assert done.code == 1 and "Traceback" not in done.err and not stored(folder)
-    assert list((folder / "runs").iterdir())  # what it wrote is kept
-
-
 def test_without_a_system_the_message_says_what_to_do(tmp_path):
     config = CONFIG.replace("[system]", "").replace('model = "real.py"', "")
     folder = make(tmp_path / "w", config=config).folder
@@ -374,17 +339,6 @@ def test_strange_files_in_the_workspace_disturb_nothing(w, trial):
     assert grounded("-C", w, "status").code == 0
 
 
-def test_a_lost_candidate_file_is_taken_from_its_trial(w, trial):
-    grounded("-C", w, "ingest", trial)
-    before = grounded("-C", w, "propose", "--json")
-    content = Path(before.json["file"]).read_bytes()
-    for path in (w / "candidates").iterdir():
-        path.unlink()
-    again = grounded("-C", w, "propose", "--json")
-    assert again.json["candidate"] == "c0002" and Path(again.json["file"]).read_bytes() == content
-    assert grounded("-C", w, "export", "c0001", "-o", w / "x.json").code == 0
-
-
 def test_a_damaged_candidate_says_what_to_do(w, trial):
     grounded("-C", w, "ingest", trial)
     path = w / "candidates" / "c0001.mcap"
@@ -393,12 +347,3 @@ def test_a_damaged_candidate_says_what_to_do(w, trial):
     assert done.code == 1 and "c0001" in done.err and "Traceback" not in done.err
     path.unlink()
     assert grounded("-C", w, "propose").code == 0
-
-
-def test_live_writing_refuses_to_overwrite(tmp_path):
-    path = tmp_path / "t.mcap"
-    TrialWriter(path, 0.1, {"x": "m"}, {"u": "1"}, {}).close()
-    from grounded.errors import GroundedError
-
-    with pytest.raises(GroundedError, match="never overwritten"):
-        TrialWriter(path, 0.1, {"x": "m"}, {"u": "1"}, {})

@@ -224,12 +224,3 @@ def test_init_that_was_cut_off_goes_on(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "mine" / "model.py").write_text("mine")
     assert "exists already" in grounded("init", tmp_path / "mine", "--example", "pendulum").err
     assert (tmp_path / "mine" / "model.py").read_text() == "mine"
-
-
-def test_temporary_files_of_killed_processes_are_swept(tmp_path: Path) -> None:
-    old, new = (tmp_path / f".a.csv-{name * 16}.tmp" for name in "ab")
-    for path in (old, new):
-        path.write_text("half")
-    os.utime(old, (0, 0))
-    write_atomically(tmp_path / "b.csv", b"b")
-    assert sorted(p.name for p in tmp_path.iterdir()) == [new.name, "b.csv"]

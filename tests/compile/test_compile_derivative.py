@@ -98,7 +98,7 @@ def differenced(step, x, u, p):
     return np.stack(columns, axis=2)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @example("s.x", ("and", "s.x", ("add", ("and", "1.3", "1.3"), "s.x")), 0)  # an array without axes
 @given(trees, trees, st.integers(0, 10_000))
 def test_derivatives_of_made_up_expressions(left, right, seed):
@@ -114,7 +114,7 @@ def test_derivatives_of_made_up_expressions(left, right, seed):
     assert np.allclose(exact, near, rtol=1e-6, atol=1e-6 * (1 + np.abs(near).max()))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(trees, trees, st.integers(0, 10_000), st.sampled_from([0.0, 0.3]))
 def test_compiled_agrees_with_interpreted(left, right, seed, eps):
     model = model_of(left, right)
@@ -134,8 +134,8 @@ def test_compiled_agrees_with_interpreted(left, right, seed, eps):
         assert np.allclose(mine, theirs, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("integrator", ["rk4"])
 @pytest.mark.parametrize("name", sorted(SPECS))
-@pytest.mark.parametrize("integrator", ["rk4", "euler"])
 def test_models_against_central_differences(name, integrator):
     made, p = system(name, integrator=integrator)
     rng = np.random.default_rng(1)

@@ -31,7 +31,7 @@ def pair(name, horizon=37, **changes):
 
 def cases():
     for name in sorted(SPECS):
-        for delay, limit in ((0.0, 0.2), (0.4, np.inf), (2.7, 0.2)):
+        for delay, limit in ((0.4, np.inf), (2.7, 0.2)):
             yield name, delay, limit
 
 
@@ -142,10 +142,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("n", "m", "dense"),
-    [(1, 1, True), (16, 4, True), (26, 3, False), (6, 9, True)],
-)
+@pytest.mark.parametrize(("n", "m", "dense"), [(1, 1, True), (26, 3, False), (6, 9, True)])
 def test_sizes_written_out_and_looped(n, m, dense):
     fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
     assert fast.system.how == "compiled"

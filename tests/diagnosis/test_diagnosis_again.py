@@ -61,12 +61,17 @@ def task(model, steps=200):
 @pytest.mark.slow
 def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     """A gain of 1.0 that is 1.5: adopted as 1.502, its last 0.13 % are above the noise."""
-    trials = runs(1.5, steps=120)
-    alone = diagnose(axis(1.502), trials)
+    trials = runs(1.5, trials=2, steps=120)
+    few = Library(tuple(map(Library().family, ("input_gain", "viscous_friction", "delay"))))
+    alone = diagnose(axis(1.502), trials, DiagnosisOptions(library=few))
     assert alone.effects  # seen, where nothing tells what the crude model missed
-    found = diagnose(axis(1.502), trials, DiagnosisOptions(origin=task(axis(1.0), steps=120)))
+    found = diagnose(
+        axis(1.502), trials, DiagnosisOptions(library=few, origin=task(axis(1.0), steps=120))
+    )
     assert found.effects == () and not found.credit
-    first = diagnose(axis(1.0), trials, DiagnosisOptions(origin=task(axis(1.0), steps=120)))
+    first = diagnose(
+        axis(1.0), trials, DiagnosisOptions(library=few, origin=task(axis(1.0), steps=120))
+    )
     assert first.effects
     (then, now) = ([r for r in d.prediction_error if not r.whole_trial][-1] for d in (first, found))
     assert now.outset == pytest.approx(then.crude, rel=0.05)  # one ruler, before and after

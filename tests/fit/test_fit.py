@@ -246,44 +246,6 @@ def test_held_out_errors_decide_whether_a_fit_helps():
     assert "d" in dataclasses.replace(found, params={"d": moved}).at_bounds
 
 
-@pytest.mark.slow
-def test_the_real_emps_axis_against_its_published_values():
-    """A motor, a ball screw, a carriage; only its position is measured."""
-    model = Model(
-        name="emps",
-        states={"q": "m", "v": "m/s"},
-        inputs={"voltage": "V"},
-        params={
-            "M": Param(80.0, "kg", 20.0, 300.0),
-            "Fv": Param(100.0, "N s/m", 0.0, 1000.0),
-            "Fc": Param(5.0, "N", 0.0, 100.0),
-            "offset": Param(0.0, "N", -20.0, 20.0),
-        },
-        derivative=lambda s, a, p: {
-            "q": s.v,
-            "v": (35.15065188 * a.voltage - p.Fv * s.v - p.Fc * np.sign(s.v) - p.offset) / p.M,
-        },
-    )
-
-    def axis(name, every=10):
-        data = np.load(shared() / "data" / "emps_prismatic_axis" / name)
-        T = (len(data["q_m"]) - 1) // every
-        states = np.full((T + 1, 2), np.nan)
-        states[:, 0] = data["q_m"][: T * every + 1 : every]
-        inputs = data["u_motor_V"][: T * every].reshape(T, every).mean(axis=1)[:, None]
-        return [Trial(states, inputs, every * 1e-3, ("q", "v"), ("voltage",))]
-
-    found = fit(model, axis("emps_estimation.npz"))
-    published = {"M": 95.109, "Fv": 203.5, "Fc": 20.394, "offset": -3.165}
-    for name, value in published.items():
-        assert found.params[name].low < value < found.params[name].high
-        assert found.params[name].value == pytest.approx(value, rel=0.05)
-    assert found.after.ahead[0] < found.before.ahead[0] / 20
-    validation = axis("emps_validation_pulses.npz")
-    before, after = (prediction_error(m, validation) for m in (model, found.model))
-    assert after.ahead[0] < before.ahead[0] / 20
-
-
 def test_the_real_dart_car_has_a_dead_zone():
     data = np.load(shared() / "data" / "dart_small_car" / "throttle_steps_rubber_10Hz.npz")
     column = list(data["columns"]).index

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bombs import explode, log, ros
+from bombs import explode, log
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.trial import Trial
@@ -190,20 +190,6 @@ def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
 
 STAMPED = "a/Header header\nfloat64 x\n" + "=" * 80
 STAMPED += "\nMSG: a/Header\nbuiltin_interfaces/Time stamp\nuint32 seq\n"
-
-
-def stamped(seconds: list[int]) -> bytes:
-    return ros(
-        STAMPED,
-        (b"\0\1\0\0" + struct.pack("<iIIxxxxd", s, 0, 0, float(i)) for i, s in enumerate(seconds)),
-    )
-
-
-def test_negative_stamps_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stamped([-2, -1, 0, 1]))
-    series = read_signals(path, {"x": SignalSpec("/t.x")})["x"]
-    assert series.t.tolist() == [s * 10**9 for s in (-2, -1, 0, 1)]
 
 
 @pytest.mark.parametrize("stamp", ['{"sec": 1e30, "nanosec": 0}', '{"sec": null, "nanosec": 0}'])

@@ -13,7 +13,6 @@ from cli import grounded
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
-from grounded.places import integrals
 from grounded_trials import Workspace
 from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.starting.begin import begin
@@ -608,23 +607,6 @@ def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path
     assert void_exports(w, made) == ()
 
 
-def test_a_generic_skeleton_has_the_rates_that_its_log_shows_and_an_actuator_as_input(tmp_path):
-    rng, t = np.random.default_rng(0), 0.02 * np.arange(500)
-    servo = 10 * np.sign(np.sin(2 * t)) + rng.normal(0, 1, len(t))
-    ball, speed = 80 * np.sin(1.3 * t), 104 * np.cos(1.3 * t) + rng.normal(0, 2, len(t))
-    beam = 3 * np.sin(2.2 * t)
-    table = np.column_stack([t, ball, speed, beam, servo])
-    header = "t,ball_mm,ball_vel_mm_s,beam_deg,servo_deg"
-    np.savetxt(tmp_path / "rig.csv", table, "%.5f", ",", header=header, comments="")
-    made = grounded("init", tmp_path / "w", "--from", tmp_path / "rig.csv")
-    assert made.code == 0, made.err
-    model = Workspace(tmp_path / "w").base_model
-    assert model.state_names == ("ball_mm", "ball_vel_mm_s", "beam_deg")
-    assert model.input_names == ("servo_deg",) and model.states["ball_vel_mm_s"] == "mm/s"
-    (relation,) = integrals(model)
-    assert (relation.i, relation.j, round(relation.c, 6)) == (0, 1, 1.0)
-
-
 @pytest.mark.parametrize("name", ["grip [N]"])
 def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     t = 0.02 * np.arange(500)
@@ -675,16 +657,3 @@ def test_a_log_in_which_nothing_to_learn_from_changes_is_refused(tmp_path, rows,
     (tmp_path / "off.csv").write_text("\n".join(["t,x,force", *lines]) + "\n")
     done = grounded("init", tmp_path / "w", "--from", tmp_path / "off.csv", *words)
     assert done.code == 1 and not (tmp_path / "w").exists()
-
-
-def test_a_target_on_another_grid_leads_to_the_command_that_resamples_it(tmp_path):
-    made = workspaces.make(tmp_path / "w")
-    file = made.folder / "grounded.toml"
-    before = read_target(made.folder / "target.csv")[1]
-    file.write_text(file.read_text().replace("dt = 0.05", "dt = 0.025"))
-    with pytest.raises(GroundedError) as refused:
-        Workspace(made.folder).propose()
-    then = refused.value.then
-    assert grounded("-C", made.folder, then.verb, *then.arguments).code == 0
-    np.testing.assert_allclose(read_target(made.folder / "target.csv")[1][::2], before, atol=1e-9)
-    assert grounded("-C", made.folder, "propose").code == 0

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from facts import holding, holds
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.logs.resample import END, START, Crossing, Span, to_grid
 from grounded_trials.logs.signals import Series, SignalSpec
@@ -274,23 +274,6 @@ def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
 
     with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
         grid(slow(pose(np.sin)), slow(command()))
-
-
-def test_a_skew_that_matters_is_said() -> None:
-    x = pose(np.sin)
-    skewed = replace(x, log_times=x.log_times + 300_000_000)
-    found = grid(skewed)
-    assert found.reports[0].skew_s == pytest.approx(-0.3)
-    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
-
-
-def test_what_is_held_or_sent_seldom_may_end_before_others_begin() -> None:
-    later = pose(np.sin)
-    later = replace(later, t=later.t + 20 * 10**9, log_times=later.log_times + 20 * 10**9)
-    seldom = command(0.0, 0.3)
-    assert set(grid(later, seldom).inputs[:, 0]) == {5.0}
-    with pytest.raises(GroundedError, match=holding("clocks", "[log.state.x] delay_s = 19.500")):
-        grid(later, command())
 
 
 def test_a_sample_far_outside_everything_else_is_told() -> None:

@@ -116,15 +116,6 @@ def test_the_controller_of_the_nearest_step_is_used():
     np.testing.assert_array_equal(Runner(p).action(-0.3, np.zeros(2)), p.feedforward[0])
 
 
-def test_called_at_the_rate_of_the_camera_it_sends_one_controller_a_step():
-    p = policy()
-    run = Runner(p)
-    for _ in range(3):
-        last = run.action(0.1, np.array([0.1, 0.2]))
-    z = np.array([0.3, 0.1, last[0], last[1], p.past[1]])
-    np.testing.assert_allclose(run.action(0.2, z[:2]), law(p, 2, z), atol=1e-12)
-
-
 def test_missed_calls_held_the_last_input():
     p = policy()
     run, s = Runner(p), np.zeros(2)
@@ -149,14 +140,6 @@ def test_after_the_horizon_the_held_input_is_sent():
     assert not np.array_equal(run.action(0.98, np.zeros(2)), p.past)
     for t in (0.995, 1.0, 5.0, 1e9):
         np.testing.assert_array_equal(run.action(t, np.zeros(2)), p.past)
-
-
-@pytest.mark.parametrize("t", [0.949, 0.951, 0.989, 0.991, 1.05, 0.05, 0.15])
-def test_done_agrees_with_action(t):
-    p = policy(feedback=False)
-    run = Runner(p)
-    over = np.array_equal(run.action(t, np.zeros(2)), p.past)
-    assert run.done(t) == over
 
 
 def test_an_action_can_be_kept_and_changed_by_the_caller():

@@ -7,31 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded_trials.report.calmed import WINDOWS
 from grounded_trials.report.figures.gap import forecast_figures
-from grounded_trials.report.figures.runs import bias_figure, error_figure, state_figure
+from grounded_trials.report.figures.runs import error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED, Log
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import forecast_table
-from reported import car, cart, gathered, many_flights
+from reported import car, cart, gathered
 
 __all__ = ["car", "cart"]
-
-
-def test_a_bias_hidden_by_noise_is_drawn_as_means_over_time():
-    findings = many_flights(1)
-    (run,), dt = findings.runs, findings.task.dt
-    steps, n = run.residual.shape
-    noise = np.random.default_rng(0).normal(0, 0.005, (steps + 1, n))
-    course = 0.1 * dt * np.sin(np.linspace(0, 7, steps))[:, None]
-    noisy = replace(run, residual=course + np.diff(noise, axis=0))
-    figure, window = bias_figure(replace(findings, runs=(noisy,))), -(-steps // WINDOWS)
-    for panel in figure.panels:
-        (curve,) = panel.curves
-        np.testing.assert_allclose(np.diff(curve.x), window * dt)
-        assert curve.x[0] == pytest.approx(0.5 * (window - 1) * dt) and panel.note
-        drawn = np.interp(curve.x, dt * np.arange(steps), course[:, 0] / dt)
-        assert np.abs(curve.y - drawn).max() < 0.05 < np.ptp(noise) / dt
 
 
 @pytest.mark.parametrize(("logs", "states_first"), [(1, True), (24, False)])

@@ -27,7 +27,7 @@ from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
 from grounded.trial import Trial
 from shared_data import SUPPORT
-from small_tasks import black_box, cart_task, drive, other, plain_task, rover, rover_task
+from small_tasks import cart_task, drive, other, plain_task, rover, rover_task
 
 PAPER = {"turn": 0.97, "circle": 0.88}  # section 5.2
 
@@ -222,30 +222,6 @@ def test_footnote_9_one_iteration_finds_the_optimum_whatever_the_bias(b):
 
 
 # headings
-
-
-def test_logs_with_wrapped_headings_learn_as_well():
-    task = rover_task()
-    plant = Plant(other(task.model, 1.15), latency={"speed": 0.06, "turn": 0.06})
-
-    def run(candidate):
-        trial = drive(task, plant, candidate)
-        states = np.array(trial.states)
-        states[:, 2] = (states[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        return replace(trial, states=states)
-
-    options = SearchOptions(max_trials=12)
-    plain = learn(task, lambda c: drive(task, plant, c), options).standing
-    wrapped = learn(task, run, options).standing
-    assert wrapped.utilities[-1] == pytest.approx(plain.utilities[-1], rel=0.02)
-
-
-def test_a_black_box_simulator_is_learned_from_too():
-    task = cart_task(model=black_box)
-    now = learn(
-        task, lambda c: drive(task, Plant(other(black_box, 1.5)), c), SearchOptions(max_trials=8)
-    ).standing
-    assert now.utilities[-1] > 0.9 * now.utilities[0] and now.iteration >= 1
 
 
 def test_the_fingerprint_follows_the_model_and_nothing_else():

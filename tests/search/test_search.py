@@ -144,11 +144,6 @@ def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
     assert sum(t.candidate == "c0001" for t in story.trials) == 2
 
 
-def test_two_exact_repeats_are_as_good_as_many():
-    story = Story(repeats=5).add().add()
-    assert story.now.history[0].accepted is True and story.now.phase == "propose"
-
-
 def test_repeats_are_averaged_and_all_are_needed():
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
     story = Story(plant=noisy, repeats=3)
@@ -301,17 +296,6 @@ def test_with_repeats_a_single_crash_fails_the_candidate():
     story = Story(repeats=3).add().add().add().add(cut)
     assert story.now.history[-1].accepted is False and story.now.history[-1].utility == -np.inf
     assert story.propose().is_new
-
-
-def test_a_trial_longer_than_the_horizon_counts_up_to_it():
-    def longer(trial):
-        states = np.vstack([trial.states, trial.states[-1:]])
-        return replace(trial, states=states, inputs=np.vstack([trial.inputs, trial.inputs[-1:]]))
-
-    plain, story = Story().add().add(), Story().add(longer).add(longer)
-    assert story.now.utilities == plain.now.utilities
-    a, b = plain.propose().candidate, story.propose().candidate
-    np.testing.assert_array_equal(a.policy.feedforward, b.policy.feedforward)
 
 
 @pytest.mark.parametrize(("off", "repeats", "least"), [(0.3, 1, -1.35)])
@@ -519,12 +503,6 @@ def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
     assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
     for trial in found.trials:
         assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()
-
-
-def test_a_loss_by_several_times_the_best_utility_is_no_luck():
-    """After a loss of -6.4 against -1.1 the best candidate is not run again."""
-    story = Story(rerun_incumbent=True).add().add(bad)
-    assert story.now.history[-1].accepted is False and story.now.phase == "propose"
 
 
 @pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from attacks import ATTACKS
+from benchmarks.attacks import ATTACKS
 
 
 @pytest.mark.slow

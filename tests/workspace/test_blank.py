@@ -136,18 +136,6 @@ def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
     assert "fan = 2970, pwm = 53.04" in note
 
 
-def test_a_friction_too_steep_for_a_step_is_followed_by_a_plan(sled):
-    way, found = np.linspace(0, 1, 41), []
-    sled.target({"x": 0.2 * way**2 * (3 - 2 * way)})
-    for width in (0.01, 1e-5):
-        effect = f'{{name = "coulomb_friction:v", c = 0.25, width = {width}}}'
-        edit(sled.folder, effects=effect)
-        candidate = Workspace(sled.folder).propose().candidate
-        found.append(candidate.predicted_utility)
-        assert candidate.predicted_states[-1, 0] == pytest.approx(0.2, abs=0.05)
-    assert found[1] == pytest.approx(found[0], rel=0.1, abs=0.01)
-
-
 def test_a_workspace_in_a_folder_of_this_one_is_named(sled):
     done = grounded("-C", sled.folder.parent, "status")
     assert done.code == 1 and f"{sled.folder}\n" in done.err
@@ -164,12 +152,6 @@ def test_a_candidate_as_proposed_runs_like_its_export(sled, tmp_path):
         load(candidate.file, states=("v", "x"))
     with pytest.raises(GroundedError, match=holding("0" * 16)):
         load(candidate.file, task="0" * 16)
-
-
-def test_a_candidate_is_not_read_where_nothing_reads_it(sled, monkeypatch):
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
-    with pytest.raises(GroundedError, match="npz"):
-        load(sled.propose().file)
 
 
 def test_nothing_is_overwritten(sled):

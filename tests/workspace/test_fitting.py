@@ -34,15 +34,6 @@ def filtered(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return noisy(seen, rng)
 
 
-def differenced(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The speed follows from noisy positions, smoothed."""
-    seen, speed = noisy(states, rng), 0.0
-    for t in range(1, len(seen)):
-        speed = 0.5 * speed + 0.5 * (seen[t, 0] - seen[t - 1, 0]) / DT
-        seen[t, 1] = speed
-    return seen
-
-
 def logs(
     folder: Path, masses: list[float], shown=noisy, steps: int = 40, alike: int = 1
 ) -> Workspace:
@@ -92,12 +83,6 @@ def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_p
     assert found.fit.helps and found.then == NextCommand("fit", ("--apply",))
     w.fit(apply=True)
     assert w.base_model.params["mass"].value == pytest.approx(1.4, rel=0.02)
-
-
-def test_parameters_are_fitted_without_a_speed_that_follows_from_positions(tmp_path):
-    found = logs(tmp_path / "w", [1.4] * 24, differenced).fit()
-    assert "smoothed" in {one.kind for one in found.preflight}
-    assert found.fit.helps and found.fit.params["mass"].value == pytest.approx(1.4, rel=0.05)
 
 
 def test_values_that_predict_worse_are_never_written(misled):

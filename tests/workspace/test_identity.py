@@ -110,17 +110,6 @@ def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(w):
     assert waiting in found.file
 
 
-def test_a_rewritten_candidate_with_a_checksum_of_its_own_is_found(w, tmp_path):
-    waiting = w.propose().candidate.id
-    other = learnt(tmp_path / "other", config=CONFIG.replace("x = 10.0", "x = 20.0"))
-    other.propose()
-    shutil.copy(other.candidate_path(waiting), w.candidate_path(waiting))
-    (found,) = w.verify().damaged
-    assert "was rewritten" in found.reason
-    with pytest.raises(GroundedError, match=holding(f"{waiting}.mcap", "rewritten")):
-        w.run(waiting)
-
-
 def test_joined_workspaces_never_mix_two_policies_of_one_name(w, tmp_path):
     config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
     other = learnt(tmp_path / "other", config=config)

@@ -69,22 +69,6 @@ def test_the_position_is_one_distance_and_angles_are_wrapped():
     assert (psi.what, psi.most) == ("psi", pytest.approx(0.01))
 
 
-def test_repeats_count_together_and_the_worst_of_all_is_told():
-    runs = [run(off(0.01)), run(off(0.03))]
-    position, _ = off_target_of(task(ALONG), runs)
-    assert position.rms == pytest.approx(math.sqrt((0.01**2 + 0.03**2) / 2))
-    assert position.most == pytest.approx(0.03)
-
-
-def test_what_only_the_end_weighs_is_told_there():
-    states = off(0.5)
-    states[-1, 0] = 0.002
-    (position,) = off_target_of(task(terminal=END), [run(states)])
-    assert math.isnan(position.rms) and position.end == pytest.approx(0.002)
-    both = off_target_of(task(ALONG, ALONG), [run(states)])[0]
-    assert both.rms > 0.4 and both.end == pytest.approx(0.002)
-
-
 def test_an_error_at_the_end_has_its_standard_error():
     noise = np.random.default_rng(0).normal(0.0, 0.016, (3, H + 1, 2))
     runs = []

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.effects import Library
 from grounded.errors import NextCommand
-from grounded.rollout import simulate
 from grounded_trials import Workspace
 from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.handover import checked_candidate
@@ -86,58 +84,19 @@ def test_a_probe_that_fails_costs_no_diagnosis(diagnosed, monkeypatch, caplog):
     assert kept is not None and kept.next_trial == found.next_trial
 
 
-PRECISE = "[system.noise.measurement]\nx = 0.002\nv = 0.005\n[system.noise.process]\nv = 0.02\n"
-RUBBING = """import numpy as np
-
-from grounded import Model
-from model import model as crude
-
-
-def dynamics(s, a, p):
-    return {"x": s.v, "v": (a.force - 0.5 * s.v - 0.4 * np.tanh(s.v / 0.05)) / 1.4}
-
-
-model = Model(
-    states=crude.states, inputs=crude.inputs, roles=crude.roles, params={}, derivative=dynamics
-)
-"""
-PARAMS_ALONE = Library().without(["input_gain", "viscous_friction", "input_curve", "rate_gain"])
-
-
-@pytest.mark.slow
-def test_what_a_probe_promises_is_what_the_diagnosis_after_it_states(tmp_path):
-    w = Workspace(make(tmp_path / "w", config=CONFIG + PRECISE, real=RUBBING).folder)
-    w.learn(4)
-    found = replace(w.diagnose(library=PARAMS_ALONE), indistinguishable=())
-    best = w.status().standing.incumbent.candidate
-    trials = [w.planner.lift(trial) for trial in w.task_trials()]
-    plan = w.planner.plan
-    made = probe(plan, best.policy, found, trials, PARAMS_ALONE)
-    (name,) = made.about
-    run = simulate(plan.problem(exact=True), made.policy)
-    ahead = {"predicted_states": run.states, "predicted_inputs": run.inputs}
-    one = replace(best, id=w.next_id(), policy=made.policy, **ahead, predicted_utility=run.utility)
-    saved = w.save_candidate(one, kind="probe")
-    for _ in range(made.runs):
-        w.ingest(w.run(saved.id, anyway=True).trial_file)
-    stated = w.diagnose(library=PARAMS_ALONE).parameters[name].std
-    assert made.std < found.parameters[name].std
-    assert 1 / 2.5 < stated / made.std < 2.5
-
-
 def test_one_trial_that_knows_most_is_not_believed_alone():
     rng, count = np.random.default_rng(0), 4
     root = rng.standard_normal((count, 3, 3))
     groups = root @ root.swapaxes(1, 2) + np.eye(3)
     groups[-1] *= 30
     total, draws = groups.sum(axis=0), []
-    for _ in range(2000):
+    for _ in range(600):
         s = np.array([np.linalg.cholesky(G) @ rng.standard_normal(3) for G in groups])
         s -= groups @ np.linalg.solve(total, s.sum(axis=0))  # at the top they add up to zero
         left = [np.linalg.solve(total - G, own) for G, own in zip(groups, s, strict=True)]
         draws.append((count - 1) / count * np.square(left).sum(axis=0))
     std = foretold(groups, np.zeros((3, 3)))
-    np.testing.assert_allclose(std, np.sqrt(np.mean(draws, axis=0)), rtol=0.06)
+    np.testing.assert_allclose(std, np.sqrt(np.mean(draws, axis=0)), rtol=0.12)
     assert (std > 1.5 * np.sqrt(np.diag(np.linalg.inv(total)))).all()
     twice = foretold(np.concatenate([groups, groups[-1:]]), np.zeros((3, 3)))
     assert (twice < 0.7 * std).all()

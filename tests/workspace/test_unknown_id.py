@@ -80,15 +80,3 @@ def test_a_damaged_trial_that_was_set_aside_stays_so_when_its_log_comes_again(tm
     stored.write_bytes(b"")
     found = w.ingest(log)
     assert found.trial == "t0001" and found.verdict == "set aside"
-
-
-def test_an_empty_candidate_is_deleted_and_its_trial_carries_it(ran):
-    path = ran.candidate_path("c0001")
-    whole = path.read_bytes()
-    path.chmod(0o644)
-    path.write_bytes(b"")
-    with pytest.raises(GroundedError, match="c0001"):
-        ran.export("c0001", ran.folder / "x.json")
-    path.unlink()
-    assert ran.candidate("c0001")[0].id == "c0001"
-    path.write_bytes(whole)

@@ -54,10 +54,6 @@ def test_a_command_that_is_later_than_another_gets_a_delay_of_its_own():
     assert found == pytest.approx({"delay:throttle": 0.03, "delay:steer": 0.05}, abs=2e-3)
 
 
-def test_commands_that_are_equally_late_keep_one_delay():
-    assert delays((0.04, 0.04)) == pytest.approx({"delay:throttle+steer": 0.04}, abs=2e-3)
-
-
 @pytest.mark.parametrize(
     "name, other, rest, same",
     [

@@ -178,34 +178,3 @@ def test_open_loop_predictions_of_an_unstable_plant_run_away():
     rows = diagnose(crude, trials, options).prediction_error
     assert rows[-1].whole_trial and set(rows[-1].runs_away["crude"]) == {"x", "v"}
     assert rows[-1].crude["x"] > 1e3 and not rows[0].runs_away
-
-
-def test_a_horizon_at_which_noise_fills_all_that_was_measured_shows_no_gap():
-    """A robot that balances, with its true model: a second ahead it may as well have fallen."""
-    true = Model(
-        name="balancing",
-        states={"x": "m", "v": "m/s", "a": "rad", "w": "rad/s"},
-        inputs={"u": "m/s^2"},
-        params={"k": Param(64.0, "1/s^2")},
-        derivative=lambda s, a, p: {
-            "x": s.v,
-            "v": a.u - 0.5 * s.v,
-            "a": s.w,
-            "w": p.k * np.sin(s.a) - 4 * a.u * np.cos(s.a),
-        },
-    )
-    rng, trials = np.random.default_rng(3), []
-    for _ in range(2):
-        z, rows, inputs = np.array([[0.0, 0.0, 0.02, 0.0]]), [], []
-        for k in range(300):
-            rows.append(z[0])
-            x, v, a, w = z[0] + rng.normal(0, [1e-3, 1e-2, 2e-3, 2e-2])
-            inputs.append([40 * a + 6 * w + 1.2 * x + 2 * v + np.sin(0.05 * k)])
-            z = true.system.step(z, np.array([inputs[-1]]), true.values, 0.02)
-        y = np.array([*rows, z[0]]) + rng.normal(0, [1e-3, 1e-2, 2e-3, 2e-2], (301, 4))
-        trials.append(Trial(y, np.array(inputs), 0.02, tuple(true.states), ("u",)))
-    library = Library(tuple(f for f in Library().families if f.name == "input_bias"))
-    found = diagnose(true, trials, DiagnosisOptions(library=library, max_effects=1))
-    assert not found.leftover and not found.effects
-    ahead = [one for one in found.prediction_error if not one.whole_trial]
-    assert ahead[-1].drowned and not ahead[0].drowned

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
-from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses import scan
 from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.scan import between, elsewhere
@@ -69,20 +68,6 @@ def test_a_rate_that_no_command_asks_for_is_no_limit():
         assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
 
 
-def test_noise_of_a_state_is_no_rate_that_refutes_a_limit():
-    t, rng = np.arange(301) * 0.02, np.random.default_rng(0)
-    slow = 0.1 * np.abs((t + 0.5) % 2 - 1)  # at 0.1 rad/s, up and down
-    for noise in (0.0, 0.045):
-        states = np.zeros((301, car.n))
-        states[:, 0] = slow + noise * rng.standard_normal(301)
-        inputs = np.column_stack([np.sin(t[:-1]), np.zeros(300)])
-        trial = Trial(states, inputs, 0.02, car.state_names, car.input_names)
-        data = prepare(car, [trial, trial])
-        effect = Library().effect("slew_limit:delta", car, data.scales)
-        for r, refuted in ((0.1, []), (0.0, [effect.name])):
-            assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == refuted
-
-
 def test_a_late_position_is_tried_with_a_filter_of_its_own():
     rng, trials = np.random.default_rng(3), []
     for _ in range(3):
@@ -106,29 +91,6 @@ def test_a_late_position_is_tried_with_a_filter_of_its_own():
     (fit,) = search.refined(starts, 12)
     assert search.score(fit) > search.score(null) + 3
     assert fit.hypothesis.values[0]["d"] == pytest.approx(0.05, abs=0.015)
-
-
-@pytest.mark.parametrize(("late", "claimed"), [(0.2, set()), (1.5, {"rate_limit:u"})])
-def test_what_is_late_within_a_step_is_no_rate_limit(late, claimed):
-    rng, trials = np.random.default_rng(0), []
-    for k in range(3):
-        u = np.repeat(rng.choice([-0.5, 0.5], 30), 4)
-        before = np.concatenate([np.zeros(2), u])
-        whole, part = int(late), late % 1
-        acts = (1 - part) * before[2 - whole :][:120] + part * before[1 - whole :][:120]
-        v = np.concatenate([[0.0], np.cumsum(0.1 * acts)]) + 1e-3 * rng.standard_normal(121)
-        trials.append(Trial(v[:, None], u[:, None], 0.1, ("v",), ("u",), id=f"t{k}"))
-    cart = Model(
-        states={"v": "m/s"},
-        inputs={"u": "m/s^2"},
-        params={},
-        derivative=lambda s, a, p: {"v": a.u},
-        integrator="euler",
-    )
-    options = DiagnosisOptions(library=Library((Library().family("rate_limit"),)))
-    found = diagnose(cart, trials, options)
-    assert set(found.effects) == claimed and not found.unconfirmed
-    assert {row.effect for row in found.ranking} == claimed
 
 
 @pytest.mark.parametrize(

@@ -63,15 +63,6 @@ def test_repeats_are_compared_at_the_same_time(known):
     assert ruler.scatter(fit, [[1, 2]]) is None  # nothing that begins together
 
 
-def test_repeats_of_different_length_are_compared_where_they_begin_together(known, monkeypatch):
-    predictor, fit, trials = known
-    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6e6)
-    short = replace(trials[2], states=trials[2].states[:351], inputs=trials[2].inputs[:350])
-    some = Predictor(prepare(predictor.data.model, [trials[0], short]))
-    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
-    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1]])[0][:-1], 0.0, atol=1e-9)
-
-
 def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(known):
     predictor, _, trials = known
     short = [replace(t, states=t.states[:61], inputs=t.inputs[:60]) for t in trials[::2]]
@@ -84,15 +75,6 @@ def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(
         assert unsure[0] < unsure[len(ruler.steps) - 1] < unsure[-1]
 
 
-def test_repeats_that_ended_before_a_horizon_tell_no_noise_of_it(known):
-    predictor, _, trials = known
-    short = [replace(t, states=t.states[:9], inputs=t.inputs[:8]) for t in trials[::2]]
-    data = prepare(predictor.data.model, [*short, *trials[1::2]])
-    fit = SimpleNamespace(hypothesis=Hypothesis(), states=data.y)
-    ruler = Ruler(Predictor(data))
-    assert max(ruler.steps) > 8 and ruler.scatter(fit, [[0, 1]]) is None
-
-
 def test_noise_that_differs_from_moment_to_moment_is_less_sure():
     """A ball on a beam: 5.0, 3.3, 4.9 and 2.6 mm by four diagnoses, stated as sure to 8 %."""
     rng = np.random.default_rng(0)
@@ -102,15 +84,6 @@ def test_noise_that_differs_from_moment_to_moment_is_less_sure():
     assert same == pytest.approx(1 / np.sqrt(2 * 80), rel=0.4) and other > 2 * same
     assert _uneven([(0.25, even, np.ones((1, 1)))])[0] == pytest.approx(2 * same, rel=0.05)
     assert _uneven([(1.0, even[:1], np.ones((1, 1)))])[0] == 0.0  # tells nothing
-
-
-def test_predictions_start_where_an_unmeasured_speed_is_known(known):
-    """They missed by 27 mm from where stretches of a log begin, and by 3 mm elsewhere."""
-    predictor, _, trials = known
-    assert Ruler(predictor).starts[0].min() == 1
-    blind = [replace(t, states=np.where([True, False], t.states, np.nan)) for t in trials]
-    some = Ruler(Predictor(prepare(predictor.data.model, blind)))
-    assert some.starts[0].min() == 10
 
 
 def test_a_repeat_in_another_unit_is_no_noise(known):

@@ -59,14 +59,6 @@ def test_a_gain_beside_an_uncertain_mass_is_as_uncertain_as_the_mass():
     ]
 
 
-def test_a_gain_beside_a_known_drag_is_known_alone():
-    found = diagnose(cart(0.5), driven(weaker(cart(0.5))), OF_CART)
-    assert found.effects == ("input_gain:u",) and not found.combinations
-    g = found.ranking[0].params["g"]
-    assert g.std < 0.005 and g.value == pytest.approx(-0.3, abs=4 * g.std)
-    assert "model.given" not in {one.code for one in found.findings}
-
-
 def planar(gravity=0.0):
     """Two joints in a horizontal plane: all torques and inertias may be larger by one factor."""
 
@@ -120,8 +112,3 @@ def test_the_scale_of_a_planar_arm_rests_on_the_surest_inertia():
     # I1 + 0.2 + 0.09 load is in proportion to the torques, and so is 0.07 + 0.075 load
     per_g = (0.245 + 0.09 * 0.5 - 0.09 / 0.075 * (0.07 + 0.075 * 0.5)) / (1 + g)
     assert found.std["input_gain:t1+t2", "g"] == pytest.approx(0.01 / abs(per_g), rel=0.15)
-
-
-def test_gravity_tells_the_scale():
-    found, _ = fitted(planar(gravity=3.0))
-    assert not found.combinations and not found.std

@@ -67,21 +67,6 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
     assert found.kind == "none" and 0.85 < found.gap.after < 1.15
 
 
-def test_repeats_without_a_speed_tell_the_noise_of_what_was_measured():
-    first = swings(1, 150, 3)[0]
-    rng, runs = np.random.default_rng(4), []
-    for _ in range(4):
-        x = [np.zeros(2)]
-        for value in first.inputs[:, 0]:
-            z = pendulum.system.step(x[-1][None], np.array([[value]]), pendulum.values, DT)[0]
-            x.append(z + DISTURBED * rng.standard_normal(2))
-        y = np.array(x) + MEASURED * rng.standard_normal((151, 2))
-        names = (first.state_names, first.input_names)
-        runs.append(Trial(y, first.inputs, DT, *names, candidate="c0001"))
-    found = diagnose(pendulum, list(seen_every(runs, 1, 0)))
-    assert found.prediction_error[0].floor_from == "repeats"
-
-
 def test_the_start_goes_where_least_squares_over_the_whole_run_puts_it():
     trials = list(seen_every(swings(2, 12), 1, 0))
     data = prepare(pendulum, trials)

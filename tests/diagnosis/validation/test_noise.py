@@ -9,7 +9,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
 from grounded.diagnosis.pictures import where_figure
 from grounded.effects import Library
-from small_tasks import DT, pushed_cart, pushed_cart_task
+from small_tasks import DT, pushed_cart
 
 
 def repeats_of(trial, count):
@@ -37,15 +37,6 @@ def test_without_an_effect_the_error_is_noise():
     assert found.kind == "none" and where["times"] == where["regions"] == []
     assert {c["share"] for c in where["channels"]} == {None}
     assert where_figure(found) is None or "channel" not in str(where_figure(found).panels[0].title)
-
-
-def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
-    model, trials = pushed_cart(asymmetric=0.8, trials=6)
-    poor = DiagnosisOptions(
-        library=Library((Library().family("trend"),))
-    )  # nothing that could explain it
-    found = diagnose(pushed_cart_task(model), trials, poor)
-    assert found.leftover and found.where.whiteness["v"] < 0.01
 
 
 def test_repeats_of_a_candidate_tell_the_noise():

@@ -51,11 +51,6 @@ def test_what_unit_derivative_and_the_only_pair_agree_on_is_sure(tmp_path):
     assert by["th"].scale == by["w"].scale == pytest.approx(np.pi / 180)
 
 
-def test_where_another_number_fits_as_well_it_is_asked(tmp_path):
-    by = found_in(tmp_path, belt="")
-    assert not by["x"].sure and by["th"].sure
-
-
 def test_without_a_unit_it_is_asked(tmp_path):
     by = found_in(tmp_path, pole_deg="pole")
     assert not by["th"].sure and by["x"].sure

@@ -20,7 +20,7 @@ from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.locating.run_start import recording
-from grounded_trials.workspace.intake.opening import foreign, reading
+from grounded_trials.workspace.intake.opening import reading
 from recorded import LOGGED, RATE, follow, record, waiting
 from workspaces import make
 
@@ -203,15 +203,6 @@ def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp
     (tmp_path / "c.csv").write_text("\n".join(rows[:-4]))
     (told,) = of_code(w.ingest(tmp_path / "c.csv", candidate="c0002"), "log.short")
     assert told.facts["missing"] == pytest.approx(40)
-
-
-def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
-    reads = []
-    counted = lambda *a: reads.append(a) or read(*a)  # noqa: E731
-    read = foreign.mapped_signals
-    monkeypatch.setattr(foreign, "mapped_signals", counted)
-    found = w.ingest(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 1.0))
-    assert found.notes and len(reads) == 1
 
 
 @pytest.mark.parametrize(("before", "late"), [(1.0, 2), (0.0, 1)])
@@ -487,16 +478,6 @@ def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path)
         with pytest.raises(GroundedError) as refused:
             w.ingest(log)
         assert refused.value.then == NextCommand("ingest", (str(log), *then))
-
-
-def test_logs_are_data_without_a_target_whatever_errors_would_weigh(tmp_path):
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    log = record(w, tmp_path / "drive.csv", w.propose().candidate.policy, 0.0)
-    config = w.folder / "grounded.toml"
-    config.write_text(config.read_text().replace('target = "target.csv"', 'target = ""'))
-    other = Workspace(w.folder)
-    taken = other.ingest(log, data=True)
-    assert other.trials()[0].stored.id == taken.trial and not other.task.reward.state.any()
 
 
 def edited(path, change):

@@ -78,24 +78,6 @@ def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
     assert np.sqrt(np.mean(error**2)) < 0.06
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, seed):
-    in_mm = MODEL.replace("(a.force - p.drag * s.v)", "(1000 * a.force - p.drag * s.v)")
-    errors = []
-    for size, model in ((1.0, MODEL), (1000.0, in_mm)):
-        task = make(tmp_path / f"{size}", model=model, config=CONFIG).task
-        logged, t, v = driven(size=size, seed=seed)
-        first = int(np.argmax(v)) // 10
-        log = {
-            name: series(t[10 * first :: 10], one.values[first:], one.spec.path)
-            for name, one in logged.items()
-        }
-        table = EstimateTable({"x": 0.002 * size}, {})
-        errors.append(off(with_estimates(log, table, task), t, v)[0] / size)
-    np.testing.assert_allclose(errors[1], errors[0], atol=1e-6)
-    assert v[10 * first] > 400 and np.abs(errors[0][:5]).max() < 0.05
-
-
 @pytest.mark.parametrize("process", [{"v": 0.05}])
 def test_a_speed_is_the_slope_of_its_position_where_the_model_is_off_for_long(tmp_path, process):
     quick = MODEL.replace("(a.force - p.drag * s.v) / p.mass", "(a.force - s.v) / 0.03")
@@ -191,30 +173,6 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
     w.discard("t0001")
     anew = w.ingest(tmp_path / "0.csv", data=True)
     assert not anew.known and anew.trial != first.trial
-
-
-def test_a_late_sensor_that_was_adopted_leaves_estimates_as_they_are(tmp_path):
-    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
-    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
-    logged, *_ = disturbed(0.0, 0.8)
-    late = np.interp(logged["x"].t * 1e-9 - 0.04, logged["x"].t * 1e-9, logged["x"].values)
-    table = np.column_stack([logged["x"].t * 1e-9, late, logged["force"].values])
-    np.savetxt(tmp_path / "late.csv", table, "%.5f", ",", header="t,x,force", comments="")
-    friction = {"name": "coulomb_friction:v", "c": 0.8}
-    speeds = []
-    for name, effects in (
-        ("a", [friction]),
-        ("b", [friction, {"name": "sensor_delay:x", "d": 0.04}]),
-    ):
-        folder = make(tmp_path / name, config=config).folder
-        set_in_model(folder / "grounded.toml", effects=effects)
-        w = Workspace(folder)
-        w.ingest(tmp_path / "late.csv", data=True)
-        stored = w.trials()[0]
-        assert stored.meta["estimated_with"] == "coulomb_friction:v"
-        speeds.append(stored.measured.states[:, 1])
-    np.testing.assert_array_equal(*speeds)
-    assert np.sqrt(np.mean(speeds[0] ** 2)) > 0.1
 
 
 def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from facts import of_code
-from grounded.errors import GroundedError
 from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.who_drove import evidence, follows
 from grounded.search.returned.whose_run import suspicion
@@ -218,27 +217,6 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     (note,) = old_samples(w, replace(made, sample_age=aged - 0.012), run, old)
     assert note.facts["planned"].value == pytest.approx(aged - 0.012)
     assert note.facts["age"].value == pytest.approx(aged)
-
-
-def test_ingest_names_the_candidate_that_ran_and_both_ways_on(ladder, tmp_path):
-    w, by_alpha = ladder
-    waits = propose_in(w).candidate
-    log = drive(tmp_path / "a.mcap", w, by_alpha[1], 1)
-    with pytest.raises(GroundedError, match=by_alpha[1].id) as refused:
-        ingest_log(w, log)
-    told = refused.value.finding
-    assert (told.facts["ran"], told.facts["other"]) == (waits.id, by_alpha[1].id)
-    assert refused.value.then.arguments[-1] == by_alpha[1].id
-
-
-def test_a_log_that_is_stored_is_not_asked_again_who_drove(ladder, tmp_path):
-    w, by_alpha = ladder
-    log = drive(tmp_path / "a.mcap", w, by_alpha[1], 1)
-    waits = propose_in(w).candidate
-    first = ingest_log(w, log, waits.id)  # all the same
-    assert first.warnings and first.candidate == waits.id
-    again = ingest_log(w, log)
-    assert again.known and again.trial == first.trial
 
 
 def sender_of_log(w, path, said):

@@ -80,13 +80,6 @@ def test_other_commands_are_not_the_candidate_s(learnt, kind):
         assert why.code in ("log.not_run", "log.silent") and why.about == ("force",)
 
 
-def test_every_pair_of_candidates_is_told_apart(learnt):
-    for own, trial, candidates in runs(learnt):
-        for other in candidates:
-            why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates).why
-            assert why.facts["other"] == own.id if other.id != own.id else why is None
-
-
 @pytest.fixture
 def waiting(tmp_path):
     """A workspace that waits for c0002, and a log of manual driving."""
@@ -222,25 +215,6 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
     new = w.propose()
     assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
     assert any("c0002" in note and "set aside" in note for note in again.notes)
-
-
-def test_the_candidate_after_a_run_that_was_stopped_gives_way_once_that_is_discarded(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.ingest(w.run(w.propose().candidate.id).trial_file)
-    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
-    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
-    short = w.ingest(tmp_path / "short.mcap", candidate="c0002").trial
-    after = w.propose().candidate
-    assert (after.id, after.seen) == ("c0003", ("t0001", short))
-    w.discard(short)
-    again = w.propose()
-    assert (again.candidate.id, again.proposal.is_new) == ("c0002", False)
-    for notes in (again.notes, w.status().notes):
-        assert any(holds(note, "c0003", short, "void", "--candidate c0003") for note in notes)
-    assert w.propose().candidate.id == "c0002"
-    assert any(short in note for note in w.export("c0003", tmp_path / "c.npz").notes)
-    w.restore(short)
-    assert w.propose().candidate.id == "c0003"
 
 
 LOGGED = (
