@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 import sys
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded.result import listed
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, table_layout
 from grounded_cli.console.terminal import (
     LABEL,
     field,
@@ -25,6 +25,7 @@ from grounded_cli.console.terminal import (
 from grounded_cli.console.workspace_option import next_line
 
 if TYPE_CHECKING:
+    from grounded_trials.formats.tables import Layout
     from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.starting.begin import Begun
 
@@ -46,6 +47,7 @@ FEW = 8  # alternative signals listed for an unsure state or input
     "crane, generic.",
 )
 @click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
+@table_layout
 @click.option(
     "--dt",
     type=click.FloatRange(min=0, min_open=True),
@@ -69,6 +71,7 @@ def command(
     blank: bool,
     kind: str | None,
     inputs: str | None,
+    layout: Layout,
     dt: float | None,
     yes: bool,
     name: str | None,
@@ -83,6 +86,7 @@ def command(
     real.py simulates the robot.
     """
     sorts = (("--kind", kind), ("--inputs", inputs), ("--yes", yes))
+    sorts = (*sorts, ("--columns", layout.columns), ("--rate", layout.rate))
     if list_:
         _list(json_)
     elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
@@ -105,7 +109,8 @@ def command(
         asked = None if yes or json_ or not sys.stdin.isatty() else _ask
         with progress(f"reading {log}"):
             named = names_in(inputs)
-            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, inputs=named, ask=asked)
+            about: Any = {"model": model, "kind": kind, "dt": dt, "layout": layout}
+            begun = begin(Path(folder), log, inputs=named, ask=asked, **about)
         show_json(begun.to_json()) if json_ else _tell(begun)
     else:
         _example(folder, str(name), json_)

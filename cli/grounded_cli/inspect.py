@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, table_layout
 from grounded_cli.console.terminal import number, progress, remark, show, show_json, table
 from grounded_cli.console.workspace_option import given, in_workspace, next_line, typed
 from grounded_trials.wording import count, extent
@@ -14,6 +14,7 @@ from grounded_trials.wording import count, extent
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from grounded_trials.formats.tables import Layout
     from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
@@ -22,9 +23,10 @@ MANY = 9  # constant fields of one array (an IMU's covariance has 9) that are fo
 
 @click.command("inspect")
 @click.argument("log", metavar="LOG")
+@table_layout
 @in_workspace
 @as_json
-def command(log: str, json_: bool) -> None:
+def command(log: str, layout: Layout, json_: bool) -> None:
     """Show topics, types, rates and fields of a log, and a ready-made [log] table.
 
     The table is guessed for the states and inputs of the workspace; `unsure` marks lines to check.
@@ -34,7 +36,7 @@ def command(log: str, json_: bool) -> None:
     from grounded_trials.workspace.inspecting import inspect_in
 
     with progress(f"reading {log}"):
-        found = inspect_in(Folder(given() or "."), log)
+        found = inspect_in(Folder(given() or "."), log, layout)
     if found.why_none:
         remark("note", f"no [log] table is guessed{found.why_none}")
     if json_:

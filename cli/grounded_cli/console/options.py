@@ -1,4 +1,4 @@
-"""Options that several commands share: --json, --details, --anyway, --trials, parallel work."""
+"""Options that several commands share: --json, --details, --anyway, --trials, tables, jobs."""
 
 from __future__ import annotations
 
@@ -60,6 +60,28 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
             metavar="N",
             help=f"Workers on this machine (default: {default}).",
         ),
+    ):
+        call = option(call)
+    return call
+
+
+def table_layout(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --columns and --rate, passed as `layout`: what a table without names or times lacks."""
+
+    @functools.wraps(function)
+    def call(*args: Any, columns: str | None, rate: float | None, **others: Any) -> Any:
+        from grounded_trials.formats.tables import Layout
+
+        return function(*args, layout=Layout(tuple(names_in(columns)), rate or 0.0), **others)
+
+    for option in (
+        click.option(
+            "--rate",
+            type=click.FloatRange(min=0, min_open=True),
+            metavar="HZ",
+            help="Rows a second of a table without times.",
+        ),
+        click.option("--columns", metavar="A,B,...", help="Columns of a table without names."),
     ):
         call = option(call)
     return call

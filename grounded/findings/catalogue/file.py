@@ -77,7 +77,8 @@ ENTRIES: dict[str, Entry] = {
     "no_times": Entry(
         "refuse",
         "{about} has no column of times[[ among {names}]]",
-        f"add or name {_STAMPS}[[; '{{rises}}' increases in every row]]",
+        f"add or name {_STAMPS}[[; '{{rises}}' increases in every row]]; or give the rate of "
+        "its rows [Hz], `--rate 100`, or `rate = 100` in [log]",
     ),
     "times": Entry(
         "refuse",
@@ -95,7 +96,11 @@ ENTRIES: dict[str, Entry] = {
     "no_names": Entry(
         "refuse",
         "{about} begins with '{line}'",
-        "expected a line with column names above the rows, such as 't,x,v'",
+        "expected a line with column names above the rows, such as 't,x,v'; or name them, "
+        "`--columns t,x,v`, or `columns` in [log]",
+    ),
+    "columns": Entry(
+        "refuse", "{about} has {has} columns ('{row}'), but {names} {names:is/are} named for it"
     ),
     "row": Entry(
         "refuse",

@@ -23,7 +23,14 @@ from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import Columns, column_name, is_time, table_records
+from grounded_trials.formats.tables import (
+    AS_IT_SAYS,
+    Columns,
+    Layout,
+    column_name,
+    is_time,
+    table_records,
+)
 
 DATA = ("Data", "data", "values", "Values")  # the numbers of one signal beside its times
 CALLED = ("Name", "name", "label", "blockName")  # what names it
@@ -37,7 +44,7 @@ class _Object:
         self.kind = kind
 
 
-def mat_records(path: Path) -> Iterator[Record]:
+def mat_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of a MATLAB file of version 5.
 
     Raises:
@@ -48,10 +55,12 @@ def mat_records(path: Path) -> Iterator[Record]:
     with warnings.catch_warnings():  # of two variables with one name the last counts
         warnings.simplefilter("ignore")
         content = loadmat(path, simplify_cells=True, appendmat=False)
-    yield from _records({k: _plain(v) for k, v in content.items() if k[:2] != "__"}, path)
+    yield from _records(
+        {k: _plain(v) for k, v in content.items() if k[:2] != "__"}, path, layout.rate
+    )
 
 
-def mat73_records(path: Path) -> Iterator[Record]:
+def mat73_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of a MATLAB file of version 7.3.
 
     Raises:
@@ -60,13 +69,18 @@ def mat73_records(path: Path) -> Iterator[Record]:
     import h5py
 
     with h5py.File(path, "r") as file:
-        yield from _records(_struct(file), path)
+        yield from _records(_struct(file), path, layout.rate)
 
 
-def _records(content: Mapping[str, Any], path: Path) -> Iterator[Record]:
-    """Yield the records of nested dictionaries, lists, arrays and texts."""
+def _records(content: Mapping[str, Any], path: Path, rate: float) -> Iterator[Record]:
+    """Yield the records of nested dictionaries, lists, arrays and texts.
+
+    With a rate, what has no times is as long as the longest array.
+    """
+    rows = max((max(a.shape) for a in map(_numbers, content.values()) if a is not None), default=0)
+    outer = np.arange(rows) / rate if rate else None
     tables: dict[str, Columns] = {}
-    for topic, clock, columns in _tables(content, ("mat",), None, path):
+    for topic, clock, columns in _tables(content, ("mat",), outer, path):
         while topic in tables and not np.array_equal(next(iter(tables[topic].values())), clock):
             topic += "_"  # another clock in the same struct
         tables[topic] = {**tables.get(topic, {"time": clock}), **columns}

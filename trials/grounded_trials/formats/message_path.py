@@ -6,11 +6,11 @@
                                               a slice (both ends included), a filter on its items
     "/odd topic.name".data                    names with dots or blanks in quotes
 
-Functions: @rpy.roll|pitch|yaw of a quaternion, @world_velocity.x|y|z of an Odometry message, @norm
-of a vector or list, and of a number: @abs @negative @sign @sqrt @sin @cos @tan @asin @acos @atan
-@exp @log @ceil @floor @round @deg2rad @rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare
-with == != < <= > >=; several may follow each other or be joined by &&. This module only parses;
-`path_walk` applies a path to messages.
+Functions: @rpy.roll|pitch|yaw of a quaternion (named x, y, z, w, or an array w, x, y, z as PX4's),
+@world_velocity.x|y|z of an Odometry message, @norm of a vector or list, and of a number: @abs
+@negative @sign @sqrt @sin @cos @tan @asin @acos @atan @exp @log @ceil @floor @round @deg2rad
+@rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=; several may follow
+each other or be joined by &&. This module only parses; `path_walk` applies a path to messages.
 """
 
 from __future__ import annotations

@@ -25,7 +25,13 @@ from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Header, Record
-from grounded_trials.formats.tables import Columns, column_name, table_records
+from grounded_trials.formats.tables import (
+    AS_IT_SAYS,
+    Columns,
+    Layout,
+    column_name,
+    table_records,
+)
 from grounded_trials.plain_file import read_file
 
 EPISODE = re.compile(r"episode_(\d+)")
@@ -64,8 +70,8 @@ def episode_files(path: Path) -> list[Path]:
     return alone or [*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]
 
 
-def parquet_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a parquet table, which needs a column of times.
+def parquet_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
+    """Yield the records of a parquet table, which needs a column of times or a rate.
 
     A file with one episode of a LeRobot data set is read as that.
 
@@ -82,7 +88,9 @@ def parquet_records(path: Path) -> Iterator[Record]:
         for column in file.schema_arrow.names
         for name, values in _numbers(column, file.read([column], use_threads=False)[column])
     ]
-    yield from table_records({"/parquet": columns_by_name(named, path)}, "parquet", path)
+    yield from table_records(
+        {"/parquet": columns_by_name(named, path)}, "parquet", path, layout.rate
+    )
 
 
 def episode_records(path: Path) -> Iterator[Record]:

@@ -49,6 +49,7 @@ SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", 
 CALENDAR_S = 9_200_000_000  # 2^63 ns: the years 1678 to 2261
 STAMPS = (("header", "stamp"), ("stamp",), ("timestamp",), ("header", "timestamp"))
 QUATERNION = ("x", "y", "z", "w")
+TURNS = (".q", ".q_d")  # of PX4: arrays w, x, y, z
 TURNED = ("pose", "pose", "orientation")  # in nav_msgs/Odometry: how the robot's axes are turned,
 MOVING = ("twist", "twist", "linear")  # and its velocity along them
 
@@ -146,7 +147,7 @@ def _check_end(type: Type, path: MessagePath) -> None:
     name = path.functions[0].name if path.functions else ""
     if name in ANGLES:
         fits = isinstance(type, Struct) and all(_is_number(type, part) for part in QUATERNION)
-        if not fits:
+        if not fits and not _is_turn(type):
             raise BadPath("path_step", step="@rpy", needs="x, y, z and w", type=str(type))
     elif name in AXES:
         if not _is_odometry(type):
@@ -175,6 +176,11 @@ def _is_odometry(type: Type) -> bool:
         if not isinstance(inner, Struct) or not all(_is_number(inner, part) for part in parts):
             return False
     return True
+
+
+def _is_turn(type: Any) -> bool:
+    """Check whether a type is an array of four numbers: a quaternion w, x, y, z."""
+    return isinstance(type, Array) and type.count == 4 and isinstance(type.item, Number)
 
 
 def _is_number(type: Struct, name: str) -> bool:
@@ -335,7 +341,10 @@ def _part(node: Node, *names: str) -> Floats:
 
 def _turn(node: Node, *names: str) -> list[Floats]:
     """Return the quaternion (x, y, z, w) that names lead to, of length 1; NaN for zero."""
-    quaternion = [_part(node, *names, name) for name in QUATERNION]
+    if isinstance(node.type, Array):
+        quaternion = [node.items(i, i).numbers() for i in (1, 2, 3, 0)]
+    else:
+        quaternion = [_part(node, *names, name) for name in QUATERNION]
     with np.errstate(invalid="ignore", divide="ignore"):
         norm = np.sqrt(sum(q**2 for q in quaternion))
         return [q / norm for q in quaternion]
@@ -411,6 +420,8 @@ def _paths_in(thing: Any, depth: int, patience: Iterator[int]) -> Iterator[str]:
     if names == QUATERNION or (isinstance(thing, dict) and set(thing) == set(QUATERNION)):
         yield from (f".@rpy.{angle}" for angle in ANGLES)
     for step, inner in _steps_into(thing):
+        if step in TURNS and _is_turn(inner):
+            yield from (f"{step}.@rpy.{angle}" for angle in ANGLES)
         for rest in _paths_in(inner, depth + 1, patience):
             yield step + rest
 

@@ -12,6 +12,7 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +45,23 @@ LATEST = 4e18  # [ns], the year 2096
 Columns = Mapping[str, Floats]
 
 
-def npz_records(path: Path) -> Iterator[Record]:
+@dataclass(frozen=True)
+class Layout:
+    """What a table without names or times does not say: `[log] columns` and `rate`."""
+
+    columns: tuple[str, ...] = ()  # names of a text table's columns; (): its first line names them
+    rate: float = 0.0  # [Hz] of the rows; 0: a column has their times
+
+
+AS_IT_SAYS = Layout()
+
+
+def npz_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of a NumPy archive: arrays of one length and their times.
 
     `NAME` (N, k) with `NAME_t` (N,) becomes the table /NAME, its columns named by an array of k
-    texts if there is one; arrays (N,) with a time of that length become the table /npz.
+    texts if there is one; arrays (N,) with a time of that length become the table /npz. With a
+    rate, the longest array and those of its length are that.
 
     Raises:
         GroundedError: if it has no times.
@@ -57,10 +70,10 @@ def npz_records(path: Path) -> Iterator[Record]:
         arrays = {name: archive[name] for name in archive.files}
     if arrays.keys() >= CANDIDATE:
         raise GroundedError(found("file.exported", str(path), candidate=str(arrays["candidate"])))
-    yield from table_records(_npz_tables(arrays, path), "npz", path)
+    yield from table_records(_npz_tables(arrays, path, layout.rate), "npz", path, layout.rate)
 
 
-def _npz_tables(arrays: Mapping[str, Any], path: Path) -> dict[str, Columns]:
+def _npz_tables(arrays: Mapping[str, Any], path: Path, rate: float) -> dict[str, Columns]:
     labels = {
         key: list(map(column_name, a))
         for key, a in arrays.items()
@@ -91,6 +104,10 @@ def _npz_tables(arrays: Mapping[str, Any], path: Path) -> dict[str, Columns]:
         for name, a in rest.items():
             if len(a) == len(flat[0][2]):
                 flat += _columns(a, [], column_name(name))
+        tables["/npz"] = columns_by_name(flat, path)
+    if rate and not tables and rest:
+        rows = max(map(len, rest.values()))
+        flat = [one for n, a in rest.items() if len(a) == rows for one in _columns(a, [], n)]
         tables["/npz"] = columns_by_name(flat, path)
     return tables
 
@@ -123,23 +140,26 @@ def ulog_records(path: Path) -> Iterator[Record]:
     yield from table_records(tables, "ulog", path)
 
 
-def table_records(tables: Mapping[str, Columns], kind: str, path: Path) -> Iterator[Record]:
+def table_records(
+    tables: Mapping[str, Columns], kind: str, path: Path, rate: float = 0.0
+) -> Iterator[Record]:
     """Yield tables as records, one topic per table.
 
     Args:
         tables: columns by topic, equally long, one of them with the times.
         kind: of the file, such as "csv".
         path: of the file, for messages.
+        rate: of the rows [Hz], whatever times they have; 0: a column has their times.
 
     Raises:
-        GroundedError: if there is no table, or no column of times.
+        GroundedError: if there is no table, or no column of times and no rate.
     """
     if not tables:
         raise GroundedError(found("file.no_times", str(path)))
     yield Header("", kind)
     packed = []
     for i, (topic, columns) in enumerate(tables.items()):
-        name, stamps = _times(columns, path)
+        name, stamps = _at(columns, rate) if rate else _times(columns, path)
         fields = {k: column for k, column in columns.items() if k != name}
         yield Schema(i + 1, f"{kind}, time in '{name}'", "ros2msg", _definition(list(fields)))
         yield Channel(i, topic, "cdr", i + 1, {})
@@ -179,6 +199,12 @@ def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
     starts = np.arange(N, dtype=np.int64) * width
     numbers = np.full(N, channel, np.uint16), np.arange(N, dtype=np.uint32)
     return Messages(rows.tobytes(), starts, starts + width, *numbers, stamps, stamps)
+
+
+def _at(columns: Columns, rate: float) -> tuple[str, Any]:
+    """Return "rows", no column's name, and the times of rows at a rate [ns]."""
+    rows = np.arange(len(next(iter(columns.values()))))
+    return "rows", np.rint(rows * (1e9 / rate)).astype(np.int64)
 
 
 def _times(columns: Columns, path: Path) -> tuple[str, Any]:

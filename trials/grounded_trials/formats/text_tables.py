@@ -2,9 +2,9 @@
 
 The line with the column names is the first one with rows of numbers below it. Lines above it, as a
 PLC or a logger writes them, are skipped; a line of units below it belongs to the names. Columns are
-separated by tabs, semicolons or commas; if not by commas, 0,5 is a number. Separators at the end of
-a line don't count, in the names as in the rows. Times are numbers, or texts with a date, a time of
-day, or both, in one column or two.
+separated by tabs, semicolons, commas or blanks; if not by commas, 0,5 is a number. Separators at
+the end of a line don't count, in the names as in the rows. Times are numbers, or texts with a date,
+a time of day, or both, in one column or two. A `Layout` stands for names or times that are missing.
 """
 
 from __future__ import annotations
@@ -28,13 +28,22 @@ from grounded.findings import Finding, found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import column_name, is_time, table_records, time_among
+from grounded_trials.formats.tables import (
+    AS_IT_SAYS,
+    Layout,
+    column_name,
+    is_time,
+    table_records,
+    time_among,
+)
 from grounded_trials.within import within
 
 T = TypeVar("T")
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # characters read of a line
 BEFORE = 20  # rows before the last one that show how many digits its last cell should have
+NAMELESS = ("file.no_names", "file.no_times")  # which [log] says then
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
 SECONDS = re.compile(r"(^|[\W_])s(ec|ecs|econds)?[\])]?$")  # at the end of a column's name
@@ -52,16 +61,16 @@ class _Head:
     rows: int  # number of lines before the first row
 
 
-def csv_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a text table: a row of names, then rows of numbers.
+def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
+    """Yield the records of a text table: a row of names, unless the layout has them, then numbers.
 
     Raises:
         GroundedError: if names or times are missing, or a row has a wrong number of cells.
     """
     with _opened(path) as stream:
         first = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
-        head = _head(first, path)
-        width, times = len(head.names), _times_among(head, first, path)
+        head = _head_by(layout.columns, first, path) if layout.columns else _head(first, path)
+        width, times = len(head.names), "" if layout.rate else _times_among(head, first, path)
         _check_widths(stream, head, path)
         cut = _cut_in(stream, head)
         try:
@@ -78,7 +87,7 @@ def csv_records(path: Path) -> Iterator[Record]:
     columns: dict[str, Any] = columns_by_name(named, path)
     if stamps is not None:
         columns[times] = stamps
-    yield from table_records({"/csv": columns}, "csv", path)
+    yield from table_records({"/csv": columns}, "csv", path, layout.rate)
 
 
 def column_units(path: Path) -> dict[str, str]:
@@ -87,9 +96,15 @@ def column_units(path: Path) -> dict[str, str]:
 
 
 def _of_text(path: Path, function: Callable[[Path], T]) -> T | None:
-    """Return function(path) of a text table; None of another file."""
-    text = path.suffix.lower() in (".csv", ".tsv", ".txt")
-    return within(path, path.stat().st_size, function, path) if text else None
+    """Return function(path) of a text table that names its columns; None of another file."""
+    if path.suffix.lower() not in SUFFIXES:
+        return None
+    try:
+        return within(path, path.stat().st_size, function, path)
+    except GroundedError as error:
+        if error.finding is not None and error.finding.code in NAMELESS:
+            return None
+        raise
 
 
 def _column_units(path: Path) -> dict[str, str]:
@@ -219,6 +234,31 @@ def _rows(stream: TextIO, head: _Head, cut: _Cut | None) -> Iterable[str]:
     return stream if cut is None else islice(stream, cut.line - head.rows - 1)
 
 
+class _Spaced:
+    """A text file whose columns are separated by blanks, read as if these were tabs."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self.seek = stream, stream.seek
+
+    def readline(self, limit: int = -1) -> str:
+        return _tabbed(self._stream.readline(limit))
+
+    def __iter__(self) -> Iterator[str]:
+        return map(_tabbed, self._stream)
+
+    def __enter__(self) -> _Spaced:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+
+def _tabbed(line: str) -> str:
+    """Return a line with tabs between its words, without what marks a comment before them."""
+    end = "\n" * line.endswith("\n")
+    return "\t".join(line.lstrip("#% ").split()) + end
+
+
 def _opened(path: Path) -> TextIO:
     """Open a text file in its encoding: UTF-16 with a byte order mark, UTF-8, else Windows-1252."""
     with path.open("rb") as stream:
@@ -231,7 +271,11 @@ def _opened(path: Path) -> TextIO:
             codecs.getincrementaldecoder("utf-8")().decode(start)
         except UnicodeDecodeError:
             encoding = "cp1252"
-    return path.open(encoding=encoding, errors="replace", newline="")
+    stream = path.open(encoding=encoding, errors="replace", newline="")
+    head = stream.read(LOOK)
+    stream.seek(0)
+    blank = not re.search(r"[\t;,]", head) and re.search(r"[^\s#%] +[^\s]", head)
+    return _Spaced(stream) if blank else stream  # type: ignore[return-value]
 
 
 def _pass_over(stream: TextIO, head: _Head) -> None:
@@ -262,6 +306,26 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     if not any(map(column_name, cells)) or _share(cells) == 1:
         raise GroundedError(found("file.no_names", str(path), line=lines[0][:40].strip()))
     return _named(lines, 0, mark)
+
+
+def _head_by(columns: Sequence[str], lines: Sequence[str], path: Path) -> _Head:
+    """Return the head of a table whose first row of numbers has these columns.
+
+    Raises:
+        GroundedError: if it has another number of them.
+    """
+    marks = [next((m for m in "\t;," if m in line), ",") for line in lines]
+    rows = [_filled(_cells(line, mark)) for line, mark in zip(lines, marks, strict=True)]
+    i = next((i for i, cells in enumerate(rows) if cells and _share(cells) == 1), None)
+    if i is None:
+        raise GroundedError(found("file.no_rows", str(path), line=1))
+    cells, mark, line = rows[i], marks[i], lines[i]
+    if len(cells) != len(columns):
+        row = line.strip()[:40]
+        raise GroundedError(
+            found("file.columns", str(path), has=len(cells), names=tuple(columns), row=row)
+        )
+    return _Head(tuple(map(column_name, columns)), tuple(columns), mark, i, i)
 
 
 def _named(lines: Sequence[str], at: int, mark: str) -> _Head:
@@ -322,7 +386,7 @@ def _rises(cells: Sequence[Sequence[str]]) -> bool:
 def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
     """Read rows with texts or empty cells as NaN, and times [ns] if these are texts, else None."""
     rows: list[list[float]] = []
-    width, at = len(head.names), head.names.index(times)
+    width, at = len(head.names), head.names.index(times) if times else -1
     date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and i != at), None)
     texts: list[tuple[int, str, str]] = []
     for number, row in enumerate(csv.reader(lines, delimiter=head.mark), start=head.rows + 1):
@@ -332,12 +396,12 @@ def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tu
             row = row[:width]
         if len(row) != width:
             raise _misfit(path, number, row, head)
-        texts.append((number, row[at], "" if date is None else row[date]))
+        texts.append((number, row[at] if times else "", "" if date is None else row[date]))
         if head.mark != ",":  # decimal comma
             row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]
         rows.append([_number(cell) for cell in row])
     values = np.array(rows, dtype=float).reshape(-1, width)
-    if np.isfinite(values[:, at]).any() or not rows:
+    if not times or np.isfinite(values[:, at]).any() or not rows:
         return values, None  # times are numbers; missing ones are reported later
     return values, _stamps(texts, times, path)
 

@@ -24,6 +24,8 @@ from grounded.findings import found
 from grounded_trials.formats import parquet
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
+from grounded_trials.formats.text_tables import SUFFIXES
 from grounded_trials.plain_file import open_file, read_file
 from grounded_trials.within import within
 
@@ -48,21 +50,23 @@ class Format:
 
     kind: str  # its name in messages
     begins: bytes  # the first bytes of a file
-    reader: str  # module of `formats`, and its function (path) -> records
+    reader: str  # module of `formats`, and its function (path) or (path, layout) -> records
     library: str = ""  # that the reader needs
     extra: str = ""  # of grounded's, with which the library comes
+    table: bool = False  # may lack names or times, so that its reader takes a layout
 
 
-TABLE = Format("table", b"", "text_tables.csv_records")
-EPISODE = Format("LeRobot data set", b"", "parquet.episode_records", "pyarrow.parquet", "parquet")
+TABLE = Format("table", b"", "text_tables.csv_records", table=True)
+PYARROW = "pyarrow.parquet", "parquet"
+EPISODE = Format("LeRobot data set", b"", "parquet.episode_records", *PYARROW)
 FORMATS = (
     Format("ROS 2 bag", b"SQLite format 3\0", "bags.sqlite_records"),
     Format("ROS 1 bag", b"#ROSBAG", "bags.ros1_records"),
     Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_records", "pyulog", "px4"),
-    Format("NumPy archive", b"PK\x03\x04", "tables.npz_records"),
-    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_records", "scipy.io"),
-    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_records", "h5py", "matlab"),
-    Format("parquet table", b"PAR1", "parquet.parquet_records", "pyarrow.parquet", "parquet"),
+    Format("NumPy archive", b"PK\x03\x04", "tables.npz_records", table=True),
+    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_records", "scipy.io", table=True),
+    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_records", "h5py", "matlab", True),
+    Format("parquet table", b"PAR1", "parquet.parquet_records", *PYARROW, True),
 )
 
 
@@ -201,34 +205,38 @@ def empty(path: Path) -> GroundedError:
     return GroundedError(found("file.empty", str(path)))
 
 
-def log_records(path: Path) -> Iterator[Record]:
+def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of one file of any supported format; only in `read_apart`.
+
+    Args:
+        path: the file.
+        layout: the names and the rate of a table that does not say them.
 
     Raises:
         GroundedError: if it can't be read, is damaged, or is not a log.
     """
     if parquet.is_episode(path):
-        yield from _read_as(EPISODE, path)
+        yield from _read_as(EPISODE, path, layout)
         return
     with open_log(path) as stream:
         head = stream.read(16)
         if not head:
             raise empty(path)
         if not head.startswith(_ZSTD):
-            yield from _by_format(path, head, stream)
+            yield from _by_format(path, head, stream, layout)
             return
         with tempfile.TemporaryDirectory() as room:
             inner = Path(room) / path.stem
             _expand(path, stream, inner)
             with inner.open("rb") as expanded:
-                yield from _by_format(inner, expanded.read(16), expanded)
+                yield from _by_format(inner, expanded.read(16), expanded, layout)
 
 
-def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
+def _by_format(path: Path, head: bytes, stream: BinaryIO, layout: Layout) -> Iterator[Record]:
     if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
         yield from _guarded("MCAP log", path, read_records(stream, str(path)))
     elif (format := _format_of(path, head)) is not None:
-        yield from _read_as(format, path)
+        yield from _read_as(format, path, layout)
     else:
         raise GroundedError(found("file.no_log", str(path), head=repr(head[:8])))
 
@@ -236,14 +244,14 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
 def _format_of(path: Path, head: bytes) -> Format | None:
     """Return the format of a file that is no MCAP log, by its first bytes, else by its name."""
     known = next((one for one in FORMATS if head.startswith(one.begins)), None)
-    return TABLE if known is None and path.suffix in (".csv", ".tsv", ".txt") else known
+    return TABLE if known is None and path.suffix in SUFFIXES else known
 
 
-def _read_as(format: Format, path: Path) -> Iterator[Record]:
+def _read_as(format: Format, path: Path, layout: Layout) -> Iterator[Record]:
     _load(format)
     module, function = format.reader.split(".")
     read = getattr(import_module(f"grounded_trials.formats.{module}"), function)
-    yield from _guarded(format.kind, path, read(path))
+    yield from _guarded(format.kind, path, read(path, *[layout] * format.table))
 
 
 def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Record]:

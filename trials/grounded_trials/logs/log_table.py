@@ -14,7 +14,7 @@ from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import LATEST
+from grounded_trials.formats.tables import AS_IT_SAYS, LATEST, Layout
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
 from grounded_trials.toml_table import Table
@@ -42,9 +42,24 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
         group = table.sub(kind)
         signals[kind] = {name: _signal(group.sub(name), clock) for name in names if group.has(name)}
         group.finish(names)
-    span = _span(table.sub("span"))
+    span, layout = _span(table.sub("span")), layout_of(table)
     table.finish()
-    return LogMapping(states=signals["state"], inputs=signals["input"], span=span)
+    return LogMapping(signals["state"], signals["input"], span, layout)
+
+
+def layout_of(table: Table) -> Layout:
+    """Return the names and the rate of tables that do not say them, `columns` and `rate`.
+
+    Raises:
+        GroundedError: for values of the wrong kind.
+    """
+    columns = table.take("columns", list, [])
+    if not all(isinstance(name, str) and name for name in columns):
+        raise table.error("columns", "list", columns)
+    rate = table.take("rate", float, 0.0)
+    if rate < 0:
+        raise table.error("rate", "positive", rate)
+    return Layout(tuple(columns), rate)
 
 
 def _signal(table: Table, clock: str) -> SignalSpec:
@@ -125,6 +140,7 @@ class LogMapping:
     states: Mapping[str, SignalSpec]
     inputs: Mapping[str, SignalSpec]
     span: Span = field(default_factory=Span)
+    layout: Layout = AS_IT_SAYS
 
 
 def read_log(
@@ -191,4 +207,4 @@ def mapped_signals(
         )
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
-    return read_signals(paths, {**specs, **mapping.span.signals()})
+    return read_signals(paths, {**specs, **mapping.span.signals()}, mapping.layout)

@@ -35,6 +35,7 @@ from grounded_trials.formats.messages import (
 from grounded_trials.formats.path_walk import Bound, NoField, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import struct_of
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.log_files import log_records, read_apart
 
 Clock = Literal["header", "log", "publish"]
@@ -82,26 +83,31 @@ class Series:
 
 
 def read_signals(
-    paths: str | Path | Sequence[str | Path], specs: Mapping[str, SignalSpec]
+    paths: str | Path | Sequence[str | Path],
+    specs: Mapping[str, SignalSpec],
+    layout: Layout = AS_IT_SAYS,
 ) -> dict[str, Series]:
     """Read signals from a log: a file, files in order, or the folder of a bag.
 
     Args:
         paths: a log of any format, several in order, or a folder with them.
         specs: what to read, by name.
+        layout: the names and the rate of a table that does not say them.
 
     Raises:
         GroundedError: for a damaged file, a missing topic or field, a message with more than one
             value for a signal, or a clock that a topic does not have.
     """
-    return read_apart(paths, _read_signals, specs)
+    return read_apart(paths, _read_signals, specs, layout)
 
 
-def _read_signals(files: tuple[Path, ...], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
+def _read_signals(
+    files: tuple[Path, ...], specs: Mapping[str, SignalSpec], layout: Layout
+) -> dict[str, Series]:
     collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
     for path in files:
         log = _Log(str(path), list(collectors.values()))
-        for record in log_records(path):
+        for record in log_records(path, layout):
             if isinstance(record, Schema):
                 log.schemas[record.id] = record
             elif isinstance(record, Channel):

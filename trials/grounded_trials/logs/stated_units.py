@@ -37,6 +37,9 @@ UNITS = (  # units by the end of a path
     (r"@rpy\.\w+$|steering_angle$", "rad"),
     (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
     (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
+    (r"/[^/.]*(accel|acceleration)\.(xyz\[\d\]|[xyz])$|accelerometer_m_s2\[\d\]$", "m/s^2"),
+    (r"/[^/.]*gyro\.[xyz]$|gyro_rad\[\d\]$|angular_velocity\.xyz\[\d\]$", "rad/s"),
+    (r"/[^/.]*mag(netometer)?\.(\w+\[\d\]|[xyz])$|magnetometer_ga\[\d\]$", "T"),
     (r"linear\.[xyz]$|@world_velocity\.[xyz]$|drive\.speed$", "m/s"),
 )
 ANGLE = re.compile(r"(^|[._/])(angle|angular_position|swing|tilt|pitch|roll|yaw|heading)$")

@@ -20,6 +20,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import undeclared_angles
 from grounded.result import Result, listed
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import column_units, states_time_unit
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess
@@ -135,6 +136,7 @@ def begin(
     kind: str | None = None,
     dt: float | None = None,
     inputs: Sequence[str] = (),
+    layout: Layout = AS_IT_SAYS,
     ask: Ask | None = None,
 ) -> Begun:
     """Create a workspace from a log; never overwrites a file.
@@ -147,6 +149,7 @@ def begin(
         kind: kind of the skeleton, see `KINDS`; None: guessed from the log.
         dt: control interval [s]; None: the interval at which commands change, see `interval_of`.
         inputs: names of the numbers that are inputs of a generic skeleton; empty: guessed.
+        layout: the names and the rate of a table that does not say them; kept in [log].
         ask: called with each uncertain signal, returns the path to use; None: use the best guess.
 
     Raises:
@@ -164,10 +167,12 @@ def begin(
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
     options = {"--model": model, "--kind": kind, "--dt": dt, "--inputs": ",".join(inputs)}
+    options |= {"--columns": ",".join(layout.columns), "--rate": layout.rate}
     given = [str(part) for key, value in options.items() if value for part in (key, value)]
     again = (f"{folder}-2", "--from", str(log), *given)
     with fresh_folder(folder, files):
-        return _begin(folder, log, own, "generic" if inputs else kind, dt, inputs, ask, again)
+        kind = "generic" if inputs else kind
+        return _begin(folder, log, own, kind, dt, inputs, layout, ask, again)
 
 
 def _begin(
@@ -177,13 +182,14 @@ def _begin(
     kind: str | None,
     dt: float | None,
     named: Sequence[str],
+    layout: Layout,
     ask: Ask | None,
     again: tuple[str, ...],
 ) -> Begun:
     files = log_files(log)
     if kind_of(files[0]):
         raise GroundedError(f"{log} was written by grounded: init needs a log of your robot")
-    report = inspect_log(log)
+    report = inspect_log(log, layout)
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
     if all(field.low is None for field in report.numbers):
@@ -232,7 +238,7 @@ def _begin(
     ranges = {g.name: g.extent for g in (*states, *inputs)}
     odd = perhaps_degrees((*states, *inputs), built, joints)
     inputs = tuple(g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs)
-    slow = () if states_time_unit(files[0]) else _in_seconds(report)
+    slow = () if layout.rate or states_time_unit(files[0]) else _in_seconds(report)
     notes = (*notes, *slow, *(odd[g.name].sentence for g in states if g.name in odd))
     step, whose, note = (
         (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
@@ -245,7 +251,8 @@ def _begin(
         notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, built))
         notes = (*notes, *_turning(built))
     rates = velocities(built)
-    table = mapping_toml(states, inputs, simulated=report.simulated, rates=rates)
+    simulated = report.simulated
+    table = mapping_toml(states, inputs, simulated=simulated, rates=rates, layout=layout)
 
     stood: dict[str, float] | None = None
 

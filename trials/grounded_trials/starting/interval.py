@@ -112,7 +112,7 @@ def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:
     """Return the times between changes of a log's commands [s]; none if they can't be read."""
     specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]
     try:
-        found = read_signals(report.files, specs)
+        found = read_signals(report.files, specs, report.layout)
     except GroundedError:  # reported later, when the run is sampled
         return np.zeros(0)
     return np.concatenate([np.zeros(0), *map(_between_changes, found.values())])

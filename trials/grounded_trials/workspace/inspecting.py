@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.log_table import layout_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.unknown_id import refuse_ids
@@ -74,13 +77,14 @@ class Inspected(Result):
         }
 
 
-def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
+def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) -> Inspected:
     """Inspect a log; guess a [log] table if it is a foreign one and undamaged.
 
     Args:
         workspace: the workspace whose model names the states and inputs; without a model no table
             is guessed.
         log: a log of any format, or a bag's folder.
+        layout: the names and the rate of a table that does not say them; those in [log] by default.
 
     Raises:
         GroundedError: if the log can't be read at all.
@@ -91,7 +95,10 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 
     refuse_ids(workspace, log, "inspect")
-    report = inspect_log(log)
+    if layout == AS_IT_SAYS and (workspace.folder / FILE).exists():
+        with suppress(GroundedError):  # it is reported where [log] is used
+            layout = layout_of(workspace.config.log)
+    report = inspect_log(log, layout)
     if report.meta.get("format") or report.damage:
         return Inspected(str(log), report, "")
     try:
@@ -106,7 +113,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
         return Inspected(str(log), report, "", why, outside=not here)
     joints = joint_names(report)
     states, inputs = assigned(report, model.states, model.inputs, model, joints)
-    table = mapping_toml(states, inputs, simulated=report.simulated)
+    table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
     mapping = workspace.log_mapping
     odd = tuple(one.sentence for one in no_angles(model, mapping))
     odd += tuple(one.sentence for one in perhaps_degrees(states, model, joints).values())

@@ -204,7 +204,8 @@ class _Table:
             points += STATED * bool(number.said and role.unit) * self._fits(role, number)
         elif number.said or number.known:
             fits = self._fits(role, number)
-            points += (STATED if number.said else 0.5) if fits else -0.5 if number.said else -1.5
+            other = -0.5 if number.said else -1.5 if role.sent else -2 * CAP  # another sensor
+            points += (STATED if number.said else 0.5) if fits else other
             unit = number.said or number.known
             code = "start.unit" if fits else "start.unit_other"
             self.why.setdefault(own, []).append(found(code, role.name, unit=unit, model=role.unit))

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from grounded.result import extent
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.toml_table import key
 
@@ -20,6 +21,7 @@ def mapping_toml(
     *,
     simulated: bool = False,
     rates: Mapping[str, str] = MappingProxyType({}),
+    layout: Layout = AS_IT_SAYS,
 ) -> str:
     """Format guesses as a [log] table, with comments where a person should check.
 
@@ -28,11 +30,16 @@ def mapping_toml(
         inputs: one guess for each input.
         simulated: whether header stamps are on another clock than the log.
         rates: the states whose rate is another state, {q: w}.
+        layout: what the log's table does not say.
     """
     clock = "log" if simulated else "header"
     lines = ["[log]", f'clock = "{clock}"']
     if simulated:
         lines[-1] += "  # header stamps are on another clock than the log (simulation time?)"
+    if layout.columns:
+        lines.append(f"columns = [{', '.join(map(_quote, layout.columns))}]")
+    if layout.rate:
+        lines.append(f"rate = {layout.rate:.10g}  # [Hz] of the rows")
     for kind, guesses in (("state", states), ("input", inputs)):
         for guess in guesses:
             lines += ["", *_table(kind, guess, clock)]

@@ -9,7 +9,7 @@ two must not be mixed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from grounded_trials.formats.path_walk import (
     evaluate,
     number_paths,
 )
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.signals import Decoder, decoder_of
@@ -97,6 +98,7 @@ class LogReport:
     twins: tuple[Twins, ...]  # signals of different topics with one motion
     damage: str = ""  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
+    layout: Layout = AS_IT_SAYS  # what was said of its table
 
     @property
     def numbers(self) -> list[FieldReport]:
@@ -152,24 +154,25 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
     return tuple(odd)
 
 
-def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
+def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
     """Summarise a log; at damage the reading ends, and the damage is reported.
 
     Args:
         paths: a log file, several in order, or the folder of a bag.
+        layout: the names and the rate of a table that does not say them.
 
     Raises:
         GroundedError: if a file can't be read, or is not a log.
     """
-    return read_apart(paths, _inspected)
+    return replace(read_apart(paths, _inspected, layout), layout=layout)
 
 
-def _inspected(files: tuple[Path, ...]) -> LogReport:
+def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
     look = _Look()
     for path in files:
         look.new_file()
         try:
-            for record in log_records(path):
+            for record in log_records(path, layout):
                 look.add(record)
         except DamagedFile as error:
             if not look.headers:

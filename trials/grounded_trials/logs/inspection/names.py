@@ -67,7 +67,10 @@ _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "com
 COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
 # no signals by themselves
-PARTS = re.compile(r"covariance|layout|(orientation|rotation|quaternion)\.[xyzw]$")
+PARTS = re.compile(
+    r"covariance|variance|_var(\[\d+\])?$|\.(eph|epv|evh|evv)$|layout"
+    r"|(orientation|rotation|quaternion)\.[xyzw]$|\.q(_d)?\[\d\]$"
+)
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 
@@ -106,7 +105,7 @@ class Signals:
             for t in log.topics
             for f in t.fields
         }
-        self._files, self._angles = log.files, angles
+        self._log, self._angles = log, angles
         self.found: dict[str, Samples] = {}
         self._missing: set[str] = set()
 
@@ -115,11 +114,11 @@ class Signals:
         more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
         specs = {p: SignalSpec(p, clock=self._clocks.get(p, "log")) for p in more}  # type: ignore[arg-type]
         try:
-            series = read_signals(self._files, specs) if specs else {}
+            series = read_signals(self._log.files, specs, self._log.layout) if specs else {}
         except OverBudget:
             raise
         except GroundedError:
-            series = _one_by_one(self._files, specs)
+            series = _one_by_one(self._log, specs)
         for path, one in series.items():
             try:
                 found = tidy(path, one, unwrap="@rpy" in path)
@@ -178,11 +177,11 @@ def _unwound(angle: Samples) -> Samples:
     return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle
 
 
-def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
+def _one_by_one(log: LogReport, specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
     found: dict[str, Series] = {}
     for path, spec in specs.items():
         try:
-            found |= read_signals(files, {path: spec})
+            found |= read_signals(log.files, {path: spec}, log.layout)
         except GroundedError:
             continue
     return found

@@ -211,7 +211,7 @@ class ForeignLog:
         own = dict[str, Series]()
         if specs := {n: self.mapping.states[n] for n in self._beside}:
             with suppress(GroundedError):  # a log may lack them
-                own = read_signals(log_files(self.path), specs)
+                own = read_signals(log_files(self.path), specs, self.mapping.layout)
         if not seen and not own:
             return None
         return replace(self, series={**self.series, **seen, **own}, own=own)
@@ -296,7 +296,7 @@ def _unmapped(
     """Return the error for a state or an input that [log] does not map."""
     if name in model.input_names:
         return GroundedError(
-            f"[log] maps no '{name}': every input must be logged, map it{_numbers(path)}"
+            f"[log] maps no '{name}': every input must be logged, map it{_numbers(path, mapping)}"
         )
     if estimated:
         return GroundedError(
@@ -306,7 +306,8 @@ def _unmapped(
     known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
     if not known:
         return GroundedError(
-            f"[log] maps no '{name}', nor any other state: map what is measured{_numbers(path)}"
+            f"[log] maps no '{name}', nor any other state: map what is measured"
+            f"{_numbers(path, mapping)}"
         )
     return GroundedError(
         f"[log] maps no '{name}': map it. If no sensor measures it, a smoother can estimate it "
@@ -315,9 +316,9 @@ def _unmapped(
     )
 
 
-def _numbers(path: Path) -> str:
+def _numbers(path: Path, mapping: LogMapping) -> str:
     """List the numbers in a log that change, if they are few; else ""."""
-    found = [f.path for t in inspect_log(path).topics for f in t.fields if f.low != f.high]
+    found = inspect_log(path, mapping.layout).moving
     return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
 
 
