@@ -133,7 +133,7 @@ ENTRIES: dict[str, Entry] = {
         "{about} can't be read[[ as a {kind}]]: {why}",
         "[[{kind:ROS 2 bag=`sqlite3 FILE .recover` saves what can be saved,ROS 1 bag="
         "`rosbag reindex` repairs it if it was not closed,PX4 log=,NumPy archive=,MCAP log=,"
-        "parquet table=,LeRobot data set=,MATLAB file=,"
+        "parquet table=,LeRobot data set=,MATLAB file=,ArduPilot log=,"
         "table=,bag=,zstd file=,TOML file=,CSV=,candidate=,trial=}]]",
     ),
     "unwritable": Entry(
@@ -155,7 +155,8 @@ ENTRIES: dict[str, Entry] = {
     "no_log": Entry(
         "refuse",
         "{about} is not a log: it begins with {head}",
-        "expected MCAP, ROS 2 .db3, ROS 1 .bag, .csv, .npz, .parquet, .mat or PX4 .ulg",
+        "expected MCAP, ROS 2 .db3, ROS 1 .bag, .csv, .npz, .parquet, .mat, PX4 .ulg or ArduPilot "
+        ".bin",
     ),
     "no_log_inside": Entry(
         "refuse",

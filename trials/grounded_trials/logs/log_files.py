@@ -21,7 +21,7 @@ from zipfile import BadZipFile, ZipFile
 
 from grounded.errors import GroundedError, needs
 from grounded.findings import found
-from grounded_trials.formats import parquet
+from grounded_trials.formats import dataflash, parquet, text_tables
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
@@ -32,7 +32,7 @@ from grounded_trials.within import within
 P = ParamSpec("P")
 T = TypeVar("T")
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
-KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".mat", ".parquet")
+KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".bin", ".mat", ".parquet")
 NEWEST = 3  # most logs named in place of one that does not exist
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -64,6 +64,7 @@ FORMATS = (
     Format("ROS 1 bag", b"#ROSBAG", "bags.ros1_records"),
     Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_records", "pyulog", "px4"),
     Format("NumPy archive", b"PK\x03\x04", "tables.npz_records", table=True),
+    Format("ArduPilot log", dataflash.BEGINS, "dataflash.dataflash_records"),
     Format("MATLAB file", b"MATLAB 5.0", "mat.mat_records", "scipy.io", table=True),
     Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_records", "h5py", "matlab", True),
     Format("parquet table", b"PAR1", "parquet.parquet_records", *PYARROW, True),
@@ -326,6 +327,20 @@ def _load_library(file: Path) -> None:
 def _load(format: Format | None) -> None:
     if format is not None and format.library:
         needs(format.library, format.extra)
+
+
+def column_units(log: Path) -> dict[str, str]:
+    """Return the units that a log states for its numbers, by message path.
+
+    A text table does in its column names, ArduPilot's log in messages of its own.
+    """
+    if log.suffix.lower() in SUFFIXES:
+        return text_tables.column_units(log)
+    if not log.is_file():
+        return {}
+    with open_log(log) as stream:
+        stated = stream.read(3) == dataflash.BEGINS
+    return within(log, log.stat().st_size, dataflash.dataflash_units, log) if stated else {}
 
 
 def digest_of(log: Path) -> str:

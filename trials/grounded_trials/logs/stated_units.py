@@ -22,7 +22,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from grounded.units import ENDINGS, factor_between, unit_ending
-from grounded_trials.formats.text_tables import column_units
+from grounded_trials.logs.log_files import column_units
 
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
@@ -85,7 +85,7 @@ class Stated:
 
     @classmethod
     def by(cls, files: Sequence[str | Path]) -> Stated:
-        """Read the units in the first row of a log's first file; names are used in any log."""
+        """Read the units that a log's first file states; names are used in any log."""
         return cls(column_units(Path(files[0])) if files else {})
 
     def unit(self, path: str) -> str:

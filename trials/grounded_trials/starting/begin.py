@@ -21,7 +21,7 @@ from grounded.model import Model
 from grounded.places import undeclared_angles
 from grounded.result import Result, listed
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
-from grounded_trials.formats.text_tables import column_units, states_time_unit
+from grounded_trials.formats.text_tables import states_time_unit
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
@@ -29,7 +29,7 @@ from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
 from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.inspection.relations import velocities
-from grounded_trials.logs.log_files import kind_of, log_files
+from grounded_trials.logs.log_files import column_units, kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder

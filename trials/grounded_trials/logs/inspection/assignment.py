@@ -204,7 +204,7 @@ class _Table:
             points += STATED * bool(number.said and role.unit) * self._fits(role, number)
         elif number.said or number.known:
             fits = self._fits(role, number)
-            other = -0.5 if number.said else -1.5 if role.sent else -2 * CAP  # another sensor
+            other = -0.5 if number.said else -1.5 if role.sent else -CAP  # another sensor
             points += (STATED if number.said else 0.5) if fits else other
             unit = number.said or number.known
             code = "start.unit" if fits else "start.unit_other"

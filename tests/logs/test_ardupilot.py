@@ -1,0 +1,107 @@
+"""ArduPilot's logs: topics, units and instances as the log says; damage; three commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from dataflash import dataflash
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.logs.inspection.assignment import assigned
+from grounded_trials.logs.inspection.inspect_log import inspect_log
+from grounded_trials.logs.log_files import column_units
+from grounded_trials.logs.signals import SignalSpec, read_signals
+
+DT, TAU, N = 0.02, 0.25, 400
+T = np.arange(N) * DT
+WANTED = 20 * np.sign(np.sin(1.7 * T)) + 10 * np.sin(3 * T)  # [deg]
+ROLL = np.zeros(N)
+for i in range(1, N):
+    ROLL[i] = ROLL[i - 1] + (1 - np.exp(-DT / TAU)) * (WANTED[i - 1] - ROLL[i - 1])
+ROLL += 0.05 * np.random.default_rng(0).normal(size=N)
+GYRO = np.deg2rad(np.gradient(ROLL, DT))
+KINDS = [
+    ("ATT", "Qcc", "TimeUS,DesRoll,Roll", "sdd"),
+    ("IMU", "QBf", "TimeUS,I,GyrX", "s#E"),
+    ("MSG", "QZ", "TimeUS,Message", "s-"),
+]
+MODEL = """from grounded import Model, Param
+
+
+def dynamics(s, a, p):
+    return {"roll": (a.roll_command - s.roll) / p.tau}
+
+
+model = Model(
+    states={"roll": "rad"},
+    inputs={"roll_command": "rad"},
+    params={"tau": Param(0.5, "s", 0.01, 5.0)},
+    derivative=dynamics,
+)
+"""
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    messages: list = [("MSG", (10**6, "ArduCopter V4.5"))]
+    for t, wanted, roll, gyro in zip(T, WANTED, ROLL, GYRO, strict=True):
+        at = 10**6 + round(t * 1e6)
+        messages.append(("ATT", (at, round(100 * wanted), round(100 * roll))))
+        messages += [("IMU", (at, k, gyro + k)) for k in range(2)]
+    return dataflash(tmp_path / "00000012.BIN", KINDS, messages)
+
+
+def test_messages_are_topics_with_the_units_that_the_log_states(log: Path) -> None:
+    specs = {n: SignalSpec(p) for n, p in {"roll": "/ATT.Roll", "p": "/IMU_1.GyrX"}.items()}
+    found = read_signals(log, specs)
+    np.testing.assert_allclose(found["roll"].values, ROLL, atol=0.0051)
+    np.testing.assert_allclose(found["roll"].t, 1e9 + T * 1e9, atol=1000)
+    np.testing.assert_allclose(found["p"].values, GYRO + 1, rtol=1e-6, atol=1e-6)
+    units = column_units(log)
+    assert units["/ATT.Roll"] == "deg" and units["/IMU.GyrX"] == units["/IMU_1.GyrX"] == "rad/s"
+    assert {topic.topic for topic in inspect_log(log).topics} >= {"/ATT", "/IMU", "/IMU_1"}
+
+
+def test_degrees_and_what_was_desired_are_told_apart(log: Path) -> None:
+    (roll,), (sent,) = assigned(inspect_log(log), {"roll": "rad"}, {"roll_command": "rad"})
+    assert (roll.path, sent.path) == ("/ATT.Roll", "/ATT.DesRoll")
+    assert roll.scale == pytest.approx(np.pi / 180) and sent.scale == roll.scale
+
+
+def test_another_reader_reads_the_same(log: Path) -> None:
+    pymavlink = pytest.importorskip("pymavlink.DFReader", reason="pymavlink is not installed")
+    reader, rolls = pymavlink.DFReader_binary(str(log)), []
+    while (message := reader.recv_match(type="ATT")) is not None:
+        rolls.append(message.Roll)
+    reader.data_map.close()
+    reader.filehandle.close()
+    own = read_signals(log, {"roll": SignalSpec("/ATT.Roll")})["roll"].values
+    np.testing.assert_allclose(own, rolls)
+
+
+def test_damage_costs_the_messages_in_it(log: Path) -> None:
+    whole, rng = log.read_bytes(), np.random.default_rng(0)
+    for k in range(8):
+        bad = bytearray(whole)
+        at = len(whole) // 2 + 37 * k
+        bad[at : at + 60] = rng.bytes(60)
+        log.write_bytes(bytes(bad[: len(bad) - 5 * k]))
+        found = read_signals(log, {"roll": SignalSpec("/ATT.Roll")})["roll"].values
+        assert N - 8 <= len(found) <= N
+        np.testing.assert_allclose(found[:100], ROLL[:100], atol=0.0051)
+    log.write_bytes(whole[:200])
+    with pytest.raises(GroundedError):
+        inspect_log(log)
+
+
+@pytest.mark.slow
+def test_three_commands_lead_to_a_diagnosis(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(log.parent)
+    Path("roll.py").write_text(MODEL)
+    assert grounded("init", "quad", "--from", log.name, "--model", "roll.py", "--yes").code == 0
+    assert grounded("-C", "quad", "ingest", "--data", log.name).code == 0
+    assert "tau" in Workspace("quad").diagnose().verdict.parameters
