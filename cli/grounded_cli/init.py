@@ -85,8 +85,10 @@ def command(
     needs no log and writes drive.py, the robot's program. --example NAME copies an example, whose
     real.py simulates the robot.
     """
-    sorts = (("--kind", kind), ("--inputs", inputs), ("--yes", yes))
-    sorts = (*sorts, ("--columns", layout.columns), ("--rate", layout.rate))
+    sorts: tuple[tuple[str, object], ...] = (
+        *(("--kind", kind), ("--inputs", inputs), ("--yes", yes)),
+        *(("--columns", layout.columns), ("--rate", layout.rate)),
+    )
     if list_:
         _list(json_)
     elif folder is None or [log is not None, name is not None, blank].count(True) != 1:

@@ -271,11 +271,11 @@ def _opened(path: Path) -> TextIO:
             codecs.getincrementaldecoder("utf-8")().decode(start)
         except UnicodeDecodeError:
             encoding = "cp1252"
-    stream = path.open(encoding=encoding, errors="replace", newline="")
-    head = stream.read(LOOK)
-    stream.seek(0)
+    text = path.open(encoding=encoding, errors="replace", newline="")
+    head = text.read(LOOK)
+    text.seek(0)
     blank = not re.search(r"[\t;,]", head) and re.search(r"[^\s#%] +[^\s]", head)
-    return _Spaced(stream) if blank else stream  # type: ignore[return-value]
+    return _Spaced(text) if blank else text  # type: ignore[return-value]
 
 
 def _pass_over(stream: TextIO, head: _Head) -> None:

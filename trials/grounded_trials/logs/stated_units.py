@@ -25,7 +25,7 @@ from grounded.units import ENDINGS, factor_between, unit_ending
 from grounded_trials.logs.log_files import column_units
 
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
-    r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req)$"
+    r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req|ctrl)$"
 )
 _SENT = re.compile(r"(?<=[./])(?:cmd|command|commanded|desired|target|setpoint|ref)_(?=[a-zA-Z])")
 _SHORT = ("s", "V", "A", "N", "C")  # may be part of a name as well: `vel_N`

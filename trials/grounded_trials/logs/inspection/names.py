@@ -63,8 +63,11 @@ NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by it
 _BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, not the speed
 _COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
 _RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
-_COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
-COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
+_COMMANDED = (
+    *("ref", "reference", "desired", "des", "target", "setpoint", "goal", "cmd", "command"),
+    "action",
+)
+COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target|^/action$")
 _ANGLES = ("roll", "pitch", "yaw")
 # no signals by themselves
 PARTS = re.compile(
