@@ -39,7 +39,7 @@ PLAIN = (int, float, complex, bool, str, bytes, type(None), np.generic)  # sent 
 
 def possible() -> bool:
     """Return whether copies of this process can be made."""
-    return sys.platform == "linux"
+    return sys.platform == "linux" and hasattr(os, "fork")
 
 
 @dataclass

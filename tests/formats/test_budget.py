@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import struct
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -82,7 +81,7 @@ def crash() -> None:
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Start children as on Linux, and as elsewhere."""
     if request.param == "spawn":
-        monkeypatch.setattr(sys, "platform", "darwin")
+        monkeypatch.setattr("grounded_trials.within.FORKS", False)
     return str(request.param)
 
 

@@ -12,6 +12,11 @@ from typing import BinaryIO
 
 from grounded.errors import GroundedError, type_of
 
+# What a system lacks does no harm there: Windows has no pipes in its folders.
+BINARY = getattr(os, "O_BINARY", 0)
+PLAIN = BINARY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
+
 
 def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
     """Open a regular file for reading, without blocking.
@@ -26,8 +31,7 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
     """
     if not follow and path.is_symlink():
         raise GroundedError(f"{path} is a link, expected a regular file: links are not followed")
-    links = 0 if follow else os.O_NOFOLLOW
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | links)
+    descriptor = os.open(path, os.O_RDONLY | PLAIN | (0 if follow else NO_LINKS))
     try:
         mode = os.fstat(descriptor).st_mode
         if stat.S_ISDIR(mode):

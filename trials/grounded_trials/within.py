@@ -7,8 +7,8 @@ so that no loop has to count what it does. The child returns its result, or its 
 
 On Linux the child is a copy of this process (a fork): it starts in a few milliseconds, what it is
 given need not be picklable, and the system enforces every limit. Elsewhere a fork is not safe: the
-child is another Python, and its memory is looked at every `LOOK_S`. Time is the child's CPU time,
-so a slow disk or a busy machine does not matter.
+child is another Python, whose time and memory are looked at every `LOOK_S`. Time is the child's CPU
+time, so a slow disk or a busy machine does not matter.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -28,8 +29,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from errno import EFBIG
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from grounded.errors import GroundedError
 
@@ -43,6 +45,7 @@ DISK = 4  # [memory] largest decompressed file
 PATIENCE = 20  # [CPU time] after which a child that does not end is stuck
 LOOK_S = 0.1  # [s] between two looks at a child's memory
 ENDS = {77: "memory", 78: "disk", -9: "memory", -27: "time"}  # exit codes; SIGKILL, SIGPROF
+FORKS = sys.platform == "linux" and hasattr(os, "fork")
 
 _inside = False  # whether this process is such a child
 
@@ -105,7 +108,7 @@ def within(
     with tempfile.TemporaryDirectory(prefix="grounded-") as room:
         order = (limits.seconds, limits.memory, room, function, args, kwargs)
         try:
-            child = _Child(*(_fork if sys.platform == "linux" else _spawn)(order))
+            child = (_Copy if FORKS else _Other)(order)
         except OSError as error:
             raise GroundedError(f"{name} can't be read: no process can start: {error}") from None
         try:
@@ -118,16 +121,39 @@ def within(
     return result
 
 
-@dataclass
-class _Child:
-    """A running child: the number of its process, and the stream of its answer."""
+class _Copy:
+    """A copy of this process, which the system limits."""
 
-    process: int
-    answer: Any
-    code: int | None = None  # its exit code, negative for a signal; None while it may run
+    code: int | None  # its exit code, negative for a signal; None while it may run
+
+    def __init__(self, order: tuple[Any, ...]) -> None:
+        receive, send = os.pipe()
+        with warnings.catch_warnings():  # of other threads, whose locks no reader takes
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self.process = os.fork()
+        if not self.process:
+            try:
+                gc.freeze()  # else the first collection copies the parent's memory
+                os.close(receive)
+                with os.fdopen(send, "wb") as out:
+                    _serve(out, *order)
+            finally:
+                os._exit(1)
+        os.close(send)
+        self.answer, self.code = os.fdopen(receive, "rb"), None
+        self.poll = select.poll()
+        self.poll.register(self.answer, select.POLLIN)
+
+    def answers(self, seconds: float) -> bool:
+        """Wait for its answer, or its end; False if neither came in that time."""
+        return bool(self.poll.poll(1e3 * seconds))
+
+    def over(self, limits: _Limits) -> str:
+        """Return the limit that it exceeds while it runs; the system ends it there."""
+        return ""
 
     def wait(self) -> int:
-        """Return the exit code, once it has ended."""
+        """Return the exit code, once it has ended; negative for a signal."""
         if self.code is None:
             self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
         return self.code
@@ -141,63 +167,65 @@ class _Child:
                 self.wait()
 
 
-def _answer(child: _Child, limits: _Limits) -> tuple[bool, Any]:
+class _Other:
+    """Another Python, at whose time and memory this process looks."""
+
+    def __init__(self, order: tuple[Any, ...]) -> None:
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        # Ctrl-C ends it through its parent
+        self.child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, **pipes)
+        assert self.child.stdin is not None and self.child.stdout is not None
+        self.answer = cast("BufferedReader", self.child.stdout)
+        with self.child.stdin as stream, suppress(BrokenPipeError):
+            pickle.dump(order, stream)
+        self.waiting = threading.Thread(target=self.answer.peek, args=(1,), daemon=True)
+        self.waiting.start()
+
+    def answers(self, seconds: float) -> bool:
+        """Wait for its answer, or its end; False if neither came in that time."""
+        self.waiting.join(seconds)
+        return not self.waiting.is_alive()
+
+    def over(self, limits: _Limits) -> str:
+        """Return the limit that it exceeds while it runs."""
+        import psutil
+
+        with suppress(psutil.Error):  # it has just ended
+            child = psutil.Process(self.child.pid)
+            used = child.cpu_times()
+            if child.memory_info().rss > limits.memory:
+                return "memory"
+            return "time" * (used.user + used.system > limits.seconds)
+        return ""
+
+    def wait(self) -> int:
+        """Return the exit code, once it has ended; negative for a signal."""
+        return self.child.wait()
+
+    def end(self) -> None:
+        """End it, if it still runs."""
+        self.child.kill()
+        self.child.wait()
+        self.waiting.join()
+        self.answer.close()
+
+
+def _answer(child: _Copy | _Other, limits: _Limits) -> tuple[bool, Any]:
     """Return what the child sent: whether it succeeded, and its result or exception."""
-    ready, until = select.poll(), time.monotonic() + PATIENCE * limits.seconds
-    ready.register(child.answer, select.POLLIN)
-    limited = sys.platform == "linux"  # by the system
-    while not ready.poll(1e3 * (PATIENCE * limits.seconds if limited else LOOK_S)):
+    patience = PATIENCE * limits.seconds
+    until = time.monotonic() + patience
+    while not child.answers(patience if FORKS else LOOK_S):
         if time.monotonic() > until:
-            return False, limits.over(f"does not end within {PATIENCE * limits.seconds:.0f} s")
-        if not limited and _resident(child.process) > limits.memory:
-            return False, limits.over("memory")
+            return False, limits.over(f"does not end within {patience:.0f} s")
+        if over := child.over(limits):
+            return False, limits.over(over)
     try:
         found: tuple[bool, Any] = pickle.load(child.answer)
         return found
     except (EOFError, pickle.UnpicklingError):  # it ended before, or while it answered
         code = child.wait()
         return False, limits.over(ENDS.get(code) or f"crashes (exit code {code})")
-
-
-def _resident(process: int) -> int:
-    """Return the memory that a process uses [bytes], on any Unix."""
-    command = ["ps", "-o", "rss=", "-p", str(process)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return 1024 * int(done.stdout.strip() or 0)
-
-
-def _fork(order: tuple[Any, ...]) -> tuple[int, Any]:
-    """Start a copy of this process; return its number, and the stream of its answer."""
-    receive, send = os.pipe()
-    with warnings.catch_warnings():  # of other threads, whose locks no reader takes
-        warnings.simplefilter("ignore", DeprecationWarning)
-        process = os.fork()
-    if process:
-        os.close(send)
-        return process, os.fdopen(receive, "rb")
-    try:
-        gc.freeze()  # else the first collection copies the parent's memory
-        os.close(receive)
-        with os.fdopen(send, "wb") as out:
-            _serve(out, *order)
-    finally:
-        os._exit(1)
-
-
-def _spawn(order: tuple[Any, ...]) -> tuple[int, Any]:
-    """Start another Python; return its number, and the stream of its answer."""
-    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-    child = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C ends it through its parent
-    )
-    assert child.stdin is not None
-    with child.stdin as stream, suppress(BrokenPipeError):
-        pickle.dump(order, stream)
-    child.returncode = 0  # `within` waits for it
-    return child.pid, child.stdout
 
 
 def main() -> None:
@@ -229,8 +257,11 @@ def _serve(
 
 
 def _limit(seconds: float, memory: int) -> None:
-    """Let the system end this process at its limits."""
-    import resource
+    """Let the system end this process at its limits; of Windows its parent does."""
+    try:
+        import resource
+    except ImportError:
+        return
 
     signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends it, also inside a library
     signal.setitimer(signal.ITIMER_PROF, seconds)

@@ -26,7 +26,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from grounded.errors import GroundedError
-from grounded_trials.plain_file import open_file
+from grounded_trials.plain_file import BINARY, open_file
 
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
@@ -330,7 +330,9 @@ def _remove(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder, so that the names in it are durable."""
+    """Sync a folder, so that the names in it are durable; on Windows they are."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -341,14 +343,14 @@ def sync_folder(folder: Path) -> None:
 def _copy(source: str | Path | bytes, target: Path, mode: int = 0o444) -> str:
     """Copy to a new file and sync it; return the SHA-256 of the contents."""
     hasher = hashlib.sha256()
-    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | BINARY, 0o644)
     with os.fdopen(descriptor, "wb") as out:
         for block in _blocks(source):
             hasher.update(block)
             out.write(block)
         out.flush()
-        os.fchmod(out.fileno(), mode)
         os.fsync(out.fileno())
+    target.chmod(mode)
     return hasher.hexdigest()
 
 
