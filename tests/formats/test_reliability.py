@@ -47,7 +47,7 @@ def test_kill_at_any_moment() -> None:
 
 
 def test_concurrent_processes() -> None:
-    fine(reliability.concurrent())
+    fine(reliability.concurrent(24, 12) if FULL else reliability.concurrent(8, 4))
 
 
 def test_a_full_disk() -> None:
@@ -55,7 +55,7 @@ def test_a_full_disk() -> None:
 
 
 def test_a_write_that_ends_early() -> None:
-    fine(reliability.size_limit())
+    fine(reliability.size_limit(20_011 if FULL else 70_001))
 
 
 def test_a_folder_that_may_not_be_written() -> None:
@@ -64,4 +64,4 @@ def test_a_folder_that_may_not_be_written() -> None:
 
 @pytest.mark.slow
 def test_faults_at_each_system_call() -> None:
-    fine(reliability.fault_injection(1 if FULL else 6), "strace is not there")
+    fine(reliability.fault_injection(1 if FULL else 19), "strace is not there")

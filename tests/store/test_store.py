@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -118,21 +116,6 @@ def test_a_folder_that_can_not_be_written(tmp_path: Path) -> None:
     with pytest.raises(GroundedError, match=holding(tmp_path / "no")):
         write_atomically(tmp_path / "no" / "x", b"x")
     assert not (tmp_path / "no").exists()
-
-
-def test_concurrent_processes_lose_nothing(tmp_path: Path) -> None:
-    code = (
-        "import sys; from grounded_trials.store.store import Store\n"
-        "for i in range(12): Store(sys.argv[1]).add(b'file %d' % ((i + int(sys.argv[2])) % 12))"
-    )
-    running = [
-        subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "s"), str(i)])
-        for i in range(4)
-    ]
-    assert [p.wait() for p in running] == [0] * 4
-    store = Store(tmp_path / "s")
-    assert sorted(store.read(s) for s in store.list()) == sorted(b"file %d" % i for i in range(12))
-    assert [s.number for s in store.list()] == list(range(1, 13))
 
 
 def test_a_folder_without_file_locks_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:

@@ -275,9 +275,9 @@ def full_disk() -> Outcome | None:
     return Outcome(3, tuple(failures), "one message each, and the next small file fits")
 
 
-def size_limit() -> Outcome:
+def size_limit(stride: int = 20_011) -> Outcome:
     """Let writes end early, after any number of bytes."""
-    limits = range(0, 200_000, 20_011)
+    limits = range(0, 200_000, stride)
     failures = []
     for limit in limits:
         with tempfile.TemporaryDirectory() as folder:

@@ -78,14 +78,13 @@ def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
     return folder
 
 
-def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
+def car_bag(folder, storage=StoragePlugin.SQLITE3):
     """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s."""
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
         "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
         "/joint_states": "sensor_msgs/msg/JointState",
     }
-    topics |= {seen: "geometry_msgs/msg/PoseStamped"} if seen else {}
     messages, v, x, y, psi = [], 0.0, 0.0, 0.0, 0.0
     for k in range(800):
         t, steering, speed = START + k * 10**7, 0.3 * np.sin(0.01 * k), 1 + 0.5 * np.sin(0.02 * k)
@@ -93,10 +92,6 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3, seen=""):
         if k % 5 == 0:
             messages.append(("/drive", t, drive(t, steering, speed)))
         messages.append(("/odom", t, odometry(t, x, y, psi, v, rate)))
-        if seen:
-            pose = odometry(t, x + 0.8, y + 0.6, psi, v, rate).pose.pose
-            stamped = T["geometry_msgs/msg/PoseStamped"](header=header(t), pose=pose)
-            messages.append((seen, t, stamped))
         wheels = np.array([20 * x, 20 * x])
         messages.append(("/joint_states", t, joints(t, ["left", "right"], wheels, wheels, wheels)))
         v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate
@@ -333,35 +328,4 @@ def thruster_bag(folder, swapped=False):
         psi += h * r
         x += h * (u * np.cos(psi) - v * np.sin(psi))
         y += h * (u * np.sin(psi) + v * np.cos(psi))
-    return bag(folder, topics, messages)
-
-
-def balancer_bag(folder):
-    """Write a bag of a balancing robot: an IMU, encoders of both wheels and a voltage."""
-    topics = {
-        "/imu": "sensor_msgs/msg/Imu",
-        "/joint_states": "sensor_msgs/msg/JointState",
-        "/motor_voltage": "std_msgs/msg/Float64",
-    }
-    messages, none = [], np.zeros(9)
-    for k in range(600):
-        t, s = START + k * 10**7, DT * k
-        pitch, rate = 0.1 * np.sin(2 * s), 0.2 * np.cos(2 * s)
-        q, w = np.full(2, 8 * np.sin(0.7 * s)), np.full(2, 5.6 * np.cos(0.7 * s))
-        turn = T["geometry_msgs/msg/Quaternion"](
-            x=0.0, y=np.sin(pitch / 2), z=0.0, w=np.cos(pitch / 2)
-        )
-        imu = T["sensor_msgs/msg/Imu"](
-            header=header(t),
-            orientation=turn,
-            orientation_covariance=none,
-            angular_velocity=vector("Vector3", 0.0, rate, 0.0),
-            angular_velocity_covariance=none,
-            linear_acceleration=vector("Vector3", 0.0, 0.0, 9.81),
-            linear_acceleration_covariance=none,
-        )
-        messages.append(("/imu", t, imu))
-        messages.append(("/joint_states", t, joints(t, ["left_wheel", "right_wheel"], q, w, 0 * q)))
-        if k % 2 == 0:
-            messages.append(("/motor_voltage", t, T["std_msgs/msg/Float64"](data=np.cos(3 * s))))
     return bag(folder, topics, messages)

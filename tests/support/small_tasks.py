@@ -160,7 +160,6 @@ def speed_rover_task(model: Model) -> Task:
 def pushed_cart(
     friction: float = 0.0,
     dead: float = 0.0,
-    asymmetric: float = 0.0,
     trials: int = 4,
     steps: int = 120,
     noise: float = 1.0,
@@ -184,7 +183,6 @@ def pushed_cart(
         x, states = np.zeros(2), [np.zeros(2)]
         for value in u:
             force = np.sign(value) * max(abs(value) - dead, 0)
-            force *= 1 + (asymmetric if force > 0 else 0)
             for _ in range(10):
                 v = x[1]
                 rate = 2.0 * force - v - friction * np.tanh(v / 0.01)
