@@ -6,7 +6,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from grounded import Model, Param
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.trial import Trial
 
 DT, FINE = 0.05, 10  # [s] control step; steps of the simulation in one
@@ -71,11 +70,3 @@ def test_one_message_is_late_as_a_whole(trials):
     found = preflight(ROVER, trials, one_message=POSE)
     assert late(found.findings) == pytest.approx(dict.fromkeys(POSE, LATE), abs=0.004)
     assert {f"sensor_delay:{name}" for name in POSE} <= found.settled
-
-
-def test_unequal_wheels_are_named_and_slip_is_not_given_the_delay(trials):
-    found = diagnose(ROVER, trials, DiagnosisOptions(one_message=POSE))
-    assert {*found.verdict.effects} == {"coupling:psi<-v", "side_slip:x+y"}
-    values = {r.effect: next(iter(r.params.values())).value for r in found.ranking if r.claimed}
-    assert values["coupling:psi<-v"] == pytest.approx(PULL, rel=0.05)
-    assert values["side_slip:x+y"] == pytest.approx(SLIP, rel=0.15)

@@ -49,17 +49,6 @@ def test_a_car_without_a_speed_command_is_driven_by_what_its_log_has(tmp_path, n
     assert gain.low < FULL / 2 and gain.high > 2 * FULL
 
 
-def test_a_speed_command_comes_before_a_motor_s(tmp_path):
-    rows = driven()
-    log = tmp_path / "drive.csv"
-    both = np.column_stack([rows, FULL * rows[:, -1]])
-    head = "t,v,x,y,psi,steering,motor_duty,speed_cmd"
-    np.savetxt(log, both, "%.5f", ",", header=head, comments="")
-    found = begin(tmp_path / "w", log, kind="car")
-    assert [g.name for g in found.inputs] == ["steering", "speed"]
-    assert Workspace(tmp_path / "w").task.model.params["gain"].value == 1.0
-
-
 def test_no_plan_is_made_for_an_input_that_log_does_not_map(tmp_path):
     """A node sent a speed of 1.6 m/s as the duty of its motor."""
     w = tmp_path / "w"

@@ -92,23 +92,6 @@ def test_the_end_of_a_name_says_a_unit(path, unit, bare):
     assert without_unit(path) == bare
 
 
-@pytest.mark.parametrize("unit, size", [("%", 100.0), ("1", 1.0)])
-def test_the_weight_of_changes_is_that_of_their_range(tmp_path, unit, size):
-    t = np.arange(0, 8, 0.02)
-    table = np.column_stack([t, np.sin(t), np.cos(t), size * np.sin(np.floor(3 * t))])
-    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
-    model = f"""from grounded import Model
-model = Model(states={{"x": "m", "v": "m/s"}}, inputs={{"force": "{unit}"}}, params={{}},
-    derivative=lambda s, a, p: {{"x": s.v, "v": a.force}})
-"""
-    (tmp_path / "m.py").write_text(model)
-    for name, how in {"a": ("--from", tmp_path / "log.csv", "--yes"), "b": ("--blank",)}.items():
-        made = grounded("init", tmp_path / name, *how, "--model", tmp_path / "m.py")
-        assert made.code == 0, made.err
-        weights = tomllib.loads((tmp_path / name / "grounded.toml").read_text())["reward"]
-        assert weights["input_change"]["force"] == pytest.approx(0.01 / size**2, rel=0.01)
-
-
 BEAM = """from grounded import Model, Param
 model = Model(states={"r": "m", "rd": "m/s", "th": "rad", "thd": "rad/s"}, inputs={"volt": "V"},
     params={"k": Param(1.0, "1/s", 0.5, 2.0)},

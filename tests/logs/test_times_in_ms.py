@@ -1,10 +1,8 @@
 """Tables whose times are in ms under a header that says seconds, and [log] without a signal."""
 
 import numpy as np
-import pytest
 
 from cli import grounded
-from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
 
 
@@ -28,19 +26,6 @@ def test_times_in_ms_are_asked_about_and_next_is_to_begin_again(tmp_path):
     renamed = table(tmp_path / "b.csv", column="t_ms")
     again = begin(tmp_path / "w-2", renamed, kind="generic", inputs=["force"])
     assert again.dt < 2 and again.then.verb == "ingest"
-
-
-@pytest.mark.parametrize(
-    ("column", "unit"),
-    [("millis", 1e-3), ("time_millis", 1e-3), ("micros", 1e-6), ("t_us", 1e-6), ("Time_s", 1.0)],
-)
-def test_an_arduino_s_times_are_known_by_their_name(tmp_path, column, unit):
-    log = table(tmp_path / "a.csv", column, unit)
-    found = begin(tmp_path / "w", log, kind="generic", inputs=["force"])
-    assert found.then.verb == "ingest" and found.dt < 2
-    assert grounded("-C", tmp_path / "w", "ingest", "--data", log).code == 0
-    (one,) = Workspace(tmp_path / "w").trials()
-    assert one.trial.steps * one.trial.dt == pytest.approx(20, abs=2.1)
 
 
 def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path):

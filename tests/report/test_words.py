@@ -4,20 +4,12 @@ import pytest
 
 from grounded.result import measured, measured_alike
 from grounded_trials.wording import (
-    count,
-    glued,
     labelled,
     per_second,
     percent,
-    ranges,
     shown,
     with_unit,
 )
-
-
-def test_one_trial_and_two_trials():
-    assert [count(n, "trial") for n in (0, 1, 2)] == ["0 trials", "1 trial", "2 trials"]
-    assert count(2, "crash", "crashes") == "2 crashes"
 
 
 def test_the_unit_one_is_not_printed():
@@ -40,23 +32,6 @@ def test_the_unit_one_is_not_printed():
 )
 def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
     assert per_second(unit) == rate
-
-
-@pytest.mark.parametrize(
-    "whole", ["v > 1.02", "0.5 N m s", "m +30 %", "a4 -1.5 %", "270 mm", "0.35 mrad", "2 ± 0.1 rad"]
-)
-def test_no_line_is_broken_inside_a_quantity(whole):
-    assert " " not in glued(whole)
-
-
-def test_trials_are_named_without_hiding_those_between():
-    names = ["t0001", *(f"t{k:04d}" for k in range(7, 17))]
-    assert ranges(names) == "t0001, t0007 to t0016"
-    assert ranges(names[:2]) == "t0001, t0007" and ranges(names[1:3]) == "t0007 and t0008"
-    assert ranges(names[:3]) == "t0001, t0007, t0008"
-    assert ranges(["t0001"]) == "t0001" and ranges(["a", "b"]) == "a, b"
-    odd = [f"t{k:04d}" for k in range(1, 22, 2)]
-    assert ranges(odd) == "t0001 to t0021 without 10"
 
 
 @pytest.mark.parametrize(

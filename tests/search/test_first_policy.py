@@ -52,15 +52,6 @@ def test_heading_and_speed_are_read_off_the_path():
     assert np.abs(np.diff(x[:, 4])).max() < 0.5
 
 
-def test_a_path_that_starts_at_rest_or_never_moves():
-    task = car_task("turn", car.model)
-    still = np.full_like(task.target, np.nan)
-    still[:, [2, 3]] = 0.0
-    reward = replace(task.reward, state=np.array([0, 0, 10.0, 10.0, 0, 0]))
-    guess = first_guess(replace(task, target=still, reward=reward))
-    assert np.isfinite(guess.cost)
-
-
 def test_the_start_heading_decides_which_turn():
     task = car_task("circle", car.model)
     start = np.array(task.start)

@@ -8,15 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded import Model
 from grounded.plant import Plant
 from grounded.search import making
 from grounded.search.ask_tell import Search
 from grounded.search.first_guess import filled_target
 from grounded.search.first_policy import first_policy
-from grounded.search.improve import propose
-from grounded.search.planner import planner_for
-from grounded.search.step.step_size import SearchOptions
 from grounded.solve import ddp
 from small_tasks import cart_task, drive, other
 
@@ -56,22 +52,6 @@ def test_only_columns_that_are_weighed_shape_the_guess(mechanisms):
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("trials", [1])
-def test_a_better_models_own_plan_is_a_rival(late_arm, trials):
-    task, search = late_arm.task, Search(late_arm.task)
-    for _ in range(trials):
-        search.tell(late_arm.run(search.ask()))
-    planner = planner_for(task, task.model, np.full(task.model.m, 0.03))
-    candidates, told = list(search.candidates), list(search.trials)
-    for _ in range(3):
-        made = propose(task, candidates, told, SearchOptions(), planner=planner).candidate
-        if made is not None:
-            candidates.append(made)
-            told.append(late_arm.run(made))
-    assert trials > 1 or candidates[1].way == "own plan"
-    assert max(map(task.utility, told)) > -0.125  # its optimum is -0.115
-
-
 def test_an_unstable_loop_gets_gentler_gains(late_arm):
     search = Search(late_arm.task)
     search.tell(late_arm.run(search.ask()))
@@ -104,19 +84,3 @@ def test_an_end_says_what_it_is(monkeypatch, gain, ending):
     assert search.ask() is None
     assert (search.standing.phase, search.standing.ending) == ("stopped", ending)
     assert search.standing.then.verb == "diagnose"
-
-
-def test_smaller_steps_hold_a_stiff_friction():
-    """Reason 7: one RK4 step a control step diverges on dry friction of width 0.035 at 26."""
-
-    def rate(s, a, p):
-        return {"v": a.u - 26.0 * np.tanh(s.v / 0.035)}
-
-    about = {"states": {"v": "m/s"}, "inputs": {"u": "N"}, "params": {}, "derivative": rate}
-    x = {}
-    for substeps in (1, 16):
-        model = Model(**about, substeps=substeps)
-        x[substeps] = np.array([[0.5]])
-        for _ in range(40):
-            x[substeps] = model.system.step(x[substeps], np.zeros((1, 1)), model.values, 0.05)
-    assert abs(x[16][0, 0]) < 1e-3 < 0.1 < abs(x[1][0, 0])

@@ -17,7 +17,7 @@ from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step.step_size import OTHER_WAY, SearchOptions
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
-from small_tasks import cart_task, drive, other, rover_task
+from small_tasks import cart_task, drive, other
 
 TASK = cart_task()
 PLANT = Plant(other(TASK.model, 1.6), latency={"force": 0.02})
@@ -115,14 +115,6 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     assert set(others) <= {"recorded inputs"} and len(others) <= OTHER_WAY
     ended = story.propose().standing
     assert (ended.phase, ended.ending) == ("converged", "no step improved")
-
-
-def test_steps_that_lose_what_they_promised_ask_for_a_diagnosis():
-    story = Story().add()
-    while story.propose().candidate is not None:
-        story.add(bad)
-    ended = story.propose().standing
-    assert ended.ending == "no step improved" and ended.then == NextCommand("diagnose")
 
 
 @pytest.mark.parametrize(("off", "asks"), [(0.5, False), (50.0, True)])
@@ -292,12 +284,6 @@ def test_a_run_whose_last_steps_were_not_recorded_did_not_crash():
     assert story.now.iteration == 1 and story.now.incumbent.trials[0].steps == TASK.horizon
 
 
-def test_with_repeats_a_single_crash_fails_the_candidate():
-    story = Story(repeats=3).add().add().add().add(cut)
-    assert story.now.history[-1].accepted is False and story.now.history[-1].utility == -np.inf
-    assert story.propose().is_new
-
-
 @pytest.mark.parametrize(("off", "repeats", "least"), [(0.3, 1, -1.35)])
 def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
     """The robot starts slightly (or far) off s_0. With the exact start: from -1.349 to -0.881."""
@@ -344,15 +330,6 @@ def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
     assert story.now.outstanding is made
 
 
-def test_an_outstanding_candidate_of_another_model_is_made_again():
-    story = Story().add()
-    story.propose()
-    story.task = story.task.with_model(other(TASK.model, 1.3))
-    assert story.now.phase == "propose"
-    made = story.propose()
-    assert made.is_new and made.candidate.id == "c0003" and made.candidate.base == "c0001"
-
-
 def test_trials_of_no_candidate_are_ignored():
     story = Story().add()
     before = story.now
@@ -383,17 +360,6 @@ def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
     b = replace(a, start_inputs=np.array([3.0]))
     np.testing.assert_array_equal(mean_trial([a, b], none).start_inputs, [2.0])
     assert mean_trial([a, replace(a, start_inputs=None)], none).start_inputs is None
-
-
-def test_headings_that_wrap_between_repeats_do_not_spoil_the_mean():
-    """Logs may differ by a full turn: their mean is not half a turn off."""
-    task = rover_task()
-    policy = task.policy(np.full((60, 2), 0.5), None, None)
-    one = Plant(task.model).run(policy, {}, np.random.default_rng(0))
-    states = np.array(one.states)
-    states[:, 2] += 2 * np.pi
-    mean = mean_trial([one, replace(one, states=states)], task.model.angle_mask)
-    assert np.abs(task.model.difference(mean.states, one.states)).max() < 1e-9
 
 
 EVENTS = {

@@ -11,8 +11,7 @@ from grounded.search.ask_tell import Search, learn
 from grounded.search.candidate import BY_STEP, Tried
 from grounded.search.feedback.margin import worse_costs
 from grounded.search.planner import Planner, predicted
-from grounded.search.standing import standing
-from grounded.search.step.by_step import PRICES, Told, believed_by_step, worth
+from grounded.search.step.by_step import PRICES, Told, worth
 from grounded.search.step.corrected import Corrected, runs
 from grounded.search.step.mispredictions import Seen, seen
 from grounded.search.step.step_size import SearchOptions, Step
@@ -160,19 +159,3 @@ def test_they_wait_until_two_steps_have_lost(grounded, lost, options, error, ste
     incumbent = replace(best, deviation=error)
     model = best.candidate.model
     assert options.due(losing(search, lost), incumbent, model, BY_STEP) == step
-
-
-def test_one_other_trial_is_too_few(grounded):
-    search, best, problem = grounded
-    assert believed_by_step(Planner(TASK, TASK), best, search.standing.history, problem) is None
-
-
-def test_small_gains_before_the_first_of_them_do_not_end_the_search(story):
-    """Patience starts anew with other derivatives."""
-    by_step = [t.candidate.way == BY_STEP and bool(t.accepted) for t in story.history]
-    known = story.history[: by_step.index(True) + 1]
-    candidates = [t.candidate for t in known]
-    trials = [trial for t in known for trial in t.trials]
-    options = SearchOptions(tolerance=0.5)  # all gains are small
-    now = standing(TASK, candidates, trials, options, candidates[0].model)
-    assert now.phase == "propose"

@@ -102,14 +102,6 @@ def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     assert w.propose().notes == ()  # said once
 
 
-def test_another_target_makes_it_void_too(w, tmp_path):
-    configure(w, CONFIG.replace("x = 10.0", "x = 11.0"))
-    refused(w, tmp_path, "c0001", "task")  # though the limits hold
-    (note,) = w.propose().notes
-    assert holds(note, "c0001", "void", "c0002")
-    assert w.export("c0001", tmp_path / "c.json", anyway=True).overridden
-
-
 def test_safety_holds_for_the_run_as_the_model_of_today_predicts_it(ran):
     best = ran.status().standing.incumbent
     real = float(best.trials[0].states[:, 0].max())
@@ -148,14 +140,6 @@ def test_what_is_to_be_run_once_more_is_not_replaced_but_refused(tmp_path):
     with pytest.raises(GroundedError, match=holding("c0001", "1 trial", "[safety]", "--anyway")):
         w.propose()
     assert w.run(anyway=True).overridden and len(w.candidate_ids()) == 1
-
-
-def test_a_model_that_was_changed_makes_an_unrun_candidate_void(w, tmp_path):
-    configure(w, model=MODEL.replace("Param(1.0", "Param(1.2"))
-    refused(w, tmp_path, "c0001", "model")
-    made = w.propose()
-    (note,) = made.notes
-    assert made.candidate.id == "c0002" and holds(note, "c0001", "void", "model")
 
 
 @pytest.mark.parametrize(("checksum", "anyway"), [("old", True), ("new", True), ("none", False)])

@@ -98,17 +98,6 @@ def test_a_speed_is_the_slope_of_its_position_where_the_model_is_off_for_long(tm
     assert np.sqrt(np.mean(error**2)) < (0.03 if process else 0.045)
 
 
-def test_a_process_noise_that_is_given_is_that_of_a_control_step(task):
-    """With hardly any, the speed is the model's; with much, it follows the samples."""
-    logged, t, v = driven()
-    errors = {}
-    for std in (1e-5, 5.0):
-        given = EstimateTable({"x": 0.002}, {"x": 1e-6, "v": std})
-        errors[std] = off(with_estimates(logged, given, task), t, v)[0]
-    rough = {k: np.std(np.diff(e)) for k, e in errors.items()}
-    assert rough[5.0] > 10 * rough[1e-5]
-
-
 def test_nothing_is_estimated_where_everything_is_measured(task):
     logged, t, v = driven()
     logged["v"] = series(t[::10], v[::10], "/csv.v")
@@ -186,29 +175,6 @@ def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
     w = Workspace(make(tmp_path / "w", config=config).folder)
     (told,) = of_code(w.ingest(tmp_path / "all.csv", data=True), "log.unread")
     assert told.about == ("v",)
-
-
-def late(before, until=3.0, delay=0.06, held=0.0, v=0.0, seed=0):
-    """A log of a cart that receives its commands late; `before` of it, they were those held."""
-    t = np.arange(-1.0, until, fine := 1e-3)
-    sent = np.where(t < 0, held, 3.0 * np.cos(np.floor(t / 0.05) * 0.05))
-    x, path = 0.0, []
-    for u in np.interp(t - delay, t, sent):
-        path.append((x, v))
-        x, v = x + fine * v, v + fine * (u - 0.4 * v)
-    x, v = np.transpose(path)
-    at = np.arange(round((1.0 - before) / fine), len(t), 10)
-    noise = np.random.default_rng(seed).normal(0, 0.002, len(at))
-    log = {"x": series(t[at] + 1, x[at] + noise), "force": series(t[at] + 1, sent[at], "/csv.f")}
-    return log, t + 1, v
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_a_log_that_begins_with_a_run_knows_what_was_held_before(task, seed):
-    task = replace(task, latency=np.array([0.06]))
-    logged, t, v = late(0.0, seed=seed)
-    error, at = off(with_estimates(logged, TABLE, task), t, v)
-    assert np.abs(error[at < 1.2]).max() < 0.02
 
 
 def test_seconds_under_a_column_of_milliseconds_are_told(task):
