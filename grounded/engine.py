@@ -63,17 +63,25 @@ def _keep_pages() -> None:
     mallopt(TRIM, LARGE)
 
 
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except (AttributeError, OSError):  # not Linux
+        return os.cpu_count() or 1
+
+
 def idle() -> int:
     """Return the number of processors that nobody else uses now, at least 1; all if unknown."""
+    here, busy = cores(), list[int]()
     try:
-        here, busy = len(os.sched_getaffinity(0)), []
         for _ in range(LOOKS):
             states = [stat.read_text().rpartition(")")[2] for stat in TASKS.glob("*/stat")]
             mine = sum(state.startswith(" R") for state in states)
             busy.append(int(LOAD.read_text().split()[3].partition("/")[0]) - mine)
             time.sleep(LOOK_S)
-    except (AttributeError, OSError):  # not Linux
-        return os.cpu_count() or 1
+    except OSError:  # not Linux
+        return here
     return max(1, here - sorted(busy)[LOOKS // 2])
 
 

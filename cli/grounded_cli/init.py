@@ -21,6 +21,7 @@ from grounded_cli.console.terminal import (
     sentence,
     show,
     show_json,
+    tell,
 )
 from grounded_cli.console.workspace_option import next_line
 
@@ -182,18 +183,24 @@ def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> Non
     if model is None:
         raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
     from grounded_trials import Workspace
+    from grounded_trials.starting.blank import left_open
 
     made = Workspace.create(folder, model=model, dt=dt)
+    notes = left_open(made.base_model)
     if json_:
-        show_json({"workspace": folder, "model": model})
+        findings = [one.to_json() for one in notes]
+        show_json({"workspace": folder, "model": model, "findings": findings})
         return
     show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
     show("  grounded.toml  dt, start, the input held before it, weights, limits")
     show("  target.csv     the desired states over time")
     show("  drive.py       measure() and send() of your robot")
-    if held := made.config.task.start:
+    tell(notes)
+    inputs, start = made.base_model.input_names, made.config.task.start
+    if held := {name: value for name, value in start.items() if name in inputs}:
         told = ", ".join(f"{name} = {value:.6g}" for name, value in held.items())
-        sentence(f"{told} holds the model at zero: [task] start sets it as the input before a run")
+        where = "at its start" if len(held) < len(start) else "at zero"
+        sentence(f"{told} holds the model {where}: [task] start sets it as the input before a run")
     where = f"cd {shlex.quote(folder)} && " * (folder != ".")
     show(f"\nnext: edit these, then {where}grounded propose")
 

@@ -13,7 +13,7 @@
 | actuator `motor`       | input `motor` (`motor_ctrl` if a state has that name); in N m or N if  |
 |                        | the control is the force itself: gear and gain 1                       |
 | joint torque           | input `elbow_torque`, `slider_force`                                   |
-| parameter "pole.mass"  | `pole_mass`                                                            |
+| parameter "pole.mass"  | `pole_mass`; of a body without mass, that of a payload at its centre   |
 
 Velocities are MuJoCo's qvel. A step depends only on the state: the constraint solver starts without
 a warm start at every control step, so equal samples give bit-identical results, alone or in a
@@ -25,12 +25,13 @@ from __future__ import annotations
 import copy
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.adapters.beside import located
 from grounded.adapters.mujoco_body import MujocoBody
@@ -43,13 +44,17 @@ from grounded.adapters.mujoco_names import (
     Setting,
     controls_of,
     joint_name,
+    kept_states,
     limits_of,
+    ranges_of,
     setting_of,
     states_of,
+    unmoved_joints,
 )
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
 from grounded.compile.run.differenced import stencil
+from grounded.engine import cores
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
@@ -69,6 +74,7 @@ def model(
     *,
     params: Sequence[str] | Mapping[str, float | tuple[float, ...]] = (),
     inputs: str | Sequence[str] = "auto",
+    without: str | Sequence[str] = (),
     timestep: float | None = None,
     reference: str | Sequence[float] | None = None,
     threads: int | None = None,
@@ -87,6 +93,9 @@ def model(
             (value, low, high) also sets its value. Other values are taken from the file.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
             joints driven by a torque, or "auto": actuators if there are any, else torques.
+        without: joints that stay where the reference pose has them and are no states; "unmoved":
+            those that no actuator can move, such as a goal marker's, as nothing connects them to
+            one and their geoms touch nothing. Without actuators, torques drive all joints.
         timestep: simulation step [s] in place of the file's; dt must be a whole multiple of it to
             within 0.1 %, and the rest is distributed over its steps.
         reference: pose that rotation vectors refer to: qpos (nq,) or the name of a keyframe; None
@@ -104,19 +113,24 @@ def model(
     if timestep is not None:
         compiled.opt.timestep = timestep
     coordinates = _coordinates(compiled, _reference(compiled, reference))
-    states = states_of(compiled)
-    controls = controls_of(compiled, inputs, states)
+    every = states_of(compiled)
+    controls = controls_of(compiled, inputs, every)
+    left_out = unmoved_joints(compiled) if isinstance(without, str) else tuple(without)
+    kept = kept_states(compiled, left_out)
+    states = {name: unit for (name, unit), keep in zip(every.items(), kept, strict=True) if keep}
     named = params if isinstance(params, Mapping) else dict.fromkeys(params, None)
     settings = [setting_of(mj, compiled, spec) for spec in named]
     values = {s.name: s.param(given) for s, given in zip(settings, named.values(), strict=True)}
-    several = threads or min(os.cpu_count() or 1, MOST_THREADS)
-    stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, several)
+    several = threads or min(cores(), MOST_THREADS)
+    stepper = MujocoStepper(compiled, coordinates, states, kept, controls, settings, several)
+    stepper.without = left_out
     stepper.source = None if str(xml).lstrip().startswith("<") else located(xml).resolve()
-    angles = [
+    free = [
         joint_name(compiled, j)
         for j in range(compiled.njnt)
         if compiled.jnt_type[j] > SLIDE and not compiled.jnt_limited[j]
     ]
+    angles = [name for name in free if name in states]
     return model_of(
         stepper,
         states=states,
@@ -145,25 +159,31 @@ class MujocoStepper(Stepper):
     """Computes control steps of MuJoCo for many samples at a time."""
 
     source: Path | None = None  # the file that it was loaded from
+    differenced = True
 
     def __init__(
         self,
         compiled: Any,
         coordinates: Coordinates,
-        states: Sequence[str],
+        states: Iterable[str],
+        kept: NDArray[np.bool_],  # of the file's states, those of the model
         controls: Controls,
         settings: Sequence[Setting],
         threads: int,
     ) -> None:
         super().__init__(states, controls.names, [s.name for s in settings])
         mj = library("mujoco")
+        self._kept = np.flatnonzero(kept)
+        pose = coordinates.from_qpos(coordinates.reference[None], np.zeros((1, compiled.nv)))[0]
+        self._still = np.append(pose, np.zeros(compiled.nv + compiled.na))
         self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
         self.threads = threads
         self._model = copy.deepcopy(compiled)  # private: parameters are written into it
         self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
         self._made = np.array([s.nominal for s in settings])  # its current parameters
-        spans = [self.limits.get(name, (-np.inf, np.inf)) for name in (*states, *controls.names)]
+        both = (*self.states, *self.inputs)
+        spans = [self.limits.get(name, (-np.inf, np.inf)) for name in both]
         self._spans = np.array(spans).T  # (2, n + m), the lowest and the highest
         self._prepare()
 
@@ -201,11 +221,30 @@ class MujocoStepper(Stepper):
         return limits_of(self._model, self.controls)
 
     @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Ranges (low, high) by name, of hinges and slides that the file limits."""
+        found = ranges_of(self._model)
+        return {name: span for name, span in found.items() if name in self.states}
+
+    @property
+    def masses(self) -> dict[str, float]:
+        """Masses [kg] by the names of the file's bodies."""
+        bodies = map(self._model.body, range(1, self._model.nbody))
+        return {body.name: float(body.mass[0]) for body in bodies if body.name}
+
+    @property
     def body(self) -> MujocoBody:
         """The body to draw in pictures."""
         mj = library("mujoco")
         compiled = copy.deepcopy(self._model)
-        return MujocoBody(compiled, mj.MjData(compiled), self.coordinates, mj.mj_kinematics)
+        data = mj.MjData(compiled)
+        return MujocoBody(compiled, data, self.coordinates, mj.mj_kinematics, self._whole)
+
+    def _whole(self, x: Array) -> Array:
+        """Return all states of the file, (N, nv + nv + na), for those of the model, (N, n)."""
+        whole = np.tile(self._still, (len(x), 1))
+        whole[:, self._kept] = x
+        return whole
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """Return the next states (N, n); NaN for unstable samples."""
@@ -271,6 +310,57 @@ class MujocoStepper(Stepper):
         J = ((y[1:] - y[0]) / width[:, :, None]).transpose(1, 2, 0)
         return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
 
+    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
+        """Return the inputs (N, m) of MuJoCo's inverse dynamics, inside their limits.
+
+        They give the mean acceleration of the control step at its start; between the torques that
+        are asked for and the inputs is a linear map, which is read off two evaluations. None for
+        actuators with a state, and where torques do not follow their controls linearly.
+        """
+        if self._model.na:
+            return None
+        nv, mj = self._model.nv, library("mujoco")
+        x, after = self._whole(x), self._whole(after)
+        rate = (after[:, nv:] - x[:, nv:]) / dt
+        found = np.empty((len(x), len(self.inputs)))
+        with self._lock, _quiet():
+            self._set(p)
+            model, data = self._model, mj.MjData(self._model)
+            for k, qpos in enumerate(self.coordinates.to_qpos(x[:, :nv])):
+                data.qpos[:], data.qvel[:], data.qacc[:] = qpos, x[k, nv:], rate[k]
+                mj.mj_inverse(model, data)
+                asked = data.qfrc_inverse.copy()
+                u = self._controls_for(model, data, asked)
+                if u is None:
+                    return None
+                found[k] = u
+        return found
+
+    def _controls_for(self, model: Any, data: Any, asked: Array) -> Array | None:
+        """Return controls (m,) inside their limits, for the torques nearest to those asked (nv,).
+
+        None if torques don't follow the controls linearly.
+        """
+        columns = list(self.controls.columns)
+        if self.controls.torques:
+            return np.array(np.clip(asked[columns], *self._spans[:, -len(columns) :]))
+        mj = library("mujoco")
+
+        def torques(u: Array) -> Array:
+            data.ctrl[columns] = u
+            mj.mj_fwdActuation(model, data)
+            return np.array(data.qfrc_actuator)
+
+        m = len(columns)
+        own = torques(np.zeros(m))
+        sent = self._spans[:, -m:]
+        unit = np.where(np.isfinite(sent[1]) & (sent[1] > 0), sent[1], 1.0)
+        by = np.column_stack([torques(row) - own for row in np.diag(unit)]) / unit
+        u = np.linalg.lstsq(by, asked - own, rcond=None)[0]
+        inside = np.array(np.clip(u, *sent))
+        linear = np.allclose(torques(inside), own + by @ inside, rtol=1e-3, atol=1e-9)
+        return inside if linear else None
+
     def _substeps(self, dt: float) -> tuple[int, float]:
         """Return the number of simulation steps in a control step, and their length [s].
 
@@ -310,6 +400,7 @@ class MujocoStepper(Stepper):
     def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
         """Run simulation steps; `models` is one model, or a list with one for each sample."""
         mj, compiled, nv = library("mujoco"), self._model, self._model.nv
+        x = self._whole(x)
         given = np.hstack([x, u])
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
         x, u = np.where(wild, 0.0, x), np.where(wild, 0.0, u)
@@ -333,7 +424,7 @@ class MujocoStepper(Stepper):
         h = (models[0] if isinstance(models, list) else models).opt.timestep
         stopped = last[:, :1] < (steps - 0.5) * h  # MuJoCo stopped an unstable sample
         wild = wild | stopped | ~(np.abs(moved) < HUGE).all(axis=1, keepdims=True)
-        return np.where(wild, np.nan, moved)
+        return np.where(wild, np.nan, moved)[:, self._kept]
 
 
 @contextmanager

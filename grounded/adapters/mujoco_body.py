@@ -5,6 +5,7 @@ A body without geoms is drawn as the box of its inertia, with a rod from its joi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,16 @@ class MujocoBody:
 
     unit, watched = "m", "the last body's centre of mass"
 
-    def __init__(self, compiled: Any, data: Any, coordinates: Coordinates, kinematics: Any) -> None:
+    def __init__(
+        self,
+        compiled: Any,
+        data: Any,
+        coordinates: Coordinates,
+        kinematics: Any,
+        whole: Callable[[Array], Array],  # from a Model's states to all of the file's
+    ) -> None:
         self._model, self._data, self._coordinates = compiled, data, coordinates
+        self._whole = whole
         self._kinematics = kinematics  # mj_kinematics
         shown = [g for g in range(compiled.ngeom) if _shown(compiled, g)]
         self._geoms = [g for g in shown if compiled.geom_type[g] in _SHAPES]
@@ -68,15 +77,16 @@ class MujocoBody:
     def path(self, states: Array) -> Array:
         """Return positions (T, 3) of the last body's centre of mass; NaN if a joint is unknown."""
         found = np.full((len(states), 3), np.nan)
-        nv = self._model.nv
-        for t in np.flatnonzero(np.isfinite(states[:, :nv]).all(axis=1)):
+        positions = self._whole(np.asarray(states, float))[:, : self._model.nv]
+        for t in np.flatnonzero(np.isfinite(positions).all(axis=1)):
             self._data.qpos[:] = self._positions(states[t : t + 1])[0]
             self._kinematics(self._model, self._data)
             found[t] = self._data.xipos[self._watched]
         return found
 
     def _positions(self, states: Array) -> Array:
-        return self._coordinates.to_qpos(np.asarray(states, float)[:, : self._model.nv])
+        positions = self._whole(np.asarray(states, float))[:, : self._model.nv]
+        return self._coordinates.to_qpos(positions)
 
     def _along(self, body: int) -> Array:
         """Return axes (3, 3) whose z points from a body's frame to its centre of mass."""

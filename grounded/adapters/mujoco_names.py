@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Param
@@ -54,6 +55,86 @@ def states_of(compiled: Any) -> dict[str, str]:
         name = f"{_actuator_name(compiled, i)}_act"
         activations |= {f"{name}{k or ''}": "1" for k in range(count)}
     return positions | velocities | activations
+
+
+def kept_states(compiled: Any, without: Sequence[str]) -> NDArray[np.bool_]:
+    """Return which of the file's states are the model's, (nv + nv + na,).
+
+    Args:
+        compiled: the compiled file.
+        without: names of joints that are no states.
+
+    Raises:
+        GroundedError: for an unknown joint, or if no state is left.
+    """
+    names = [joint_name(compiled, j) for j in range(compiled.njnt)]
+    for name in without:
+        if name not in names:
+            raise GroundedError(f"without: there is no joint '{name}': {nearest(name, names)}")
+    moving = np.array([names[j] not in without for j in compiled.dof_jntid], bool)
+    if not moving.any():
+        raise GroundedError("without names all joints: at least one must be left as a state")
+    activations = len(states_of(compiled)) - 2 * compiled.nv
+    return np.concatenate([moving, moving, np.ones(activations, bool)])
+
+
+def ranges_of(compiled: Any) -> dict[str, tuple[float, float]]:
+    """Return (low, high) by name of every hinge and slide that the file limits."""
+    single = (compiled.jnt_type >= SLIDE) & (compiled.jnt_limited != 0)
+    return {
+        joint_name(compiled, int(j)): (
+            float(compiled.jnt_range[j, 0]),
+            float(compiled.jnt_range[j, 1]),
+        )
+        for j in np.flatnonzero(single)
+    }
+
+
+def unmoved_joints(compiled: Any) -> tuple[str, ...]:
+    """Return the joints that no actuator can move, see `mujoco.model`."""
+    driven = _driven_trees(compiled)
+    if not driven.any():
+        return ()
+    still = [j for j in range(compiled.njnt) if not driven[_tree(compiled, j)]]
+    return tuple(joint_name(compiled, j) for j in still)
+
+
+def _driven_trees(compiled: Any) -> NDArray[np.bool_]:
+    """Return which kinematic trees an actuator, a tendon, an equality or a contact may move."""
+    driven = np.zeros(compiled.ntree, bool)
+    if not compiled.nu:
+        return driven
+    import mujoco  # type: ignore[import-untyped]
+
+    # what touches, as far as the file lets any geom touch another one
+    if not compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT.value:
+        touches = (compiled.geom_contype != 0) | (compiled.geom_conaffinity != 0)
+        trees = compiled.body_treeid[compiled.geom_bodyid[touches]]
+        driven[trees[trees >= 0]] = True
+    # what tendons and equalities connect is not followed: all that they name may move
+    wrapped = compiled.wrap_type
+    of = np.full(compiled.nwrap, -1)  # the body of each
+    joints = wrapped == mujoco.mjtWrap.mjWRAP_JOINT.value
+    sites = wrapped == mujoco.mjtWrap.mjWRAP_SITE.value
+    of[joints] = compiled.jnt_bodyid[compiled.wrap_objid[joints]]
+    of[sites] = compiled.site_bodyid[compiled.wrap_objid[sites]]
+    trees = compiled.body_treeid[of[of >= 0]]
+    driven[trees[trees >= 0]] = True
+    if compiled.neq:
+        driven[:] = True
+    # the slopes of joint torques by the controls
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    moment = np.zeros((len(data.moment_rownnz), compiled.nv))
+    mujoco.mju_sparse2dense(
+        moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+    )
+    driven[compiled.dof_treeid[(moment != 0).any(axis=0)]] = True
+    return driven
+
+
+def _tree(compiled: Any, j: int) -> int:
+    return int(compiled.dof_treeid[compiled.jnt_dofadr[j]])
 
 
 def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str, str]) -> Controls:
@@ -128,7 +209,7 @@ def _actuator_name(compiled: Any, i: int) -> str:
 
 def _effort(compiled: Any, i: int) -> str:
     """Return the unit of an actuator's control: N m or N if it is the force on a joint, else 1."""
-    import mujoco  # type: ignore[import-untyped]
+    import mujoco
 
     single = compiled.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     straight = (
@@ -239,9 +320,7 @@ def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
         unit = SLIDE_UNITS[unit]
     array, index, factor = places[0]
     nominal = float(np.ravel(getattr(compiled, array)[index])[0]) / factor
-    if name == "mass":
-        if nominal <= 0:
-            raise GroundedError(f"'{spec}': the body '{element}' has no mass")
+    if name == "mass" and nominal > 0:  # else a payload, taken as a point at the body's centre
         inertia = np.array(compiled.body_inertia[at]) / nominal
         places = (*places, ("body_inertia", at, inertia))
     return Setting(spec, identifier(f"{element}_{name}"), unit, nominal, places)

@@ -24,6 +24,9 @@ class Stepper:
     def __init__(self, states: Iterable[str], inputs: Iterable[str], params: Iterable[str]) -> None:
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
 
+    differenced = False  # whether `derivatives` are differences of `advance`
+    without: tuple[str, ...] = ()  # joints of the model's file that are no states
+
     @property
     def body(self) -> Body | None:
         """The body to draw in pictures; None if there is none."""
@@ -33,6 +36,15 @@ class Stepper:
     def limits(self) -> Mapping[str, tuple[float, float]]:
         """Limits (low, high) by name, of those inputs that the model's file limits."""
         return {}
+
+    @property
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Ranges (low, high) by name, of those states that the model's file limits."""
+        return {}
+
+    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
+        """Return inputs (N, m) that lead from x (N, n) to about `after` (N, n); None if unknown."""
+        return None
 
     def __call__(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float

@@ -271,6 +271,11 @@ class System(ABC):
     states: tuple[str, ...]  # names, for messages
     inputs: tuple[str, ...]
 
+    @property
+    def simulated(self) -> bool:
+        """Whether each step is a call of the user's function: a simulator's takes milliseconds."""
+        return self.how == "differenced"
+
     @abstractmethod
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """From x (N, n), u (N, m) to the next x (N, n)."""
@@ -295,6 +300,10 @@ class System(ABC):
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
         """Where the user's function makes a number that is not finite, x (n,), u (m,); or ""."""
         return ""
+
+    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
+        """Inputs (N, m) that lead from x (N, n) to about `after` (N, n); None where unknown."""
+        return None
 
     def linearise(
         self,

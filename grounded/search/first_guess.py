@@ -18,11 +18,15 @@ The trim is solved by Levenberg-Marquardt for many steps at once, with inputs in
 It starts from several inputs, because a stalled motor has no slope. Then every step is tried again
 with one input reset (if there are few inputs and the starts ended in different minima), and from
 the solutions of its neighbours, because a manoeuvre is continuous and bad local minima rarely are.
+
+A simulator takes milliseconds a step. There few steps are solved, each once; the inputs of the
+others are those of its own inverse dynamics, where it has them, plus interpolated corrections.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +44,8 @@ FEW = 8  # inputs are reset one by one if there are at most so many
 FREE_WEIGHT = 0.3  # weight of the equations of free states, below that of prescribed ones
 KNOTS = 250  # steps that are solved from scratch; the others start from their neighbours
 ALIKE = 1e-3  # relative difference of errors below which two results are the same minimum
+FEW_KNOTS, FEW_STARTS = 12, 2  # KNOTS and STARTS of a simulator
+CLOSE = 1e-2  # EXACT for a simulator
 EXACT = 1e-12  # squared error, relative to the mean squared rate, at which a trim is accepted
 
 
@@ -128,12 +134,20 @@ def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
         x (H, n) with the free columns filled in, u (H, m).
     """
     H, free = task.horizon, np.flatnonzero(~known)
-    batch = _steps(task, x, known)
-    knots = np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int)  # at least a step apart
-    coarse = _from_scratch(task, batch, x[knots][:, free], knots)
-    at = np.arange(H)
-    w = np.column_stack([np.interp(at, knots, column) for column in coarse.w.T])
-    if len(knots) < H:
+    batch, simulated = _steps(task, x, known), task.model.system.simulated
+    most = FEW_KNOTS if simulated else KNOTS
+    knots = np.linspace(0, H - 1, min(H, most)).round().astype(int)  # at least a step apart
+    some, each = _distinct(x, knots) if simulated else (knots, np.arange(len(knots)))
+    known_inputs = _inverse(task, x)
+    starts = _starts(task, known_inputs, some)
+    coarse = _from_scratch(task, batch, x[some][:, free], some, starts)
+    w = coarse.w[each]
+    at, base = np.arange(H), np.zeros((H, w.shape[1]))
+    if known_inputs is not None:
+        base[:, len(free) :] = known_inputs
+    w = base + np.column_stack([np.interp(at, knots, c) for c in (w - base[knots]).T])
+    w[:, len(free) :] = np.clip(w[:, len(free) :], task.low, task.high)
+    if len(knots) < H and not simulated:
         w = solve(batch, w, at, MORE).w
     filled = x[:-1].copy()
     filled[:, free] = w[:, : len(free)]
@@ -166,20 +180,42 @@ def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
         return J
 
     rate = np.diff(x, axis=0)[:, known] / problem.dt
-    nowhere = np.full(len(free), np.inf)
+    nowhere, enough = np.full(len(free), np.inf), CLOSE if problem.system.simulated else EXACT
     return LeastSquares(
         residual,
         jacobian,
         low=np.append(-nowhere, task.low),
         high=np.append(nowhere, task.high),
-        solved=EXACT * (float(np.mean(rate**2)) + 1e-12),
+        solved=enough * (float(np.mean(rate**2)) + 1e-12),
     )
 
 
-def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -> Minimum:
-    """Solve from several inputs, then with one input reset, then from neighbouring solutions."""
+def _distinct(x: Array, knots: Rows) -> tuple[Rows, Rows]:
+    """Return the knots whose steps differ, and where in them each knot's step is."""
+    pairs = np.hstack([x[knots], x[knots + 1]])
+    _, first, each = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    order = np.sort(first)
+    return knots[order], np.searchsorted(order, first[each.reshape(-1)])
+
+
+def _inverse(task: Task, x: Array) -> Array | None:
+    """Return the inputs (H, m) of the model's own inverse dynamics along x (H + 1, n), if any."""
+    found = task.model.system.inverse(x[:-1], x[1:], task.model.values, task.dt)
+    return None if found is None else np.clip(found, task.low, task.high)
+
+
+def _starts(task: Task, known: Array | None, knots: Rows) -> list[Array]:
+    """Return several inputs (len(knots), m) from which the steps at the knots are solved."""
     held = np.tile(np.clip(task.past, task.low, task.high), (len(knots), 1))
-    starts = [_toward_limit(task, held, part) for part in STARTS]
+    parts = STARTS[:FEW_STARTS] if task.model.system.simulated else STARTS
+    starts = [_toward_limit(task, held, part) for part in parts]
+    return starts if known is None else [known[knots], starts[0]]
+
+
+def _from_scratch(
+    task: Task, batch: LeastSquares, states: Array, knots: Rows, starts: Sequence[Array]
+) -> Minimum:
+    """Solve from several inputs, then with one input reset, then from neighbouring solutions."""
     best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
 
     def again(w: Array, iterations: int, wanted: NDArray[np.bool_]) -> tuple[Minimum, Array]:
@@ -198,7 +234,8 @@ def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -
         best, reached = again(np.hstack([states, start]), ITERATIONS, everywhere)
         ends.append(reached)
     differ = ~(np.max(ends, axis=0) <= (1 + ALIKE) * best.error)
-    for j in range(task.model.m if task.model.m <= FEW else 0):
+    resets = task.model.m if task.model.m <= FEW and not task.model.system.simulated else 0
+    for j in range(resets):
         for start in starts:
             w = best.w.copy()
             w[:, states.shape[1] + j] = start[:, j]

@@ -15,6 +15,11 @@ starts, and the plan with the lowest cost is taken:
     wider friction   an adopted dry friction with a wider transition, narrowed step by step:
                      a joint that sticks has no slope
 
+A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
+iteration promises less than ROUGH of its cost, and a rival gets as many iterations as the reference
+took. Its slopes are differences, which a joint that sticks or a contact makes wrong: smaller
+promises are often not kept, and such a search would go on for as long again.
+
 A plan is made in a model with smoothed kinks and run in one without smoothing. If its run there
 costs much more, it is re-solved while the smoothing is reduced (`_sharpened`).
 """
@@ -49,6 +54,7 @@ SKETCH, PROMISING = 40, 1.3  # after so many iterations, a plan above this facto
 MORE_WORK = 2e8  # budget for MANY, in the same units
 WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry friction builds up over
 FOLLOWED = 200  # iterations of DDP for each of them
+ROUGH = 1e-3  # relative gain of an iteration below which a simulator's plan is done
 BLUNT = 1.2  # cost ratio, unsmoothed over smoothed, above which a plan is re-solved
 SHARPER = (0.5, 0.25, 0.1, 0.03, 0.01, 0.0)  # factors on the smoothing width
 FEWEST = 10  # a rival is not started with fewer iterations than this
@@ -83,6 +89,8 @@ def first_policy(
     rivals = list(_rivals(task))
     size = problem.horizon * (problem.nz + task.model.m) ** 2
     share = WORK / (len(rivals) * size)
+    if problem.system.simulated:
+        share = len(best.trace)
     most = int(np.clip(share, FEWEST, ITERATIONS))
     elsewhere = False
     for inputs in rivals if share >= FEWEST else rivals[:2]:
@@ -206,15 +214,22 @@ def finished(
         K: (H, m, nz) feedback of the first rollout, about `z`.
         z: (H, nz), see `K`.
         most: most iterations.
-        tick: called with a line of progress after each piece.
+        tick: called with a line of progress after each piece, of a simulator each iteration.
     """
+
+    def told(count: int, cost: float) -> None:
+        if tick is not None:
+            tick(f"planning: {count} iterations, cost {cost:.4g}")
+
     piece = int(np.clip(AT_ONCE / problem.horizon, 1, most))
-    result = ddp.solve(problem, inputs, K, z, DescentOptions(max_iterations=piece))
+    options = DescentOptions(max_iterations=piece)
+    if problem.system.simulated:
+        options = DescentOptions(max_iterations=most, tolerance=ROUGH)
+    result = ddp.solve(problem, inputs, K, z, options, told)
     trace = list(result.trace)
     while result.status == "max iterations" and len(trace) < most:
-        if tick is not None:
-            tick(f"planning: {len(trace)} iterations, cost {result.cost:.4g}")
-        options = DescentOptions(max_iterations=min(piece, most - len(trace)))
+        told(len(trace), result.cost)
+        options = replace(options, max_iterations=min(piece, most - len(trace)))
         result = ddp.solve(problem, result.u, result.K, result.z[:-1], options)
         trace += result.trace
     return replace(

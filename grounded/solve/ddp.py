@@ -28,6 +28,7 @@ kernel); `sweep` here makes it succeed, by raising mu until every Q_uu is positi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,6 +85,7 @@ def solve(
     K: Array | None = None,
     zbar: Array | None = None,
     options: DescentOptions | None = None,
+    each: Callable[[int, float], None] | None = None,
 ) -> Solution:
     """DDP from the rollout of ubar (H, m), or of the policy ubar + K (z - zbar).
 
@@ -93,6 +95,7 @@ def solve(
         K: (H, m, nz) feedback of the first rollout only.
         zbar: (H, nz) or (H+1, nz), the reference of K.
         options: settings.
+        each: called with the number of iterations so far and the cost; not by compiled systems.
 
     Raises:
         GroundedError: for arrays that do not fit the problem.
@@ -101,7 +104,7 @@ def solve(
     _check(problem, ubar, K, zbar)
     first = Controls(ubar, K, zbar)
     found = problem.system.descend(problem, first, options)
-    return _solution(problem, found or descended(problem, first, options))
+    return _solution(problem, found or descended(problem, first, options, each))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +115,12 @@ class _State:
     mu: float
 
 
-def descended(problem: Problem, first: Controls, options: DescentOptions) -> Descent:
+def descended(
+    problem: Problem,
+    first: Controls,
+    options: DescentOptions,
+    each: Callable[[int, float], None] | None = None,
+) -> Descent:
     """The loop of `solve`; a compiled system has the same in one kernel (`System.descend`)."""
     run = problem.system.rollout(problem, *first)
     state = _State(run.z[0], run.u[0], float(run.cost[0]), 0.0)
@@ -138,6 +146,8 @@ def descended(problem: Problem, first: Controls, options: DescentOptions) -> Des
             return ended("max iterations")
         state, alpha = _search(problem, state, found, options)
         lines.append((state.cost, gains.d1 + gains.d2, alpha, found.mu))
+        if each is not None:
+            each(len(lines), state.cost)
         if alpha == 0.0 and state.mu > CEILING:
             return ended("no improvement")
 

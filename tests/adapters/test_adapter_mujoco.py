@@ -359,3 +359,65 @@ def test_a_model_file_names_its_files_beside_it(
     assert {path for _, path in read} == {robot / "a.xml", robot / "parts" / "drives.xml"}
     (elsewhere / "a.xml").write_text(PENDULUM)
     assert adapter.model("a.xml").input_names == ("motor",), "else in the current folder"
+
+
+MARKED = """
+<mujoco><compiler angle="radian"/><option timestep="0.005"/>
+  <worldbody>
+    <body name="upper"><joint name="lift" axis="0 1 0" range="-3.1 -0.2" limited="true"/>
+      <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02" mass="2" contype="0" conaffinity="0"/>
+      <body name="tool" pos="0.4 0 0">
+        <inertial mass="{mass}" pos="0 0 0" diaginertia="0 0 0"/></body></body>
+    <body name="goal" pos="1 0 0"><joint name="goal" type="slide" axis="0 0 1"/>
+      <geom size="0.05" contype="{touches}" conaffinity="0"/></body>
+    <geom name="floor" type="plane" size="1 1 1" pos="0 0 -5" contype="0" conaffinity="0"/>
+  </worldbody>
+  <actuator><motor name="lift" joint="lift" gear="3" ctrlrange="-9 9"/></actuator>
+</mujoco>"""
+
+
+def test_inputs_of_the_inverse_dynamics_hold_an_arm_at_rest():
+    arm = adapter.model(MARKED.format(mass=1, touches=0), without="unmoved", threads=1)
+    x = np.array([[-1.0, 0.0], [-2.0, 0.0]])
+    u = arm.system.inverse(x, x, arm.values, 0.05)
+    assert np.allclose(arm.system.step(x, u, arm.values, 0.05), x, atol=1e-9)
+    assert np.abs(arm.system.step(x, 0 * u, arm.values, 0.05) - x).max() > 0.1
+
+
+def test_joints_that_no_actuator_can_move_are_no_states():
+    alone = adapter.model(MARKED.format(mass=1, touches=0), without="unmoved", threads=1)
+    assert alone.state_names == ("lift", "lift_vel") and alone.step.without == ("goal",)
+    assert alone.step.ranges == {"lift": (-3.1, -0.2)}
+    whole = adapter.model(MARKED.format(mass=1, touches=0), threads=1)
+    x, u = np.array([[-1.0, 0.5]]), np.array([[1.0]])
+    both = np.array([[-1.0, 0.0, 0.5, 0.0]])
+    after = whole.system.step(both, u, whole.values, 0.05)
+    assert np.array_equal(alone.system.step(x, u, alone.values, 0.05), after[:, ::2])
+    touched = adapter.model(MARKED.format(mass=1, touches=1), without="unmoved", threads=1)
+    assert "goal" in touched.state_names
+
+
+def test_a_body_without_mass_can_carry_a_payload():
+    empty = adapter.model(MARKED.format(mass=0, touches=0), params=("tool.mass",), threads=1)
+    loaded = adapter.model(MARKED.format(mass=1.5, touches=0), threads=1)
+    x, u = np.array([[-1.0, 0.0, 0.5, 0.0]]), np.array([[1.0]])
+    by = empty.system.step(x, u, np.array([1.5]), 0.05)
+    assert np.allclose(by, loaded.system.step(x, u, loaded.values, 0.05), rtol=1e-12)
+
+
+def test_threads_are_as_many_as_the_processors_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {3}, raising=False)
+    assert adapter.model(MARKED.format(mass=1, touches=0)).step.threads == 1
+
+
+def test_slopes_along_the_same_samples_are_taken_once(monkeypatch):
+    arm = adapter.model(MARKED.format(mass=1, touches=0), threads=1)
+    taken = []
+    system, slow = arm.system, arm.system.jacobian
+    monkeypatch.setattr(system, "jacobian", lambda *at: taken.append(at) or slow(*at))
+    x, u = np.array([[-1.0, 0.0, 0.5, 0.0]]), np.array([[1.0]])
+    first = system.linearise(x, u, arm.values, 0.05)
+    again = system.linearise(x.copy(), u.copy(), arm.values, 0.05, smoothing=0.1)
+    assert len(taken) == 1 and all(map(np.array_equal, first, again))
+    x[0, 0] = -1.5
+    assert not np.array_equal(system.linearise(x, u, arm.values, 0.05)[0], first[0])

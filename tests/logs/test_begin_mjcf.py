@@ -100,3 +100,43 @@ def test_meshes_of_a_urdf_come_along_from_its_own_folder(tmp_path, inside):
     assert (w / "meshes" / "a.stl").is_file() is (w / "a.urdf").is_file() is inside
     assert str(robot) in (w / "model.py").read_text() or inside
     assert Workspace(w).base_model.input_names == ("rail_force",)
+
+
+MARKED = """
+<mujoco><compiler angle="radian"/><worldbody>
+  <body><joint name="lift" axis="0 1 0" range="-3 -1" limited="true"/>
+    <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02" mass="2" contype="0" conaffinity="0"/>
+    <body pos="0.4 0 0"><joint name="wrist" axis="0 1 0" range="-2 2" limited="true"/>
+      <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass="1" contype="0" conaffinity="0"/>
+    </body></body>
+  <body><joint name="goal" type="slide"/><geom size="0.05" contype="0" conaffinity="0"/></body>
+</worldbody><actuator>
+  <motor name="m1" joint="lift" ctrlrange="-30 30"/><motor name="m2" joint="wrist"/>
+</actuator></mujoco>"""
+
+
+def test_an_arm_starts_inside_its_ranges_and_held_and_is_planned_at_once(tmp_path):
+    (tmp_path / "arm.xml").write_text(MARKED)
+    done = grounded("init", tmp_path / "w", "--blank", "--model", tmp_path / "arm.xml", "--json")
+    told = {one["code"]: one["about"] for one in done.json["findings"]}
+    assert told == {"start.unmoved": ["goal"], "start.outside": ["lift"]}
+    workspace = Workspace(tmp_path / "w")
+    start, model = workspace.config.task.start, workspace.base_model
+    assert model.state_names == ("lift", "wrist", "lift_vel", "wrist_vel")
+    assert start["lift"] == -2.0 and abs(start["m1"]) > 1.0
+    t = np.linspace(0, 1, 41)
+    lift = -2.0 + 0.4 * (3 * t**2 - 2 * t**3)
+    workspace.target({"lift": lift, "wrist": np.zeros(41)})
+    steps = []
+    stepper = Workspace(tmp_path / "w").base_model.step
+    advance = type(stepper).advance
+
+    def counted(own, x, u, p, dt):
+        steps.append(len(x))
+        return advance(own, x, u, p, dt)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(stepper), "advance", counted)
+        proposed = workspace.propose()
+    assert sum(steps) < 10_000  # 40 steps, 7 samples for the slopes of each: 280 an iteration
+    assert proposed.candidate.predicted_utility > -0.5

@@ -76,13 +76,14 @@ class DifferencedSystem(Interpreted):
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Compares derivatives that come with the model with differences, at three samples.
 
+        Not those that are differences themselves (`Stepper.differenced`).
         At a kink, such as a limit of an input, those of either side or between them are right.
 
         Raises:
             GroundedError: where they differ by more than a hundredth of the largest.
         """
         own = self.signature.jacobian
-        if own is None:
+        if own is None or getattr(self.signature.function, "differenced", False):
             return
         at = np.unique(np.linspace(0, len(x) - 1, 3).astype(int))
         given = self._given(x[at], u[at], p, dt)
@@ -97,6 +98,15 @@ class DifferencedSystem(Interpreted):
                 f"of the step by {off.max():.3g}: jacobian and step don't belong together; leave "
                 "jacobian out to difference the step"
             )
+
+    def slopes(self, at: Samples) -> tuple[Array, Array]:
+        """See `Interpreted.slopes`; without smoothing, which changes nothing here."""
+        return super().slopes(at._replace(smoothing=0.0))
+
+    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
+        """See `System.inverse`; the function may have one, as simulators do."""
+        known = getattr(self.signature.function, "inverse", None)
+        return None if known is None else known(x, after, p, dt)
 
     def jacobian(self, at: Samples, width: int) -> Array:
         """See `Interpreted.jacobian`; by central differences.

@@ -55,6 +55,18 @@ ENTRIES: dict[str, Entry] = {
     "encoder": Entry(
         "note", "of '{joint}', times the radius r", "enter yours here and in model.py"
     ),
+    # what the file of a model says
+    "unmoved": Entry(
+        "note",
+        "{about} {about:is/are} no {about:state/states}, as no input moves {about:it/them}",
+        "delete `without` in model.py to have {about:it/them}",
+    ),
+    "outside": Entry(
+        "note",
+        "not all ranges of the joints include 0: {about} {about:starts/start} in the middle of "
+        "{about:its range/their ranges}",
+        "set [task] start",
+    ),
     "degrees": Entry(
         "note",
         "{about} is in rad by the model, but goes from {low} to {high}",

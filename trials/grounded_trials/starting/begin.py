@@ -250,6 +250,8 @@ def _begin(
     if own:
         notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, built))
         notes = (*notes, *_turning(built))
+        without = getattr(built.step, "without", ())
+        notes = (*notes, *[found("start.unmoved", *without).sentence] * bool(without))
     rates = velocities(built)
     simulated = report.simulated
     table = mapping_toml(states, inputs, simulated=simulated, rates=rates, layout=layout)

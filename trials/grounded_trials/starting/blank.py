@@ -1,9 +1,11 @@
 """Creates a workspace from a model file alone, for a robot that no example resembles.
 
-Every setting of the task has a placeholder value that runs: the target holds each state at zero
-with weight 1; inputs have the limits of the MJCF or URDF file, or none. If some input holds the
-model at zero (a quadrotor's hover), that is the input before the start. `drive.py` is the robot's
-program: it reads the candidate and writes the trial; the user implements `measure` and `send`.
+Every setting of the task has a placeholder value that runs: the target holds each state at its
+start with weight 1, which is zero; if the range of a joint excludes zero, all joints start in the
+middle of their ranges. Inputs have the limits of the MJCF or URDF file, or none. If some input
+holds the model there (a quadrotor's hover), that is the input before the start. `drive.py` is the
+robot's program: it reads the candidate and writes the trial; the user implements `measure` and
+`send`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
@@ -99,13 +103,30 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
         write_atomically(folder / "drive.py", drive.encode())
         name = f"{model.name or own.file.stem}: set your own target, weights and limits"
-        text = toml_of(task, name, COMMAND).replace("\ninput_change", f"\n{CHANGES}\ninput_change")
+        text = toml_of(task, name, COMMAND, explicit=True)
+        text = text.replace("\ninput_change", f"\n{CHANGES}\ninput_change")
         write_atomically(folder / FILE, text.encode())
 
 
+def left_open(model: Model) -> list[Finding]:
+    """Return what the file of a model made different from what its user may expect."""
+    without = getattr(model.step, "without", ())
+    beside = [name for name, at in zip(model.state_names, _start(model), strict=True) if at]
+    told = [found("start.unmoved", *without)] if without else []
+    return told + ([found("start.outside", *beside)] if beside else [])
+
+
+def _start(model: Model) -> Array:
+    """Return the state (n,) at which the model starts, see the module."""
+    ranges = getattr(model.step, "ranges", {})  # in an MJCF or URDF file
+    low, high = np.array([ranges.get(name, (0.0, 0.0)) for name in model.state_names]).T
+    outside = bool(((low > 0) | (high < 0)).any())
+    return np.asarray(0.5 * (low + high) * outside)
+
+
 def _task(model: Model, dt: float) -> Task:
-    """Return the task of holding every state at zero for 100 steps, from the inputs that do so."""
-    n, m = model.n, model.m
+    """Return the task of holding the start for 100 steps, from the inputs that do so."""
+    n, m, start = model.n, model.m, _start(model)
     stated = getattr(model.step, "limits", {})  # limits in an MJCF or URDF file
     ends = [stated.get(name, (-np.inf, np.inf)) for name in model.input_names]
     changes = np.array([change_weight(None, unit) for unit in model.inputs.values()])
@@ -113,9 +134,9 @@ def _task(model: Model, dt: float) -> Task:
     task = Task(
         model=model,
         dt=dt,
-        target=np.zeros((HORIZON + 1, n)),
+        target=np.tile(start, (HORIZON + 1, 1)),
         reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), changes),
-        start=np.zeros(n),
+        start=start,
         past=np.clip(np.zeros(m), low, high),
         low=low,
         high=high,

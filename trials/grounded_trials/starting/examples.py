@@ -199,10 +199,18 @@ def _source(module: ModuleType) -> str:
 SIMULATED = 'model = "real.py"             # robot: command = "python drive.py {candidate} {trial}"'
 
 
-def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
-    """Return the grounded.toml of a task, with comments; `system` is the line under [system]."""
+def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = False) -> str:
+    """Return the grounded.toml of a task, with comments.
+
+    Args:
+        task: the task.
+        name: of an example, or a line that says what it is.
+        system: the line under [system].
+        explicit: whether the start is written where the target begins there too.
+    """
     states, inputs = task.model.state_names, task.model.input_names
-    first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
+    given = np.isfinite(task.target[0]) & (not explicit)
+    first = np.where(given, task.target[0], 0.0)
     start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
     start |= {i: v for i, v in zip(inputs, task.past, strict=True) if v != 0}
     assert task.latency is not None

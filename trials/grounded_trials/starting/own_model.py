@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from grounded.adapters import mujoco
 from grounded.adapters.beside import beside, recorded
 from grounded.errors import GroundedError
 from grounded.model import Model
@@ -23,12 +24,12 @@ SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
 FILE = "model.py"
 LOADS = """from grounded.adapters import mujoco
 
-model = mujoco.model({name}){remark}
+model = mujoco.model({name}{without}){remark}
 """
 STAYS = "  # not copied: it reads files outside its folder"
 MOVED = """
 # params= names the parameters that `fit` and `diagnose` may change, with their bounds:
-# model = mujoco.model({name}, params={{{body}: ({low:.3g}, {high:.3g})}})
+# model = mujoco.model({name}{without}, params={{{body}: ({low:.3g}, {high:.3g})}})
 # others: the damping, frictionloss, armature of a joint, the gear of an actuator ...
 """
 
@@ -84,33 +85,31 @@ def own_model(file: str | Path) -> OwnModel:
     folder = file.resolve().parent
     with recorded() as read, beside(folder):
         if simulated := file.suffix.lower() in SIMULATED:
-            from grounded.adapters import mujoco
-
-            model = mujoco.model(file.name)
+            model = mujoco.model(file.name, without="unmoved")
         else:
             model = model_in(load_module(folder, file.name, key="--model"))
     outside = tuple(dict.fromkeys(path for root, path in read if not path.is_relative_to(root)))
     others = {str(path.relative_to(root)): path for root, path in read if path not in outside}
     if simulated:  # loaded from its own folder if it reads files from elsewhere
         name, others = (str(folder / file.name), {}) if outside else (file.name, others)
-        return OwnModel(file, model, _loads(folder / file.name, name).encode(), others, outside)
+        return OwnModel(file, model, _loads(model, file, name).encode(), others, outside)
     try:
         return OwnModel(file, model, file.read_bytes(), others, outside)
     except OSError as error:
         raise GroundedError(f"{file} can't be read: {error.strerror}") from None
 
 
-def _loads(file: Path, name: str) -> str:
-    """Return the text of a model.py that loads an MJCF or URDF file under a name."""
-    from grounded.adapters.mujoco_files import load
-
-    compiled, quoted = load(file), json.dumps(name, ensure_ascii=False)
-    masses = {compiled.body(i).name: float(compiled.body_mass[i]) for i in range(compiled.nbody)}
-    text = LOADS.format(name=quoted, remark="" if name == file.name else STAYS)
-    for body, mass in masses.items():
-        if body and mass > 0:
+def _loads(model: Model, file: Path, name: str) -> str:
+    """Return the text of a model.py that loads the model's MJCF or URDF file under a name."""
+    stepper, quoted = model.step, json.dumps(name, ensure_ascii=False)
+    assert isinstance(stepper, mujoco.MujocoStepper)
+    named = json.dumps(stepper.without, ensure_ascii=False)
+    known = {"name": quoted, "without": f", without={named}" if stepper.without else ""}
+    text = LOADS.format(**known, remark="" if name == file.name else STAYS)
+    for body, mass in stepper.masses.items():
+        if mass > 0:
             body = json.dumps(f"{body}.mass", ensure_ascii=False)
-            return text + MOVED.format(name=quoted, body=body, low=0.5 * mass, high=2 * mass)
+            return text + MOVED.format(**known, body=body, low=0.5 * mass, high=2 * mass)
     return text
 
 
