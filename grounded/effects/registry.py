@@ -200,7 +200,7 @@ def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
     here, there = (_Rates(model, x, u, p, kept) for p in (model.values, beside))
     for name, own in here.named.items():
         for other, slope in here.slopes.items():
-            same = _along(slope, own) and _along(there.slopes[other], there.named[name])
+            same = parallel(slope, own) and parallel(there.slopes[other], there.named[name])
             if same and name not in found and _free(model, other):
                 found[name] = other
     return found
@@ -236,7 +236,7 @@ class _Rates:
         self.slopes = inputs | params
 
 
-def _along(slope: Array, own: Array) -> bool:
+def parallel(slope: Array, own: Array) -> bool:
     """Check whether one array is a multiple of the other, neither of them zero."""
     a, b = slope.reshape(-1), own.reshape(-1)
     lengths = float(a @ a) * float(b @ b)

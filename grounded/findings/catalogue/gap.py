@@ -37,6 +37,7 @@ ENTRIES: dict[str, Entry] = {
         "[[, {part:%} of it in {trial} from {start:.3g} to {end:.3g} s]]"
         "[[; {others:more state} {others:is/are} off]]",
     ),
+    "declared": Entry("note", "{effect}: as if {parameter} were {value}, not {was}"),
     "lacks": Entry(
         "note",
         "small but lasting: the rate of {state} lacks something[[, {size} rms]]"

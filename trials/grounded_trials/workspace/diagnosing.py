@@ -14,7 +14,7 @@ from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import NEXT, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding
+from grounded.findings import Finding, Quantity
 from grounded.findings import found as finding
 from grounded.share import Share
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
@@ -107,7 +107,7 @@ def diagnose_in(
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    more = (*told, *_not_compared(workspace), *found.findings)
+    more = (*told, *_not_compared(workspace), *_declared(planner.plan, found), *found.findings)
     found = replace(found, made=made, preflight=seen, ranking=known, findings=more)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
@@ -146,6 +146,23 @@ def _not_compared(workspace: Folder) -> Iterator[Finding]:
     for name, others in tied_when_adopted(workspace).items():
         code = "gap.equivalent" if name in same else "gap.not_compared"
         yield finding(code, name, effect=name, others=others)
+
+
+def _declared(task: Task, found: Diagnosis) -> Iterator[Finding]:
+    """Yield a finding for each claimed effect that is another value of a constant of the model."""
+    from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
+
+    for name in found.effects:
+        row, quantity = found.ranked(name), (RELATIVE | ABSOLUTE).get(name.partition(":")[0])
+        if row is None or quantity is None or row.params[quantity].value is None:
+            continue
+        size = row.params[quantity]
+        for one in declared(task.model, name, size.value, size.std, task.low, task.high):
+            unit = task.model.params[one.parameter].unit
+            value = Quantity(one.value, unit, one.std)
+            was = Quantity(one.was, unit)
+            p = one.parameter
+            yield finding("gap.declared", name, p, effect=name, parameter=p, value=value, was=was)
 
 
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
