@@ -192,7 +192,25 @@ def _alone(function: Any, rows: Sequence[Any]) -> Results:
 
 
 def _threaded(threads: Executor, function: Any, rows: Sequence[Any]) -> Results:
-    yield from enumerate(threads.map(partial(_quietly, function), rows))
+    """Yield the results of threads; if it is ended early, end the pieces that they are at."""
+    at_work = set[int]()
+
+    def piece(row: Any) -> Any:
+        at_work.add(threading.get_ident())
+        try:
+            return _quietly(function, row)
+        finally:
+            at_work.discard(threading.get_ident())
+
+    pieces = [threads.submit(piece, row) for row in rows]
+    try:
+        yield from ((k, one.result()) for k, one in enumerate(pieces))
+    finally:
+        for one in pieces:
+            one.cancel()
+        for thread in tuple(at_work):  # at its next line of Python
+            ended = ctypes.py_object(KeyboardInterrupt)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ended)
 
 
 def _sent(pool: Any, function: Any, rows: Sequence[Any]) -> Results:

@@ -2,16 +2,17 @@
 
 import re
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from grounded import forked
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.engine import Engine
+from grounded.engine import Engine, each, running
 from grounded.fit import fit
 from grounded.model import Model, Param
-from grounded.progress import Interrupted, Stages
+from grounded.progress import Interrupted, Stages, within
 from grounded.trial import Trial
 
 
@@ -124,6 +125,30 @@ def test_ctrl_c_while_one_more_effect_is_sought_keeps_what_was_found(trials):
     assert found.effects == whole.effects and found.verdict.again
     assert "gap.interrupted" in {one.code for one in found.findings}
     assert any(stage.startswith("more effects (one more effect; Ctrl-C") for stage in told)
+
+
+def slowly(seconds):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        sum(range(100))
+
+
+def test_ctrl_c_ends_what_threads_are_at():
+    began = time.monotonic()
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), running(Engine(jobs=2), copied=False):
+        each(slowly, [0.0, 60.0, 60.0], done=stop)
+    assert time.monotonic() - began < 20.0
+
+
+def test_what_takes_too_long_is_ended_as_by_ctrl_c():
+    with pytest.raises(KeyboardInterrupt), within(0.01):
+        slowly(60.0)
+    with within(60.0):
+        slowly(0.0)
 
 
 def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):

@@ -59,7 +59,7 @@ from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
 Words = ctypes.c_int64 * len(BATCH)
-RESULTS = BATCH[6:]
+RESULTS, LENGTH = BATCH[6:], BATCH.index("dt")
 POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
@@ -147,19 +147,25 @@ class CompiledSystem(TracedSystem):
         self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
 
-    def march(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """Steps one after the other: x (N, n), u (T, N, m) -> states (T + 1, N, n)."""
+    def march(self, x: Array, u: Array, p: Array, dt: float | Array) -> Array:
+        """Steps one after the other: x (N, n), u (T, N, m) -> states (T + 1, N, n).
+
+        dt: the length of every step, or of each (T,).
+        """
         steps, u, p = len(u), plain(u), plain(p)
         z = np.empty((steps + 1, *x.shape))
         z[0] = x
         at = {"x": address(z), "u": word(u), "p": word(p), "out": address(z[1:]) if steps else 0}
-        at |= {"dt": word(float(dt)), "eps": word(0.0), "N": len(x)}
+        at |= {"eps": word(0.0), "N": len(x)}
         words = (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH])
-        kernel, per = self._compiled(p, dt).batch()["step"], 8 * len(x)
+        lengths = np.broadcast_to(dt, steps).tolist() if len(x) else []
+        of_length = {h: (word(h), self._compiled(p, h).batch()["step"]) for h in set(lengths)}
         each = [
-            (BATCH.index(k), per * w) for k, w in (("x", self.n), ("out", self.n), ("u", self.m))
+            (BATCH.index(k), 8 * len(x) * w)
+            for k, w in (("x", self.n), ("out", self.n), ("u", self.m))
         ]
-        for _ in range(steps if len(x) else 0):
+        for length in lengths:
+            words[LENGTH], kernel = of_length[length]
             run(kernel, words)
             for i, size in each:
                 words[i] += size

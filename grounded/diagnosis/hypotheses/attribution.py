@@ -25,14 +25,14 @@ from grounded.diagnosis.hypotheses.search import (
 )
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.hypotheses.variations import HOPEFUL, TUNED, reordered, swapped, varied
-from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
-from grounded.progress import interruptible
+from grounded.progress import interruptible, within
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
@@ -40,6 +40,7 @@ AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
+ANSWER_S = 1.0  # [s] most time for errors of predictions in the answer to Ctrl-C
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -84,25 +85,32 @@ def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = 
     """
     if not search.of_size(0):
         return "no hypothesis has been fitted yet"
-    with np.errstate(all="ignore"):
-        ruler, best, crude = Ruler(search.predictor), search.chosen(most), search.of_size(0)[0]
-        crude = search.fits.get((Structure(), 0.0, ()), crude)
-        at = len(ruler.steps) - 1
-        before, after = (ruler.errors(fit).rms[at] for fit in (crude, best))
-    model, seconds = search.data.model, ruler.steps[at] * search.data.dt
-    rows = ", ".join(
-        f"{name} by {after[i]:.3g} instead of {before[i]:.3g} {model.states[name]}"
-        for i, name in zip(ruler.shown, ruler.names, strict=True)
-    )
+    best = search.chosen(most)
     causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
     told = f"the likeliest of {len(search.fits)} hypotheses has {listed(causes) or 'no cause'}"
     more = "not confirmed on held-out trials"
     if decided is not None:
         more = f"confirmed before the search for one more: {listed(decided) or 'no cause'}"
-    return (
-        f"so far, {told}; {more}; no diagnosis is stored. Predictions {seconds:.2g} s ahead miss "
-        f"{rows}"
+    told = f"so far, {told}; {more}; no diagnosis is stored"
+    try:
+        with np.errstate(all="ignore"), within(ANSWER_S):
+            return f"{told}. Predictions {_misses(search, best)}"
+    except KeyboardInterrupt:  # a simulator may need minutes for them
+        return told
+
+
+def _misses(search: HypothesisSearch, best: Fitted) -> str:
+    """Return the errors of a hypothesis beside those of the model alone."""
+    ruler, crude = Ruler(search.predictor), search.of_size(0)[0]
+    crude = search.fits.get((Structure(), 0.0, ()), crude)
+    at = len(ruler.steps) - 1
+    before, after = (ruler.errors(fit).rms[at] for fit in (crude, best))
+    model, seconds = search.data.model, ruler.steps[at] * search.data.dt
+    rows = ", ".join(
+        f"{name} by {after[i]:.3g} instead of {before[i]:.3g} {model.states[name]}"
+        for i, name in zip(ruler.shown, ruler.names, strict=True)
     )
+    return f"{seconds:.2g} s ahead miss {rows}"
 
 
 def _searched(

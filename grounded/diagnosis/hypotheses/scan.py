@@ -15,7 +15,7 @@ projected out, so that a candidate is credited only with what they can't explain
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,6 +25,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.delays import delays_of, sensor_offset
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import of_sensor
 from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -37,9 +38,6 @@ from grounded.effects import (
     MemoryFamily,
     ParamFamily,
     RateFamily,
-    SensorDelayFamily,
-    SensorFamily,
-    SensorLagFamily,
 )
 from grounded.effects.sensed import behind_logs
 from grounded.engine import SentOnce, each
@@ -71,6 +69,17 @@ class _Column:
     r: Array  # (L + 1, B, n) or empty
 
 
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """What a column changes: a linear value by a small amount, or all of a grid point."""
+
+    point: int
+    name: str
+    amount: float
+    values: dict[str, float]
+
+
+_Points = Sequence[tuple[int, dict[str, float]]]  # index of a grid point, its values
 _Point = tuple[int, int, Effect, dict[str, float]]  # candidate, grid point, effect, its values
 # by candidate and grid point: of each column its name and its products with residual, base, mates
 _Results = dict[tuple[int, int], list[tuple[str, float, Array, Array]]]
@@ -99,7 +108,10 @@ def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effe
 def _looked(context: _Context, block: Sequence[_Point]) -> _Results:
     """Return the products of a block of columns, which holds all columns of each grid point."""
     results: _Results = {}
-    columns = [column for point in block for column in context.columns(*point)]
+    columns = list[_Column]()
+    for i, some in itertools.groupby(block, key=lambda one: one[0]):
+        points = list(some)
+        columns += context.columns(i, points[0][2], [(point, grid) for _, point, _, grid in points])
     if columns:
         context.filter(columns, results)
     return results
@@ -124,52 +136,62 @@ class _Context(SentOnce):
         self._zeros: dict[tuple[int, int], Array] = {}
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
 
-    def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        family = effect.family
+    def columns(self, i: int, effect: Effect, points: _Points) -> list[_Column]:
+        """Return the columns of a candidate at some of its grid points."""
+        family, tried = effect.family, self._tried(effect, points)
         if isinstance(family, RateFamily) and not family.parts:
-            return self._rate(i, point, effect, grid)
-        if isinstance(family, InputFamily | LossFamily | MediumFamily | MemoryFamily | RateFamily):
-            return self._step(i, point, effect, grid)
-        if isinstance(family, SensorFamily | SensorDelayFamily | SensorLagFamily):
-            return self._sensor(i, point, effect, grid)
-        if isinstance(family, ParamFamily):
+            changes = self._rate(effect, tried)
+        elif isinstance(
+            family, InputFamily | LossFamily | MediumFamily | MemoryFamily | RateFamily
+        ):
+            changes = self._step(effect, tried)
+        elif of_sensor(effect):
+            return [
+                _Column(i, one.point, one.name, _EMPTY, self._sensor(effect, one)) for one in tried
+            ]
+        elif isinstance(family, ParamFamily):
             k = self.predictor.data.model.param_names.index(effect.site.target)
-            return [_Column(i, point, "d", self.f_p[..., k], _EMPTY)]
-        return []
+            return [_Column(i, point, "d", self.f_p[..., k], _EMPTY) for point, _ in points]
+        else:
+            return []
+        return [
+            _Column(i, one.point, one.name, d, _EMPTY)
+            for one, d in zip(tried, changes, strict=True)
+        ]
 
-    def _tried(
-        self, effect: Effect, grid: dict[str, float]
-    ) -> Iterator[tuple[str, float, dict[str, float]]]:
-        """Yield the name, amount and all values of each column: a small amount, or the change."""
-        linear = [q.name for q in effect.free if not q.grid]
-        values = {**effect.fixed, **dict.fromkeys(linear, 0.0), **grid}
-        for name in linear:
-            yield name, 1e-3, values | {name: 1e-3}
-        if not linear:
-            yield "", 1.0, values
-
-    def _rate(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        predictor, seen, found = self.predictor, self.predictor.seen, []
-        for name, amount, values in self._tried(effect, grid):
-            before, later = (self._rates_at(effect, values, when) for when in (0, 1))
-            part, d = 0.5 * predictor.data.dt / amount, np.zeros_like(self.x)
-            for state, rate in before:
-                d += self._by_state[seen.index(state)] * np.multiply(part, rate)[..., None]
-            for state, rate in later:
-                d[..., seen.index(state)] += part * rate
-            if behind_logs(predictor.data.model) is not None:
-                d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
-            for a, b in predictor.tied:
-                if effect.family.needs_own:  # type: ignore[attr-defined]
-                    before, later = (
-                        self._rates_at(effect, values, k, instant=True) for k in (0, 1)
-                    )
-                d[..., b] = (self._entering[b] * d).sum(axis=-1)
-                for sign, rates in ((-1, before), (1, later)):
-                    for rate in (rate for state, rate in rates if state == seen[a]):
-                        d[..., b] += sign * rate / amount
-            found.append(_Column(i, point, name, d, _EMPTY))
+    @staticmethod
+    def _tried(effect: Effect, points: _Points) -> list[_Tried]:
+        """Return what each column changes: a linear value by a small amount, or a grid value."""
+        linear, found = [q.name for q in effect.free if not q.grid], list[_Tried]()
+        for point, grid in points:
+            values = {**effect.fixed, **dict.fromkeys(linear, 0.0), **grid}
+            for name in linear:
+                found.append(_Tried(point, name, 1e-3, values | {name: 1e-3}))
+            if not linear:
+                found.append(_Tried(point, "", 1.0, values))
         return found
+
+    def _rate(self, effect: Effect, tried: Sequence[_Tried]) -> Array:
+        """Return what K columns of an added rate add to a step, to first order (K, L, B, n)."""
+        predictor, seen = self.predictor, self.predictor.seen
+        amount = np.array([one.amount for one in tried]).reshape(-1, 1, 1)
+        values = {q: _alike([one.values[q] for one in tried]) for q in tried[0].values}
+        before, later = (self._rates_at(effect, values, when) for when in (0, 1))
+        part, d = 0.5 * predictor.data.dt / amount, np.zeros((len(tried), *self.x.shape))
+        for state, rate in before:
+            d += self._by_state[seen.index(state)] * np.multiply(part, rate)[..., None]
+        for state, rate in later:
+            d[..., seen.index(state)] += part * rate
+        if behind_logs(predictor.data.model) is not None:
+            d = predictor.logged(self.fit.hypothesis, np.zeros_like(d), d)
+        for a, b in predictor.tied:
+            if effect.family.needs_own:  # type: ignore[attr-defined]
+                before, later = (self._rates_at(effect, values, k, instant=True) for k in (0, 1))
+            d[..., b] = (self._entering[b] * d).sum(axis=-1)
+            for sign, rates in ((-1, before), (1, later)):
+                for rate in (rate for state, rate in rates if state == seen[a]):
+                    d[..., b] += sign * rate / amount
+        return d
 
     @cached_property
     def _by_state(self) -> Array:
@@ -187,7 +209,7 @@ class _Context(SentOnce):
         return found
 
     def _rates_at(
-        self, effect: Effect, values: dict[str, float], when: int, instant: bool = False
+        self, effect: Effect, values: Mapping[str, Any], when: int, instant: bool = False
     ) -> list[tuple[str, Any]]:
         """Return added rates with their states at the start (0) or the end (1) of every step."""
         data = self.predictor.data
@@ -221,32 +243,22 @@ class _Context(SentOnce):
             return near, self.after
         return near, near.advance(h, self.x, self.u, self.predictor.data.time)
 
-    def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        """Return columns from repeating the whole step with the candidate in it."""
+    def _step(self, effect: Effect, tried: Sequence[_Tried]) -> Array:
+        """Return what K columns add to a step, by repeating it with the candidate (K, L, B, n)."""
         data, (predictor, base) = self.predictor.data, self.stepping
-        found = []
-        for name, amount, values in self._tried(effect, grid):
-            h = self.fit.hypothesis.plus(effect, values)
-            acts = isinstance(effect.family, InputFamily | MemoryFamily)
-            received = predictor.inputs(h) if acts else self.u
-            start = self.predictor.remembered(h, self.fit.track)[:-1]
-            after = predictor.advance(h, start, received, data.time)
-            d = data.model.difference(after, base) / amount
-            d[..., data.exact] = 0.0
-            found.append(_Column(i, point, name, d, _EMPTY))
-        return found
+        with_it = [self.fit.hypothesis.plus(effect, one.values) for one in tried]
+        after = predictor.each_next(with_it, self.fit.track)
+        d = data.model.difference(after, base)
+        d /= np.array([one.amount for one in tried]).reshape(-1, 1, 1, 1)
+        d[..., data.exact] = 0.0
+        return np.asarray(d)
 
-    def _sensor(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
-        data = self.predictor.data
-        shown = [data.model.state_names.index(name) for name in effect.site.targets]
-        found = []
-        for name, amount, values in self._tried(effect, grid):
-            r = np.zeros_like(self.fit.track)
-            for k in shown:
-                r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
-            r = r if self.delays is None else self.delays.aligned(r)
-            found.append(_Column(i, point, name, _EMPTY, r))
-        return found
+    def _sensor(self, effect: Effect, one: _Tried) -> Array:
+        """Return what a column adds to the measurements (L + 1, B, n)."""
+        data, r = self.predictor.data, np.zeros_like(self.fit.track)
+        for k in (data.model.state_names.index(name) for name in effect.site.targets):
+            r[..., k] = -sensor_offset(effect, one.values, self.ahead[..., k], data.dt) / one.amount
+        return r if self.delays is None else self.delays.aligned(r)
 
     def filter(self, block: list[_Column], results: _Results) -> None:
         """Whiten a block of columns; store their products with residual, base and each other."""
@@ -334,6 +346,11 @@ class _Context(SentOnce):
             return Look(effect, {}, 0.0)
         looks.sort(key=lambda look: -look[0])
         return Look(effect, looks[0][1], looks[0][0], elsewhere(effect, looks))
+
+
+def _alike(each: Sequence[float]) -> Any:
+    """Return the value that all share, or all of them (K, 1, 1)."""
+    return each[0] if len({*each}) == 1 else np.array(each).reshape(-1, 1, 1)
 
 
 def _side_by_side(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:

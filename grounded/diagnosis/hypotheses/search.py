@@ -87,7 +87,7 @@ class HypothesisSearch(FittedHypotheses):
         *,
         rivals: bool = False,
     ) -> list[Fitted]:
-        """Refine hypotheses and keep the fits; of rivals, the worse half stops early."""
+        """Refine hypotheses and keep the fits; of rivals, those far behind stop early."""
         worth = self.score if rivals else None
         fits = refine(self.predictor, starts, iterations=iterations, tick=self._ticks, worth=worth)
         self.keep(fits)

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects import Effect, LossFamily, MediumFamily, RateFamily
+from grounded.effects import (
+    Effect,
+    LossFamily,
+    MediumFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+    SensorLagFamily,
+)
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -92,19 +100,22 @@ class Hypothesis:
 def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
     """Combine hypotheses with the same effects into one that steps many rows (M, n) at once.
 
-    Its values are arrays: row i has those of hypothesis `which[i]`, (M,) of int. Its shifts are
-    (M, k).
+    Row i has the values and the shifts of hypothesis `which[i]`, (M,) of int: values are arrays
+    (M,), shifts (M, k). What all hypotheses share stays a number, and a shift (k,).
     """
     first = hypotheses[0]
     if len(hypotheses) == 1:
         return first
+
+    def rows(each: Array) -> Any:
+        return each[0] if (each == each[0]).all() else each[which]
+
     values = [
-        {q: np.array([h.values[i][q] for h in hypotheses])[which] for q in own}
+        {q: rows(np.array([h.values[i][q] for h in hypotheses])) for q in own}
         for i, own in enumerate(first.values)
     ]
     shifts = [h.shift for h in hypotheses if h.shift is not None]
-    shift = np.stack(shifts)[which] if shifts else None
-    return replace(first, values=tuple(values), shift=shift)
+    return replace(first, values=tuple(values), shift=rows(np.stack(shifts)) if shifts else None)
 
 
 def param_scale(model: Model) -> Array:
@@ -131,3 +142,8 @@ def adds_to_steps(h: Hypothesis) -> bool:
     """Check whether a hypothesis changes the model's steps other than by the inputs received."""
     medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
     return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)
+
+
+def of_sensor(effect: Effect) -> bool:
+    """Check whether an effect changes what is measured, and no step."""
+    return isinstance(effect.family, SensorFamily | SensorDelayFamily | SensorLagFamily)

@@ -44,6 +44,7 @@ from grounded.diagnosis.likelihood.hypothesis import (
     Hypothesis,
     adds_to_steps,
     losses_of,
+    of_sensor,
     param_scale,
 )
 from grounded.diagnosis.likelihood.moving import moving
@@ -116,25 +117,26 @@ def linearise(
         if h.spread and carried
         else (step_jacobian(predictor, h, x, after), None)
     )
+    # each value is nudged; those that then change nothing (thresholds) by more
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
     base = after if near is predictor else near.advance(h, x, u, data.time)
-    for j, sizes in enumerate(_tried(h)):
-        for size in sizes:
-            other, moved = _nudged(h, theta, j, size)
-            if moved == 0:
-                continue
-            start = predictor.remembered(other, track)[:-1]
-            nudged = near.advance(other, start, near.inputs(other), data.time)
-            by_d = model.difference(nudged, base) / moved
-            by_d[..., data.exact] = 0.0  # they start where the nudged commands have led
+    tried, acts = _tried(h), [not of_sensor(effect) for effect in h.effects for _ in effect.free]
+    for k in range(max(map(len, tried), default=0)):
+        still = [j for j, sizes in enumerate(tried) if k < len(sizes)]
+        still = [j for j in still if not (k and (d[..., 1 + j].any() or r[..., 1 + j].any()))]
+        nudges = {j: _nudged(h, theta, j, tried[j][k]) for j in still}
+        nudges = {j: nudge for j, nudge in nudges.items() if nudge[1] != 0}
+        stepped = [j for j in nudges if acts[j]]
+        steps = near.each_next([nudges[j][0] for j in stepped], track) if stepped else ()
+        for j, moved_to in zip(stepped, steps, strict=True):
+            d[..., 1 + j] = model.difference(moved_to, base) / nudges[j][1]
+            d[..., data.exact, 1 + j] = 0.0  # they start where the nudged commands have led
+        for j, (other, moved) in nudges.items():
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
-            by_r = (shown - other_shown + offset - shifted) / moved
+            r[..., 1 + j] = (shown - other_shown + offset - shifted) / moved
             if begun is not None and (other_begun := predictor.begun(other)) is not None:
-                by_r[0] += (other_begun - begun) / moved
-            d[..., 1 + j], r[..., 1 + j] = by_d, by_r
-            if by_d.any() or by_r.any():
-                break
+                r[0, ..., 1 + j] += (other_begun - begun) / moved
     for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(theta)):
         if f_p is not None:
             np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])

@@ -26,7 +26,8 @@ from grounded.frozen import Array
 if TYPE_CHECKING:
     from grounded.diagnosis.likelihood.predictor import Predictor
 
-LONG = 400  # fewest steps for which compiling pays
+Times = Array | float  # [s] within the trial, of each row (M,) or of all
+LONG = 100  # fewest steps for which compiling pays
 AGREE = 1e-9  # tolerance of the check, relative to a state's size
 CARRIED = 1e-3  # the same for a heading rate, which `advance` computes by a short finite step
 
@@ -38,19 +39,23 @@ class March:
     system: System
     names: tuple[str, ...]  # parameters: those of the hypothesis' effects before adopted ones
 
-    def __call__(self, predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
-        """Roll out from x (M, n) with u (T, M, m): states (T + 1, M, n)."""
+    def __call__(self, predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Times) -> Array:
+        """Roll out from x (M, n) at times t with u (T, M, m): states (T + 1, M, n)."""
         own = dict(zip(predictor.data.model.param_names, predictor.params(h), strict=True))
         for effect, values in h.pairs:
             whole = effect.complete(values)
             own |= {param_name(effect.name, name): value for name, value in whole.items()}
         march = getattr(self.system, "march")  # noqa: B009
         p = np.array([own[name] for name in self.names])
-        return np.asarray(march(x, u, p, predictor.data.dt))
+        n, clocks = x.shape[-1], self.system.n - x.shape[-1]
+        clock = np.broadcast_to(np.reshape(t, (-1, 1)), (len(x), clocks))
+        return np.asarray(march(np.hstack([x, clock]), u, p, predictor.data.dt)[..., :n])
 
 
-def marched(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array | None:
-    """Roll out from x (M, n) with received inputs u (T, M, m): states (T + 1, M, n).
+def marched(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Times = 0.0
+) -> Array | None:
+    """Roll out from x (M, n) at times t with received u (T, M, m): states (T + 1, M, n).
 
     None if the hypothesis can't be compiled, or there are too few steps for that to pay.
     """
@@ -61,21 +66,21 @@ def marched(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array | 
             return None
         march = _compiled(predictor, h)
         if march is not None:
-            first = predictor.advance(h, x, u[0], np.zeros(len(x)))
-            off = np.abs(march(predictor, h, x, u[:1])[1] - first)
+            first = predictor.advance(h, x, u[0], np.broadcast_to(t, len(x)))
+            off = np.abs(march(predictor, h, x, u[:1], t)[1] - first)
             room = np.full(first.shape[-1], AGREE)
             room[[rate for _, rate in predictor.tied]] = CARRIED
             march = march if (off <= room * (1 + np.abs(first))).all() else None
         predictor.marches[h.names] = march
     found = predictor.marches[h.names]
-    return None if found is None else found(predictor, h, x, u)
+    return None if found is None else found(predictor, h, x, u, t)
 
 
 def _compiled(predictor: Predictor, h: Hypothesis) -> March | None:
     data, families = predictor.data, [effect.family for effect in h.effects]
     if simulated(data.model) or behind_logs(data.model) is not None:
         return None
-    if any(isinstance(f, MediumFamily) or getattr(f, "timed", False) for f in families):
+    if any(isinstance(f, MediumFamily) for f in families):
         return None
     model = data.model
     try:
@@ -83,7 +88,8 @@ def _compiled(predictor: Predictor, h: Hypothesis) -> March | None:
             if isinstance(effect.family, LossFamily | RateFamily):
                 at = replace(effect.site, model=model)
                 model = wrap(replace(effect, site=at), values, data.dt)
-        if model.step is None or model.n != data.model.n:
+        clocks = [name for name in model.state_names if name not in data.model.state_names]
+        if model.step is None or not all(name.endswith("_clock") for name in clocks):
             return None
         names = (model.state_names, model.input_names, model.param_names)
         states, inputs, params = names

@@ -11,7 +11,7 @@ compared with the log. The equations are those of `grounded.effects.wrap`, evalu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -34,6 +34,7 @@ from grounded.diagnosis.likelihood.delays import filter_lag, sensor_offset
 from grounded.diagnosis.likelihood.hypothesis import (
     Hypothesis,
     adds_to_steps,
+    by_row,
     limits_of,
     losses_of,
     param_scale,
@@ -61,6 +62,8 @@ from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.places import integrated, outright_states, partner
 from grounded.rollout import each_stepped
+
+TOGETHER = 6000  # rows of states that are stepped at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +235,38 @@ class Predictor(SentOnce):
         """Return one step of a hypothesis from each x (L, B, n) of the track, (L, B, n)."""
         return self.advance(h, x, self.inputs(h), self.data.time)
 
+    def each_next(self, hypotheses: Sequence[Hypothesis], track: Array) -> Array:
+        """Return a step of each of K hypotheses with the same effects along a track, (K, L, B, n).
+
+        Those with the same parameters and parts of a step are the rows of one array, as many as fit
+        into the cache: for short logs, calls take longer than what they compute.
+
+        Args:
+            hypotheses: the hypotheses.
+            track: (L + 1, B, n), its exact memories replaced by those of each hypothesis.
+        """
+        data = self.data
+        x = [self.remembered(h, track)[:-1] for h in hypotheses]
+        u = [self.inputs(h) for h in hypotheses]
+        found, rows = np.empty((len(x), *data.time.shape, data.model.n)), data.time.size
+        groups = dict[Any, list[int]]()
+        for i, h in enumerate(hypotheses):
+            parts = delayed(self.acting(h), data) if self.divisible else None
+            alike = self.params(h).tobytes(), b"" if parts is None else parts.tobytes()
+            groups.setdefault(i if simulated(data.model) else alike, []).append(i)
+        most = max(1, TOGETHER // rows)
+        for every in groups.values():
+            for some in (every[at : at + most] for at in range(0, len(every), most)):
+                own = by_row([hypotheses[i] for i in some], np.repeat(range(len(some)), rows))
+                if len(some) == 1:
+                    found[some[0]] = self.advance(own, x[some[0]], u[some[0]], data.time)
+                    continue
+                starts, sent = (np.concatenate([a[i] for i in some]) for a in (x, u))
+                starts, sent = (a.reshape(-1, a.shape[-1]) for a in (starts, sent))
+                after = self.advance(own, starts, sent, np.tile(data.time.reshape(-1), len(some)))
+                found[some] = after.reshape(len(some), *found.shape[1:])
+        return found
+
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """Return one step of a hypothesis from x (..., n) with received u (..., m) at times t."""
         if medium := moving(h, self.seen):
@@ -274,14 +309,24 @@ class Predictor(SentOnce):
         )
 
     def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
-        """Roll the model out from x (M, n) with received u (T, M, m): states (T + 1, M, n).
+        """Roll the model out from x (M, n) with received u (T, M, m or 2 m): states (T + 1, M, n).
 
-        None if the hypothesis adds to the model's steps, or the model is not compiled.
+        None if the hypothesis adds to the model's steps, if the model is not compiled, or if inputs
+        change more than once within a step.
         """
-        march = getattr(self.data.model.system, "march", None)
+        (T, M, width), model = u.shape, self.data.model
+        march = getattr(model.system, "march", None)
         if march is None or adds_to_steps(h):
             return None
-        return np.asarray(march(x, u, self.params(h), self.data.dt))
+        if width == model.m:
+            return np.asarray(march(x, u, self.params(h), self.data.dt))
+        parts = delayed(self.acting(h), self.data) if self.divisible else None
+        if parts is None or behind_logs(model) is not None:
+            return None
+        split = self._split(u, parts)
+        sent = np.stack([now for now, _ in split], axis=1).reshape(-1, M, model.m)
+        lengths = np.tile([length for _, length in split], T)
+        return np.asarray(march(x, sent, self.params(h), lengths)[:: len(split)])
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """Return the model's step with the joints' losses, without added or limited rates."""
@@ -341,13 +386,19 @@ class Predictor(SentOnce):
 
     def _in_parts(self, x: Array, u: Array, p: Array, parts: Array) -> Array:
         """Step with inputs u (..., 2 m) that change once within it, after `parts` of it (m,)."""
-        dt, m, within = self.data.dt, self.data.model.m, parts * (1 - parts)
+        for now, length in self._split(u, parts):
+            x = self.step(x, now, p, length)
+        return x
+
+    def _split(self, u: Array, parts: Array) -> list[tuple[Array, float]]:
+        """Return the inputs (..., m) of each part of such a step, and how long it takes [s]."""
+        m, within, found = self.data.model.m, parts * (1 - parts), list[tuple[Array, float]]()
         change = u[..., m:] * np.divide(2, within, out=np.zeros(m), where=within > 0)
         now, at = u[..., :m] - parts * change, 0.0  # the change is what it was before, less now
         for end in (*sorted({part for part in parts.tolist() if part > 0}), 1.0):
-            x = self.step(x, now + change * (parts >= end), p, (end - at) * dt)
+            found.append((now + change * (parts >= end), (end - at) * self.data.dt))
             at = end
-        return x
+        return found
 
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""

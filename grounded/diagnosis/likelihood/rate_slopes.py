@@ -113,18 +113,20 @@ def rate_slopes(
     own = x
     if any(e.family.needs_own for e, _ in rates):
         own = predictor.instant(h, x, u) if now else (predictor.moved(h, x, u) - x) / data.dt
-    base = predictor.added_rate(rates, x, u, t, predictor.named(own))
-    found = np.empty((*x.shape, n))
-    for j, name in enumerate(names):
-        size = SMALL * data.scales.spread(name)
-        other = x.copy()
-        other[..., j] += size
-        moved = own if of_own is None else own + size * of_own[..., j]
-        rate = predictor.added_rate(rates, other, u, t, predictor.named(moved))
-        found[..., j] = (rate - base) / size
+    # the rates at the states and beside them, in each state's direction: (1 + n, L, B, n)
+    size = np.array([0.0, *(SMALL * data.scales.spread(name) for name in names)])
+    beside = np.broadcast_to(x, (1 + n, *x.shape)).copy()
+    moved = np.broadcast_to(own, beside.shape)
+    moved = moved.copy() if of_own is not None else moved
+    for j in range(n):
+        beside[1 + j, ..., j] += size[1 + j]
+        if of_own is not None:
+            moved[1 + j] += size[1 + j] * of_own[..., j]
+    rate = predictor.added_rate(rates, beside, u, t, predictor.named(moved))
+    found = np.moveaxis((rate[1:] - rate[0]) / size[1:].reshape(-1, *[1] * x.ndim), 0, -1).copy()
     i = np.arange(n)
     found[..., i, i] = np.maximum(found[..., i, i], -STEEPEST / half)
-    return found
+    return np.asarray(found)
 
 
 def heading_slope(

@@ -55,8 +55,9 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # size of one (L, B, N, N) array of a block; what fits in the cache is fastest
 SHORTEST = 0.05  # smallest fraction of a step that is tried
-HALVED = 4  # iterations after which only the better half of rivals continues
 CLOSE = 10.0  # nats behind the best within which all rivals continue
+AHEAD = 2.0  # times what its next step promises that a rival may gain
+KEPT = 4  # iterations of a round of a simulator, whose slopes are kept during a round
 LITTLE = 0.1  # nats that a shortened step must promise to be tried
 NOTHING = 0.01  # nats: after a rise below LEAST, a step that promises less is not tried
 LEAST = 1.0  # nats: smaller rises may end a fit
@@ -74,7 +75,7 @@ class Work:
     step: ProposedStep | None = None
     part: float = 1.0  # fraction of the step that is taken
     still: bool = False  # the likelihood no longer rises
-    given_up: bool = False  # too far behind its rivals
+    given_up: bool = False  # can't catch up with its rivals
     moving: bool = True  # the track moves with the step; at kinks of the model this may not help
     along: Predictor | None = None  # predictor of its own track, during the fit
     share: float = 1.0  # of the thresholds LITTLE, NOTHING and STILL, below which it ends
@@ -125,7 +126,7 @@ def refine(
         iterations: most iterations; a fit whose likelihood no longer rises stops earlier.
         tick: called whenever a block of fits is done.
         fixed_noise: keep the noise as it is.
-        worth: value of a rival; after a few iterations the worse half stops. None: all continue.
+        worth: value of a rival; those far behind the best stop early. None: all continue.
         share: fraction of the thresholds (in nats) at which a fit ends.
 
     Returns:
@@ -142,10 +143,12 @@ def refine(
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    if worth is not None and iterations > HALVED:
-        works = _after(predictor, works, (HALVED, fixed_noise, False), size, tick)
-        _halve(works, worth)
-        iterations -= HALVED
+    # a race: after each round, those that can't catch up with the best are given up
+    lap = KEPT if simulated(predictor.data.model) else 1
+    while worth is not None and len(works) > 1 and iterations > lap:
+        works = _after(predictor, works, (lap, fixed_noise, False), size, tick)
+        _race(works, worth)
+        iterations -= lap
     works = _after(predictor, works, (iterations, fixed_noise, True), size, tick)
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
     return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
@@ -192,14 +195,12 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool])
     return [replace(work, along=None) for work in works]
 
 
-def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
-    """Give up the works in the worse half that are also more than CLOSE nats behind the best."""
-    value = {id(work): worth(work.best) for work in works if work.best is not None}
-    ranked = sorted(value.values(), reverse=True)
-    for work in works:
-        mine = value.get(id(work), -np.inf)
-        if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
-            work.given_up = True
+def _race(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+    """Give up works that stay CLOSE nats behind the best with AHEAD times what a step promises."""
+    value = [-np.inf if work.best is None else worth(work.best) for work in works]
+    for work, mine in zip(works, value, strict=True):
+        reach = mine + AHEAD * np.nan_to_num(work.hope) + CLOSE
+        work.given_up = work.given_up or -np.inf < reach < max(value)
 
 
 def _of_one_shape(works: list[Work], data: Data) -> list[list[int]]:

@@ -16,10 +16,11 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
-from grounded.diagnosis.likelihood.marching import LONG, marched
+from grounded.diagnosis.likelihood.marching import marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
 
+LED = 400  # steps of predictions from which how inputs change within a step is left out
 FAR = 1e6  # size of a state above which it has diverged
 
 
@@ -69,7 +70,7 @@ def missed(
     each = [(h, own) for h, own in each if len(own)]
     sent, begin = np.empty((*t.shape, 0)), dict[int, int]()
     for h, own in each:
-        by_trial = predictor.received(h, leads=steps < LONG)  # longer ones are compiled, without
+        by_trial = predictor.received(h, leads=steps < LED)
         if not sent.shape[-1]:
             sent = np.empty((*t.shape, by_trial.shape[-1]))
         sent[:, own] = by_trial[trial[own], t[:, own]]
@@ -79,7 +80,10 @@ def missed(
     path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
     together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
     advance = stepper(predictor, together)
-    if added is None and (marched := _marched(predictor, each, path[-1], sent)) is not None:
+    if (
+        added is None
+        and (marched := _marched(predictor, each, path[-1], sent, t[0] * data.dt)) is not None
+    ):
         path, sent = [*path, *marched[1:]], sent[:0]  # all steps are done
     for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
         x = advance(path[-1], u, now)
@@ -118,17 +122,20 @@ def at_steps(error: Array, steps: int, first: Any) -> Array:
 
 
 def _marched(
-    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array
+    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array, t: Array
 ) -> Array | None:
-    """Return compiled rollouts (steps + 1, M, n); None if not compiled, or one diverges."""
-    if sent.shape[-1] > predictor.data.model.m:
-        return None
-    found = np.empty((len(sent) + 1, *x.shape))
+    """Return compiled rollouts (steps + 1, M, n); None if not compiled, or one diverges.
+
+    x (M, n), sent (steps, M, m or 2 m), t (M,): states, received inputs and times at the start.
+    """
+    found, whole = np.empty((len(sent) + 1, *x.shape)), sent.shape[-1] == predictor.data.model.m
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])
         if z is not None and not (np.abs(z) < FAR).all():
             return None
-        if z is None and (z := marched(predictor, h, x[own], sent[:, own])) is None:
+        if z is None and whole:
+            z = marched(predictor, h, x[own], sent[:, own], t[own])
+        if z is None:
             return None
         found[:, own] = np.fmax(np.fmin(z, FAR), -FAR)
     return found

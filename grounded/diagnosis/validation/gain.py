@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.levels import LEAST, SURE
+from grounded.diagnosis.likelihood.levels import SURE
 from grounded.frozen import Array
+
+LEAST = 0.01  # log gain in some channel at some horizon below which a difference does not matter
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.levels import ALIKE, SHARE, WILD
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -44,7 +43,10 @@ WHOLE_STEPS = 4000  # most steps of these together, unless that leaves fewer tha
 LEAST_WHOLE = 3
 FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
 SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
+ODD = 10.0  # a trial that misses more than this times the best repeat is not a repeat
 MOMENTS = 20  # most moments at which repeats are compared
+AS_LONG = 1.25  # whole trials up to this times as long as the repeats have their floor
+ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
 
 
 class Ruler:
@@ -162,14 +164,7 @@ class Ruler:
         `first` (n,): steps after which a log shows what the track has not used (`unseen`). `added`
         (L, B, n) is added to every step within a run.
         """
-        at, run = self.starts
-        piece = self.piece0[run] + (at - 1) // self.steps[-1]
-        most = max(self.steps[-1], int(first.max()))
-        error = missed(self.predictor, each, of_run[run], track, at, run, most, added)
-        for k, steps in enumerate(self.steps):
-            square = at_steps(error, steps, first) ** 2
-            np.add.at(found.total[k], piece, np.nan_to_num(square))
-            np.add.at(found.count[k], piece, np.isfinite(square))
+        # the long ones first: what is compiled for them is at hand for the others
         lengths = self.data.lengths[self.data.trial_of[self.wholes]]
         for steps in np.unique(lengths) if whole else ():
             run = self.wholes[lengths == steps]
@@ -179,6 +174,14 @@ class Ruler:
             square = error[1:] ** 2
             found.total[-1, self.piece0[run]] += np.nan_to_num(square).sum(axis=0)
             found.count[-1, self.piece0[run]] += np.isfinite(square).sum(axis=0)
+        at, run = self.starts
+        piece = self.piece0[run] + (at - 1) // self.steps[-1]
+        most = max(self.steps[-1], int(first.max()))
+        error = missed(self.predictor, each, of_run[run], track, at, run, most, added)
+        for k, steps in enumerate(self.steps):
+            square = at_steps(error, steps, first) ** 2
+            np.add.at(found.total[k], piece, np.nan_to_num(square))
+            np.add.at(found.count[k], piece, np.isfinite(square))
 
     def doubt(self, fit: Fitted) -> Array:
         """Return the jackknife standard error of each log rms error, over runs, (K, n')."""
@@ -263,7 +266,7 @@ class Ruler:
             length = int(data.lengths[data.trial_of[runs]].min())
             own = int(data.valid[runs].sum(axis=1).min())
             for k, steps in enumerate((*self.steps, length)):
-                if k == len(self.steps) and longest > (1 + ALIKE) * length:
+                if k == len(self.steps) and longest > AS_LONG * length:
                     continue
                 last = min(own - 1, length - steps)
                 if last < 0:  # what is used of the runs is shorter than this horizon
@@ -310,7 +313,7 @@ class Ruler:
         if not own:
             return runs
         least = np.fmin.reduce(own) + self.fine[self._watched]
-        return runs[[not (one > WILD * least).any() for one in own]]  # NaN compares as False
+        return runs[[not (one > ODD * least).any() for one in own]]  # NaN compares as False
 
     @property
     def _watched(self) -> list[int]:
@@ -359,8 +362,8 @@ def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]
                 break
             length = min(int(data.lengths[i]), int(data.lengths[group[0]]))
             apart = (trial.inputs[:length] - one.inputs[:length]) / scale
-            same = abs(int(data.lengths[i]) - int(data.lengths[group[0]])) <= ALIKE * length
-            if same and np.sqrt((apart**2).mean(axis=0)).max() < SHARE:
+            same = abs(int(data.lengths[i]) - int(data.lengths[group[0]])) <= 0.1 * length
+            if same and np.sqrt((apart**2).mean(axis=0)).max() < ALIKE:
                 group.append(i)
                 break
         else:
