@@ -5,12 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 
 from grounded import Model, Param, Trial
 from grounded.accounts.ages import bias_of as constant_of
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.kinematics import dead as dead_rates
 from grounded.accounts.kinematics import kinematic_rows, turned
 from grounded.accounts.lag import at_samples, lag_between
 from grounded.accounts.sound_trials import sound_trials as preflight
@@ -58,12 +56,6 @@ def lagged(x, tau):
     for k in range(1, len(x)):
         out[k] = a * out[k - 1] + (1 - a) * 0.5 * (x[k] + x[k - 1])
     return out
-
-
-def lowpass(x, samples=9):
-    """The same without its noise, nearly: a moving average."""
-    edge = np.pad(x, samples // 2, mode="edge")
-    return np.convolve(edge, np.full(samples, 1 / samples), mode="valid")
 
 
 def columns(q=lambda x: x, w=lambda x: x):
@@ -135,27 +127,6 @@ def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first
     looked = preflight(ARM, arm(fault))
     (found,) = [one for one in looked.findings if one.kind == "smoothed"]
     assert found.signal == "w" and found.corrected
-    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_a_speed_that_was_filtered_at_twice_the_rate_of_the_commands_is_no_sensor(seed):
-    rng, half = np.random.default_rng(seed), DT / 2
-
-    def fault(y):
-        steps = np.arange(2 * len(y) - 1) / 2
-        q = CubicSpline(np.arange(len(y)), lowpass(y[:, 0]))(steps)
-        q += 2e-3 * rng.standard_normal(len(q))
-        w, part = np.zeros(len(q)), half / (0.05 + half)
-        for k in range(1, len(q)):
-            w[k] = (1 - part) * w[k - 1] + part * (q[k] - q[k - 1]) / half
-        return np.stack([q, w], axis=1)[::2]
-
-    looked = preflight(ARM, arm(fault, seed, trials=1, steps=700))
-    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
-    assert found.signal == "w" and "filtered derivative of q" in found.finding
-    (age,) = [one.delay_s for one in looked.findings if one.kind in ("lag", "delay")]
-    assert age == pytest.approx(0.055, abs=0.003)  # and half a step
     assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
 
 
@@ -251,15 +222,6 @@ def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
     (one,) = (f for f in found.findings if f.kind == "stuck")
     assert one.signal == "w" and "number 2" in one.finding
     assert np.isnan(found.trials[1].states[:, 1]).all()
-
-
-@pytest.mark.parametrize("late", [8])
-def test_a_velocity_in_a_far_smaller_unit_has_the_shape_of_its_position_however_late(late):
-    small = [
-        replace(t, states=np.column_stack([t.states[:, 0], np.roll(t.states[:, 1], late) / 57.3]))
-        for t in arm()
-    ]
-    assert not any(dead_rates(ARM, t, range(ARM.n)) for t in small)
 
 
 ENCODER = 2e-3  # rad a count

@@ -142,7 +142,7 @@ def wide(n, m, dense, make=system_of, limits=0.3):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "m", "dense"), [(1, 1, True), (26, 3, False), (6, 9, True)])
+@pytest.mark.parametrize(("n", "m", "dense"), [(1, 1, True), (6, 9, True)])
 def test_sizes_written_out_and_looped(n, m, dense):
     fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
     assert fast.system.how == "compiled"

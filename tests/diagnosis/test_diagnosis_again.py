@@ -126,15 +126,6 @@ def test_a_gain_of_the_input_is_the_parameter_behind_it(name, same):
     assert one_thing(Predictor(data), 0, effect) is same
 
 
-def test_a_floor_from_trials_that_are_merely_alike_says_so():
-    alike = [replace(t, candidate=f"c{i}") for i, t in enumerate(runs(1.5, alike=True))]
-    again = [replace(t, candidate="c1") for t in alike]
-    few = DiagnosisOptions(library=Library((Library().family("viscous_friction"),)))
-    found = [diagnose(axis(1.0), some, few) for some in (alike, again)]
-    sources = [one.prediction_error[0].floor_from for one in found]
-    assert sources == ["alike", "repeats"]
-
-
 LATE = 0.1  # [s], two steps of an axis
 
 

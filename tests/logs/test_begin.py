@@ -175,16 +175,6 @@ def test_the_real_car_of_a_laboratory(tmp_path):
     assert not by["steering"].sure and len(by["steering"].others) == 1
 
 
-def test_a_real_drone_s_commands_are_asked_for(tmp_path):
-    """A Pose is abused for torques: no name says which, all that is commanded is offered."""
-    found = begin(tmp_path / "w", data("crazyflie_p4_ros2_mcap") / "flybag.mcap")
-    assert found.kind == "drone" and not any(g.path for g in found.inputs)
-    assert all("/cf_controll.position.x" in g.others for g in found.inputs)
-    by = {g.name: g for g in found.states}
-    assert by["x"].path.startswith("/vicon/") and not by["x"].sure
-    assert not any(by[name].path or by[name].sure for name in ("vx", "vy", "vz"))
-
-
 @pytest.fixture
 def wheels(tmp_path):
     """A table of a robot on two wheels, its columns with units; psi wraps."""
@@ -617,23 +607,6 @@ def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
     assert made.code == 0, made.err
     model = Workspace(tmp_path / "w").base_model
     assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
-
-
-def test_a_velocity_ends_at_rest_on_a_path_with_hold():
-    point = Model(
-        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "side": "m/s"},
-        inputs={"ax": "m/s^2", "ay": "m/s^2"},
-        roles={"position": ("x", "y")},
-        derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.ax, "vy": a.ay, "side": 0.0},
-    )
-    to = {"vx": 0.0, "vy": 0.0, "side": 0.0}
-    columns = path_target("circle", Drive(hold=1.0), point, 0.02, to)
-    for place, rate in (("x", "vx"), ("y", "vy")):
-        assert np.abs(np.gradient(columns[place], 0.02) - columns[rate]).max() < 0.02
-        assert columns[rate][-1] == pytest.approx(0.0, abs=1e-6)
-    assert (columns["side"] == 0).all()  # moves nothing
-    with pytest.raises(GroundedError, match="--hold"):
-        path_target("circle", Drive(), point, 0.02, to)
 
 
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):

@@ -274,16 +274,6 @@ def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost()
     assert story.propose().candidate is made  # restored
 
 
-def test_a_run_whose_last_steps_were_not_recorded_did_not_crash():
-    def unrecorded(trial):
-        return trial.until(trial.steps - 2)
-
-    story, whole = Story().add(unrecorded), Story().add()
-    assert story.now.incumbent.utility == pytest.approx(whole.now.incumbent.utility, rel=3e-2)
-    story.add(unrecorded).propose()
-    assert story.now.iteration == 1 and story.now.incumbent.trials[0].steps == TASK.horizon
-
-
 @pytest.mark.parametrize(("off", "repeats", "least"), [(0.3, 1, -1.35)])
 def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
     """The robot starts slightly (or far) off s_0. With the exact start: from -1.349 to -0.881."""

@@ -11,7 +11,6 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import Ending, ended
@@ -347,16 +346,6 @@ def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(w, mon
     assert following(w.folder) == ("diagnose" if left else "export best --runner")
 
 
-def test_a_result_says_what_follows_it_without_the_command_line(w):
-    run = w.run("best").trial_file
-    assert w.ingest(run).then == w.status().then  # the search has ended: not `propose`
-    assert w.ingest(run, data=True).then == DIAGNOSE
-    few = Library(tuple(map(Library().family, ("viscous_friction", "input_gain"))))
-    found = w.diagnose(max_effects=1, library=few)
-    assert found.then is not None and found.then == w.status().then
-    assert "then" not in found.to_json()
-
-
 def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(w):
     then = {"name": "delay:force", "d": 0.01}
     made = {"trials": [], "adopted": [then], "params": {}}
@@ -466,21 +455,6 @@ def test_a_delay_that_log_takes_out_by_now_does_not_act_twice(w, now, counted):
     done = grounded("-C", w.folder, "adopt", "viscous_friction:v", "sensor_delay:v")
     assert done.code == counted and (w.config.file.read_text() == before) == counted
     assert not counted or "[log.state.v] delay_s = 0.05" in " ".join(done.err.split())
-
-
-def test_a_candidate_is_void_once_another_model_plans_though_a_probe_was_made_since(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.learn(1)
-    second = w.propose().candidate
-    assert w.save_candidate(replace(second, id=w.next_id()), kind="probe").id == "c0003"
-    w.forget()
-    w.reports.mkdir(exist_ok=True)
-    diagnosed(w.folder)
-    w.adopt("viscous_friction:v")
-    done = w.propose()
-    assert done.candidate.id == "c0004"
-    assert any(holds(note, "c0002", "void") for note in done.notes)
-    assert not any("void" in note for note in w.propose().notes)  # it is said once
 
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(w):

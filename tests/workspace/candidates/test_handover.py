@@ -165,13 +165,6 @@ def test_a_candidate_for_a_robot_with_old_samples_is_no_rewritten_one(w):
         intact(encoded(replace(aged, sample_age=0.0), w.task, "search"), "c0001")
 
 
-def test_deleting_what_was_rewritten_brings_the_candidate_back(w):
-    before = w.candidate_bytes("c0001")
-    rewrite(w, "old", feedforward=np.ones((40, 1)))
-    w.candidate_path("c0001").unlink()
-    assert w.propose().candidate.id == "c0001" and w.candidate_bytes("c0001") == before
-
-
 def forget_hand_outs(w):
     """As a workspace of 0.1, which kept none."""
     for note in (w.folder / "trials").glob("n*.json"):

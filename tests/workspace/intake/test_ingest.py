@@ -142,25 +142,6 @@ def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
     assert [one.facts.get("runs") for one in counts if "runs" in one.facts] == [2] * told
 
 
-@pytest.mark.parametrize(("scatter", "again"), [(0.001, True)])
-def test_a_start_that_changes_less_than_runs_scatter_is_no_reason_to_repeat_one(
-    w, tmp_path, monkeypatch, scatter, again
-):
-    ran, *_ = read_trial(run(w))
-    cost = -w.task.utility(ran)
-    a_step = np.sqrt(cost / len(ran.states) / 10)
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: -0.02 * cost)
-    monkeypatch.setattr(initial_state, "_lost_by", lambda *_: 0.01 * cost)
-    for k, off in enumerate((-1.0, 1.0, 1.5)):
-        moved = np.array(ran.states)
-        moved[0, 0] += 1.5 * a_step * (k == 2)
-        moved[1:, 0] += scatter * off * a_step
-        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-        found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    (told,) = of_code(found, "run.start*")
-    assert (told.code == "run.start_spoils") is again
-
-
 @pytest.mark.parametrize("data", [True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     write_trial(tmp_path / "t.mcap", plain(), {}, state_units={"x": "cm", "v": "m / s"})

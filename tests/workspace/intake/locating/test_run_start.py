@@ -18,7 +18,6 @@ from grounded.policy import Policy
 from grounded.search.feedback.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.opening import reading
 from recorded import LOGGED, RATE, follow, record, waiting
@@ -87,23 +86,6 @@ def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_
     assert not before or any("begins 1.000 s before" in note for note in found.notes)  # as logged
 
 
-def test_a_start_where_lively_gains_throw_noise_from_limit_to_limit_is_where_it_is_exact():
-    T, dt, rng, waits = 60, 0.01, np.random.default_rng(4), 100
-    feedforward, gain = rng.normal(0, 0.05, (T, 1)), np.zeros((T, 1, 3))
-    feedforward[:2] = -3
-    gain[2:, 0, :2] = 20, 60
-    names, limit, none = (("x", "v"), ("force",)), np.array([3.0]), np.zeros(1)
-    policy = Policy(
-        feedforward, -limit, limit, dt, *names, (1,), (False,) * 2, none, gain, np.zeros((T, 3))
-    )
-    felt = rng.normal(0, (0.002, 0.06), (waits + T + 50, 2))
-    k = np.clip(np.arange(len(felt)) - waits, 0, T - 1)
-    sent = np.clip(feedforward[k, 0] + (gain[k, 0, :2] * felt).sum(axis=1), -3, 3)
-    sent[:waits], sent[waits + T :] = felt[:waits] @ [20, 1], 0
-    found = start_in(policy, felt, sent)
-    assert found.exact and found.seconds == pytest.approx(waits * dt + 0.001, abs=1e-6)
-
-
 def test_the_start_of_a_run_that_fell_is_found_where_gains_are_high():
     T, dt, rng, waits, fell = 200, 0.01, np.random.default_rng(5), 100, 120
     t = dt * np.arange(waits + T - 20)
@@ -162,30 +144,6 @@ def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, 
     assert abs(steps - fell / policy.dt) <= 1 if fell else steps == policy.horizon
     again = w.ingest(log, candidate=wanted)
     assert again.known and again.trial == found.trial
-
-
-@pytest.mark.parametrize(("until", "stopped"), [(1.0, True), (1.5, False)])
-def test_a_run_that_was_cut_is_found_behind_a_hold_controller_too(w, tmp_path, until, stopped):
-    policy = w.candidate("c0002")[0].policy
-    path = record(w, tmp_path / "a.csv", policy, 1.0, until=until)
-    head, rows = path.read_text().splitlines()[0], np.loadtxt(path, delimiter=",", skiprows=1)
-    t = np.arange(RATE) / RATE
-    rows[:RATE, 1:3] += 0.02 * np.stack([np.sin(30 * t), np.cos(30 * t)], axis=1)
-    rows[:RATE, 3] = -0.5 * rows[:RATE, 1] - 0.3 * rows[:RATE, 2]
-    if stopped:  # by a switch, and the log goes on
-        still = np.repeat(rows[-1:], 2 * RATE, axis=0)
-        still[:, 0] += (1 + np.arange(2 * RATE)) / RATE
-        still[:, 3] = 0.0
-        rows = np.concatenate([rows, still])
-    np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt="%.6f")
-    found = w.ingest(path, candidate="c0002" if stopped else None)
-    (note,) = [one for one in found.notes if "begins" in one]
-    assert found.candidate == "c0002"
-    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - 1.0) < 1.5 / RATE
-    assert stopped or found.verdict == "crashed"
-    taken = of_code(found, "log.not_run")
-    assert bool(taken) == (stopped and until == 1.0)  # later, the policy rests as well
-    assert all(1.0 <= one.facts["until"].value < 2.0 for one in taken)
 
 
 def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp_path):
@@ -342,24 +300,6 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("by", "told"), [(1e3, "log.unit")])
-def test_a_log_that_begins_before_a_run_with_commands_of_another_unit_is_told_so(
-    w, tmp_path, by, told
-):
-    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.7)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    table[:, 3] *= by
-    head = path.read_text().splitlines()[0]
-    np.savetxt(path, table, delimiter=",", header=head, comments="")
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(path)
-    one = refused.value.finding
-    assert (one.code, one.about, one.facts["ran"]) == (told, ("force",), "c0002")
-    named = w.ingest(path, candidate="c0002")
-    assert any("force" in warning and f"{1 / by:g}" in warning for warning in named.warnings)
-
-
-@pytest.mark.slow
 def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_named(w, tmp_path):
     policy = w.candidate("c0002")[0].policy
     driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
@@ -373,39 +313,6 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     (begins,) = of_code(found, "log.start_assumed")
     assert of_code(found, "log.not_run") and begins.facts["longer"]
     assert 1.0 <= begins.facts["at"] < 1.1  # not where it was switched on
-
-
-@pytest.mark.parametrize(
-    "wrong, said",
-    [
-        ((57.29578, 57.29578, 1), ("theta and omega", "degrees", "0.017453293")),
-        ((1 / 57.29578, 1 / 57.29578, 1), ("runner.action", "in degrees")),
-    ],
-)
-def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_path, wrong, said):
-    folder = make(tmp_path / "w", "pendulum").folder
-    with (folder / "grounded.toml").open("a") as file:
-        for kind, name in (("state", "theta"), ("state", "omega"), ("input", "torque")):
-            file.write(f'\n[log.{kind}.{name}]\npath = "/csv.{name}"\n')
-    w = Workspace(folder)
-    w.propose()
-    w.run()
-    log = next((folder / "runs").iterdir())
-    trial = read_trial(log.read_bytes(), str(log))[0]
-    t = trial.dt * np.arange(trial.steps)
-    table = np.column_stack([t, np.column_stack([trial.states[:-1], trial.inputs]) * wrong])
-    path = tmp_path / "run.csv"
-    np.savetxt(path, table, "%.9f", ",", header="t,theta,omega,torque", comments="")
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(path)
-    assert holds(str(refused.value), *said)
-    own = "runner.action" in " ".join(said)  # in the program, not in the log
-    assert refused.value.then.arguments[0] == ("LOG" if own else str(path))  # once that is mended
-    with pytest.raises(GroundedError) as refused:
-        w.next(path)
-    assert refused.value.then.verb == "next"
-    with pytest.raises(GroundedError, match="c0009"):
-        w.ingest(path, candidate="c0009")
 
 
 @pytest.mark.parametrize("pace", [2.0])

@@ -9,14 +9,11 @@ import pytest
 from cli import grounded
 from facts import holds, of_code
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Quantity
-from grounded.findings import found as finding
 from grounded.onboard import Runner
 from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.recognising import recognise
 from grounded_trials.workspace.intake.recognising.read_otherwise import exchanged_in
 from workspaces import make
 
@@ -184,36 +181,6 @@ def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
     toml.write_text(text)
     again = Workspace(w.folder)
     assert not again.ingest(path, data=True).warnings and again.preflight() == ()
-
-
-def test_percent_far_beyond_limits_is_told_where_the_model_tells_nothing(w, tmp_path):
-    path = log(w, tmp_path / "a.csv", scale=100.0)
-    rows = np.loadtxt(path, delimiter=",", skiprows=1)
-    rows[:, 1:4] = 0.0  # its motors are off
-    np.savetxt(path, rows, "%.6f", ",", header="t,v,r,psi,port,starboard", comments="")
-    found = w.ingest(path, data=True)
-    assert of_code(found, "log.still")
-    assert [one.facts["how"] for one in of_code(found, "log.limits")] == ["percent"] * 2
-
-
-@pytest.mark.parametrize("crossed", [True])
-def test_a_run_with_its_motors_exchanged_tells_no_age_of_its_samples(
-    w, tmp_path, monkeypatch, crossed
-):
-    age, one = Quantity(0.005, "s"), Quantity(1.0, "m")
-    note = finding("run.samples", ran="", state="v", age=age, moved=one, error=one)
-    monkeypatch.setattr(recognise, "old_samples", lambda *_: [note])
-    plan, path = w.propose().candidate, tmp_path / "run.csv"
-    model = w.base_model
-    wired = replace(
-        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
-    )
-    ran = Plant(wired if crossed else model).run(plan.policy, {}, RNG)
-    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs])
-    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
-    found = w.ingest(path)
-    assert (found.then.verb == "discard") == crossed
-    assert bool(of_code(found, "run.samples")) != crossed
 
 
 def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
