@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.console.options import as_json, details
-from grounded_cli.console.terminal import LABEL, field, number, progress, show, show_json, tell
+from grounded_cli.console.terminal import LABEL, field, number, show, show_json, stages, tell
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import with_unit
 
@@ -31,8 +31,9 @@ def command(json_: bool, details: bool) -> None:
     the search has ended.
     """
     workspace = open_workspace()
-    with progress("planning"):
-        proposed = workspace.propose()
+    with stages() as tick:
+        tick("planning")
+        proposed = workspace.propose(tick)
     if json_:
         show_json(proposed.to_json())
     else:

@@ -102,14 +102,17 @@ class Workspace(Folder):
     def __repr__(self) -> str:
         return f"Workspace({str(self.folder)!r})"
 
-    def propose(self) -> Proposed:
+    def propose(self, tick: Callable[[str], None] | None = None) -> Proposed:
         """Propose the next candidate to run and write its file.
 
         While a candidate's trial is outstanding, the same candidate is returned.
+
+        Args:
+            tick: called with a line of progress during a long first plan.
         """
         from grounded_trials.workspace.candidates.proposing import propose_in
 
-        return propose_in(self.forget())
+        return propose_in(self.forget(), tick)
 
     def run(
         self,

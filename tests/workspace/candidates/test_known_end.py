@@ -25,7 +25,7 @@ def planned(monkeypatch):
     """Each planning of a next candidate, which takes a minute of CPU and finds none."""
     calls = []
 
-    def propose(task, candidates, trials, options, *, identity, planner):
+    def propose(task, candidates, trials, options, *, identity, planner, tick):
         calls.append(identity)
         now = standing(task, candidates, trials, options, planner.fingerprint)
         return Proposal(ended(now, Ending.DOUBTFUL, ASK), None, is_new=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -157,10 +157,14 @@ class Status(Result):
         return told
 
 
-def propose_in(workspace: Folder) -> Proposed:
+def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> Proposed:
     """Propose the next candidate, or the outstanding one again while its trial is missing.
 
     An outstanding candidate that has become void, and was not run, is replaced.
+
+    Args:
+        workspace: the workspace.
+        tick: called with a line of progress during a long first plan.
 
     Raises:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
@@ -171,7 +175,7 @@ def propose_in(workspace: Folder) -> Proposed:
         raise GroundedError(found("plan.no_target", then=NextCommand("target", ("SHAPE",))))
     check_log(workspace)
     before, told = workspace.candidate_ids(), bool(workspace.noted.since)
-    proposal, void = _handed_over(workspace)
+    proposal, void = _handed_over(workspace, tick)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate, now = proposal.candidate, proposal.standing
     notes = [found("plan.void", name, candidate=name, why=why) for name, why in void.items()]
@@ -270,12 +274,14 @@ def _told(
     )
 
 
-def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
+def _handed_over(
+    workspace: Folder, tick: Callable[[str], None] | None
+) -> tuple[Proposal, dict[str, str]]:
     """Write and check the next candidate; also return outstanding ones that are void: id -> why."""
     void: dict[str, str] = {}
     while True:
         seen = workspace.names()
-        proposal = _proposal(workspace, void)
+        proposal = _proposal(workspace, void, tick)
         candidate = proposal.candidate
         if candidate is None:
             return proposal, void
@@ -303,11 +309,13 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
             return replace(proposal, findings=(*proposal.findings, *handed.findings)), void
 
 
-def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
+def _proposal(
+    workspace: Folder, without: Collection[str], tick: Callable[[str], None] | None
+) -> Proposal:
     """Ask the search for a proposal as if some (void) candidates had never been proposed."""
     contents = workspace.read()
     candidates = tuple(c for c in contents.candidates if c.id not in without)
-    return planned(workspace, replace(contents, candidates=candidates))
+    return planned(workspace, replace(contents, candidates=candidates), tick)
 
 
 def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -70,7 +71,9 @@ def answered(workspace: Folder, now: Standing) -> Standing:
     return now.answered() if since.settled else now
 
 
-def planned(workspace: Folder, contents: Contents) -> Proposal:
+def planned(
+    workspace: Folder, contents: Contents, tick: Callable[[str], None] | None = None
+) -> Proposal:
     """Ask the search for a proposal, unless it is known to have ended with these contents."""
     from grounded.search.improve import propose
 
@@ -81,7 +84,9 @@ def planned(workspace: Folder, contents: Contents) -> Proposal:
     if planning and (known := known_end(workspace, contents, now)) is not None:
         return Proposal(known, None, is_new=False)
     name = workspace.next_id()
-    made = propose(task, contents.candidates, trials, options, identity=name, planner=planner)
+    made = propose(
+        task, contents.candidates, trials, options, identity=name, planner=planner, tick=tick
+    )
     if planning and made.candidate is None:
         remember_end(workspace, contents, made.standing)
     return made
