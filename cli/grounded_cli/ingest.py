@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded.errors import NextCommand
 from grounded.result import listed
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, values_by_name
 from grounded_cli.console.options import details as all_findings
 from grounded_cli.console.terminal import (
     field,
@@ -66,6 +66,9 @@ VERDICTS = {
     metavar="NAME",
     help="A condition that no signal shows: wet.",
 )
+@click.option(
+    "--before", multiple=True, metavar="U=0", help="An input before a log that begins with a step."
+)
 @all_findings
 @in_workspace
 @as_json
@@ -74,6 +77,7 @@ def command(
     candidate: str | None,
     data: bool,
     group: str,
+    before: tuple[str, ...],
     details: bool,
     json_: bool,
 ) -> None:
@@ -88,10 +92,12 @@ def command(
     from grounded_trials.logs.log_files import logs_in
 
     workspace = open_workspace()
+    held = values_by_name(before, "--before")
     done = []
     for name in (str(log) for file in files for log in logs_in(Path(file))):
         with progress(f"reading {name}"):
-            done.append(workspace.ingest(name, candidate=candidate, data=data, group=group))
+            about: Any = {"candidate": candidate, "data": data, "group": group, "before": held}
+            done.append(workspace.ingest(name, **about))
         if not json_:
             _tell(name, done[-1], _best(workspace, done[-1]), workspace.base_model, details)
     if json_:

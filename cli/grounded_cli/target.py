@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, values_by_name
 from grounded_cli.console.options import details as with_details
 from grounded_cli.console.terminal import field, number, show, show_json, tell
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
@@ -96,7 +96,7 @@ def command(
         raise click.UsageError(
             "--rest is for a line: a swing-up ends at rest as it is, a path with --hold"
         )
-    asked = Manoeuvre(shape, drive, _values(to), seconds, paces, at_rest)
+    asked = Manoeuvre(shape, drive, values_by_name(to, "--to"), seconds, paces, at_rest)
     drawn = open_workspace().draw(asked)
     if json_:
         show_json(drawn.to_json())
@@ -121,17 +121,3 @@ def _tell(drawn: Drawn, shape: str, *, details: bool) -> None:
         show(field("weights", f"[reward] {kind}: {text}", "  "))
     tell(drawn.findings, all_=details)
     show(f"\n{next_line(drawn.then)}")
-
-
-def _values(pairs: tuple[str, ...]) -> dict[str, float]:
-    found = {}
-    for pair in pairs:
-        name, _, value = pair.partition("=")
-        try:
-            end = float(value)
-        except ValueError:
-            end = math.nan
-        if not math.isfinite(end):
-            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0")
-        found[name.strip()] = end
-    return found

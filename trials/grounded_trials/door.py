@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Self
 
 from grounded.errors import GroundedError, needs
 from grounded_trials.plain_file import path_of
@@ -142,6 +143,7 @@ class Workspace(Folder):
         candidate: str | None = None,
         data: bool = False,
         group: str = "",
+        before: Mapping[str, float] = MappingProxyType({}),
     ) -> Ingested:
         """Check, resample and store a trial; a trial that is already stored is not added again.
 
@@ -151,11 +153,13 @@ class Workspace(Folder):
             data: the log ran no candidate and serves fitting and diagnosis only.
             group: the condition that it was run in ("wet"); a diagnosis fits its values without a
                 group and predicts that.
+            before: inputs' values until the log's first row, which it then need not hold.
         """
         from grounded_trials.workspace.intake.ingest import ingest_log
 
         here = self.forget()
-        return ingest_log(here, path_of(path), candidate, data=data, group=group, ahead=True)
+        about: dict[str, Any] = {"data": data, "group": group, "sent_before": before}
+        return ingest_log(here, path_of(path), candidate, ahead=True, **about)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -63,6 +64,21 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
     ):
         call = option(call)
     return call
+
+
+def values_by_name(pairs: tuple[str, ...], option: str) -> dict[str, float]:
+    """Return the values of an option such as --to x=1.0, by name."""
+    found = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            end = float(value)
+        except ValueError:
+            end = math.nan
+        if not math.isfinite(end):
+            raise click.UsageError(f"{option} {pair}: expected NAME=VALUE, such as x=1.0")
+        found[name.strip()] = end
+    return found
 
 
 def table_layout(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -191,6 +191,7 @@ ENTRIES: dict[str, Entry] = {
     "unmapped": Entry(
         "refuse", "[log] maps no {kinds}: a trial needs states and inputs", "add their paths"
     ),
+    "no_input": Entry("refuse", "{about} is no input of [log]: {hint}"),
     "mapped_twice": Entry(
         "refuse",
         "[log] maps the input {input} and the state {state} to the same number, {path}",

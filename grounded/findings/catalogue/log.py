@@ -184,8 +184,10 @@ ENTRIES: dict[str, Entry] = {
     # where a run begins
     "from": Entry(
         "note",
-        "it is used from {at:.3f} s on: what was sent before is not in the log, and the robot was "
-        "not at rest",
+        "it is used from {at:.3f} s on, as if {name} had been {value:.4g} before: what was sent "
+        "before the log is not in it",
+        "if {name} was 0, add a row before it that says so, or ingest it with `--before {name}=0`: "
+        "it then begins with the step, from which a delay or a lag can be told",
     ),
     "slow": Entry(
         "note",

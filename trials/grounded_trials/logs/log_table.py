@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from grounded.errors import GroundedError
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
 from grounded.findings import found
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
@@ -74,6 +76,7 @@ def _signal(table: Table, clock: str) -> SignalSpec:
         delay_s=_time(table, "delay_s") if table.has("delay_s") else 0.0,
         max_age_s=age,
         resample=cast('Literal["linear", "hold"] | None', how or None),
+        before=table.take("before", float) if table.has("before") else None,
     )
     table.finish()
     if spec.max_age_s is not None and spec.max_age_s <= 0:
@@ -142,6 +145,19 @@ class LogMapping:
     span: Span = field(default_factory=Span)
     layout: Layout = AS_IT_SAYS
 
+    def since(self, before: Mapping[str, float]) -> LogMapping:
+        """Return it with the values of inputs until their first samples.
+
+        Raises:
+            GroundedError: for a name that is no input.
+        """
+        for name in before:
+            if name not in self.inputs:
+                hint = nearest(name, self.inputs)
+                raise GroundedError(found("file.no_input", name, hint=hint))
+        new = {name: replace(self.inputs[name], before=value) for name, value in before.items()}
+        return replace(self, inputs={**self.inputs, **new})
+
 
 def read_log(
     paths: str | Path | Sequence[str | Path],
@@ -207,4 +223,22 @@ def mapped_signals(
         )
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
-    return read_signals(paths, {**specs, **mapping.span.signals()}, mapping.layout)
+    series = read_signals(paths, {**specs, **mapping.span.signals()}, mapping.layout)
+    return series | {name: _with_row_before(one) for name, one in series.items() if name in inputs}
+
+
+def _with_row_before(series: Series) -> Series:
+    """Return an input with a sample of its value until then just before its first one."""
+    spec, first = series.spec, int(np.argmin(series.t))
+    if spec.before is None:
+        return series
+    apart = np.diff(np.sort(series.t))
+    interval = int(np.median(apart)) if len(apart) else 10**9
+    raw = (spec.before - spec.offset) / spec.scale
+    t, logged = series.t[first] - interval, series.log_times[first] - interval
+    return replace(
+        series,
+        t=np.concatenate([[t], series.t]),
+        values=np.concatenate([[raw], series.values]),
+        log_times=np.concatenate([[logged], series.log_times]),
+    )

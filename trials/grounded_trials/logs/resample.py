@@ -89,6 +89,7 @@ class Gridded:
     states: Floats  # (T + 1, n)
     inputs: Floats  # (T, m)
     start_inputs: Floats | None  # (m,) held before t = 0; None if the log does not contain them
+    assumed: bool  # the log does not contain them, so they are None or as in its first row
     start_states: Mapping[str, float]  # at t = 0, as the samples before show them; see `Trial`
     start_ns: int  # t = 0 on the signals' clock [ns]
     origin_ns: int  # stamp of the first sample of any signal, on the same clock [ns]
@@ -209,12 +210,14 @@ def to_grid(
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if still and rest is not None:
         held = np.where(np.isfinite(held), held, rest)
-    elif rest is not None and in_motion(sent, start, rest):
+    assumed = not np.isfinite(held).all()
+    if assumed and rest is not None and in_motion(sent, start, rest):
         held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
     return Gridded(
         states=np.column_stack(columns[: len(states)]),
         inputs=np.column_stack(columns[len(states) :]),
         start_inputs=held if np.isfinite(held).all() else None,
+        assumed=assumed,
         start_states=_start_states(tracked, rates, start),
         start_ns=start,
         origin_ns=origin,

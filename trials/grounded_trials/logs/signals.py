@@ -60,6 +60,7 @@ class SignalSpec:
     delay_s: float = 0.0
     max_age_s: float | None = None
     resample: Literal["linear", "hold"] | None = None
+    before: float | None = None  # an input's value until its first sample
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,6 +243,7 @@ def _begin(
     step, whose, note = (
         (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
     )
+    built = own.in_step(folder, built, step) if own else built
     if chosen != "drone":  # zero is sent after a run, so the limits must include it
         ranges |= {
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])

@@ -14,7 +14,7 @@ from grounded.findings import found as found_
 from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
-from grounded_trials.logs.inspection.joint_names import from_base, slides
+from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
 from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
 from grounded_trials.logs.inspection.relations import rates_among
 from grounded_trials.logs.stated_units import bare_command, unit_in_name
@@ -30,7 +30,7 @@ MOST, INPUTS = 6, 4  # largest number of states and of guessed inputs of a gener
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
-    r"|goal|control|\baction\b|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
+    r"|goal|control|\baction\b|\.reference\.|\.output\.|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
     "|comando"
 )
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
@@ -169,8 +169,8 @@ def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[
     {} unless each input is the command of one state.
     """
     own = {name: _word(bare_command(found[name].path)) for name in inputs if name in found}
-    states = {name for name in found if name not in own}
-    followed = {state: name for name, state in own.items() if state in states}
+    states = {_word(one.path): name for name, one in found.items() if name not in own}
+    followed = {states[state]: name for name, state in own.items() if state in states}
     return followed if len(followed) == len(inputs) else {}
 
 
@@ -218,7 +218,7 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         return "car", f"{steered} holds Ackermann commands"
     if hung := _hung(log, joints):
         return "crane", hung
-    if joints := _turning(of_arms(joints)):
+    if joints := _turning(of_arms(at_joints(joints))):
         where, names = next(iter(joints.items()))
         kind = "arm" if len(names) > 1 else "pendulum"
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"

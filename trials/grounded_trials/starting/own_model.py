@@ -8,6 +8,7 @@ elsewhere are not copied.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from grounded.result import listed
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
+NEAR = 1e-3  # of dt: a timestep this near to a part of it divides it
 SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
 FILE = "model.py"
 LOADS = """from grounded.adapters import mujoco
@@ -68,6 +70,17 @@ class OwnModel:
                 f"{error}. Create {folder} yourself, copy {self.file.name} there as {FILE}, and "
                 f"the files that it reads{far} too, then give --model {folder / FILE}"
             ) from None
+
+    def in_step(self, folder: Path, model: Model, dt: float) -> Model:
+        """Return a simulated model whose timestep divides dt, which model.py then states."""
+        own = float(getattr(model.step, "timestep", 0.0)) * (self.file.suffix.lower() in SIMULATED)
+        if not own or abs(round(dt / own) * own - dt) <= NEAR * dt:
+            return model
+        said = f", timestep={dt / max(1, round(dt / own)):.12g})"
+        text = (folder / FILE).read_text("utf-8")
+        text = re.sub(r"^(model = .*?)\)", lambda m: m[1] + said, text, count=1, flags=re.M)
+        write_atomically(folder / FILE, text.encode())
+        return model_in(load_module(folder, FILE))
 
 
 def own_model(file: str | Path) -> OwnModel:

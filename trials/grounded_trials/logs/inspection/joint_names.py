@@ -1,7 +1,9 @@
 """Assign the numbers of a JointState to joints, and the joints to states of a model.
 
 A JointState names its joints, often in alphabetical order; an array of commands names none.
-Models and controllers count from the base.
+Models and controllers count from the base. The state of ros2_control's trajectory controller names
+its joints, too, and holds what they did beside what they should do: `/state.feedback` and
+`/state.reference`, formerly `actual` and `desired`. The former stands for a topic here.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 from grounded.units import UNITS
-from grounded_trials.formats.mcap_records import Channel, Messages
+from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.log_files import log_records, read_apart
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.logs.inspection.relations import Signals
 
+NAMING = "/JointState", "/JointTrajectoryControllerState"  # types of messages that name joints
+AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
+PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # order of joints within one part
@@ -57,26 +62,55 @@ DEFLECTED = re.compile(r"steer|rudder|aileron|elevator|flap|wheel_angle")  # fol
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each JointState topic, in the order of its numbers.
+    """Return the joints of each topic that names them, in the order of its numbers.
 
     A topic whose messages name different joints is left out, since its indices are ambiguous.
     """
-    wanted = {t.topic for t in log.topics if t.type.endswith("/JointState") and t.messages}
-    return read_apart(log.files, _joint_names, wanted) if wanted else {}
+    wanted = {t.topic for t in log.topics if t.type.endswith(NAMING) and t.messages}
+    found = read_apart(log.files, _joint_names, wanted) if wanted else {}
+    there = _there(log)
+    parts = {t: [p for p in AIMED if f"{t}.{p}.positions[0]" in there] for t in found}
+    return {f"{t}.{parts[t][0]}" if parts[t] else t: names for t, names in found.items()}
+
+
+def at_joints(joints: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Return the topics that hold nothing but what joints do, without those of controllers."""
+    return {topic: names for topic, names in joints.items() if _part(topic) not in AIMED}
+
+
+def number_of(topic: str, kind: str, index: int) -> str:
+    """Return the path of a joint's position, velocity or effort."""
+    return f"{topic}.{PLURAL[kind] if _part(topic) in AIMED else kind}[{index}]"
+
+
+def _part(topic: str) -> str:
+    return topic.rpartition(".")[2]
+
+
+def _aimed_at(topic: str, kind: str, index: int, there: set[str]) -> str:
+    """Return the path of what a controller commands of a joint, "" if it is not in the log."""
+    base, _, part = topic.rpartition(".")
+    paths = [f"{base}.{aim}.{PLURAL[kind]}[{index}]" for aim in AIMED[part]]
+    return next((path for path in paths if path in there), "")
 
 
 def _joint_names(files: tuple[Path, ...], wanted: set[str]) -> dict[str, tuple[str, ...]]:
     found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
     for file in files:
         channels: dict[int, Channel] = {}
+        schemas: dict[int, Schema] = {}
         for record in log_records(file):
-            if isinstance(record, Channel):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Messages):
                 for identity in record.channel_ids():
                     channel = channels.get(identity)
                     if channel is not None and channel.topic in wanted:
-                        found[channel.topic] |= _names_in(record.of(identity), channel.encoding)
+                        found[channel.topic] |= _names_in(
+                            record.of(identity), channel.encoding, schemas.get(channel.schema_id)
+                        )
     return {topic: names.pop() for topic, names in found.items() if len(names) == 1}
 
 
@@ -96,7 +130,7 @@ def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """
     none = dict.fromkeys(TURNING, "")
     return {
-        f"{topic}.{kind}[{i}]": unit
+        number_of(topic, kind, i): unit
         for topic, names in joints.items()
         for i, joint in enumerate(names)
         for kind, unit in (
@@ -109,18 +143,23 @@ def _words(joint: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)}
 
 
-def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
+def _names_in(batch: Messages, encoding: str, schema: Schema | None) -> set[tuple[str, ...]]:
     """Return the lists of names in the first and last message of a batch."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     ros1 = encoding == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     read = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    kind, listed = "sensor_msgs/msg/JointState", "name"
+    if schema is not None and schema.name.endswith(NAMING[1]):
+        kind, listed = "control_msgs/msg/JointTrajectoryControllerState", "joint_names"
+        defined = get_types_from_msg(schema.data.decode(errors="replace"), kind)
+        store.register({name: one for name, one in defined.items() if name not in store.types})
     found = set()
     for i in {0, len(batch) - 1}:
         data = batch.buffer[int(batch.starts[i]) : int(batch.ends[i])]
         try:
-            found.add(tuple(read(data, "sensor_msgs/msg/JointState").name))  # type: ignore[attr-defined]
+            found.add(tuple(getattr(read(data, kind), listed)))
         except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
             continue  # not a ROS encoding: joints have no names
     return found
@@ -176,7 +215,13 @@ def of_joint(
             measured = SLIDING if slides(joint) else TURNING
             kind = next((k for k, u in measured.items() if u == unit), None)
             kind = kind or ("position" if unit in ("m", "1") else None)
-            path = f"{topic}.{kind}[{i}]"
+            if kind is None:
+                continue
+            path, why = number_of(topic, kind, i), found("start.joint", topic, joint=joint)
+            if sent and _part(topic) in AIMED:
+                if aimed := _aimed_at(topic, kind, i, there):
+                    return {aimed: Joint(NAMED, why, doubted=False)}
+                continue
             plain = unit == "1"  # commands may be torques, positions or speeds
             torque = sent and kind == "effort"
             if commanded := commands(log, len(names), plain) if torque or (sent and plain) else []:
@@ -184,7 +229,7 @@ def of_joint(
                 return _commanded(commanded, own, from_base(names).index(joint), joint, names)
             measures = kind != "effort" and not COMMAND_TOPIC.search(topic.lower())
             if path in there and not (sent and measures):
-                return {path: Joint(NAMED, found("start.joint", topic, joint=joint), doubted=False)}
+                return {path: Joint(NAMED, why, doubted=False)}
     return {}
 
 
@@ -215,7 +260,7 @@ def in_order(
             continue
         commanded = commands(log, len(names)) if kind == "effort" else []
         for name, joint in zip(those, some, strict=True):
-            path = f"{topic}.{kind}[{names.index(joint)}]"
+            path = number_of(topic, kind, names.index(joint))
             at, own = order.index(joint), [path] * (path in there)
             if commanded:
                 given[name] = _commanded(commanded, own, at, joint, names)
@@ -252,7 +297,9 @@ def perhaps_degrees(
         model: with their units.
         joints: see `joint_names`.
     """
-    called = {f"{t}.position[{i}]": j for t, names in joints.items() for i, j in enumerate(names)}
+    called = {
+        number_of(t, "position", i): j for t, names in joints.items() for i, j in enumerate(names)
+    }
     units, spans = {**model.states, **model.inputs}, {g.name: g.extent for g in guesses}
     peaks = {n: max(map(abs, e)) for n, e in spans.items() if e and units[n] == "rad"}
     moved = max((peak for name, peak in peaks.items() if name in model.states), default=0.0)

@@ -65,13 +65,13 @@ _COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; eith
 _RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
 _COMMANDED = (
     *("ref", "reference", "desired", "des", "target", "setpoint", "goal", "cmd", "command"),
-    "action",
+    *("action", "output"),
 )
 COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target|^/action$")
 _ANGLES = ("roll", "pitch", "yaw")
 # no signals by themselves
 PARTS = re.compile(
-    r"covariance|variance|_var(\[\d+\])?$|\.(eph|epv|evh|evv)$|layout"
+    r"covariance|variance|\.error\.(positions|velocities|accelerations|effort)\[|_var(\[\d+\])?$|\.(eph|epv|evh|evv)$|layout"
     r"|(orientation|rotation|quaternion)\.[xyzw]$|\.q(_d)?\[\d\]$"
 )
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")

@@ -9,10 +9,11 @@ second ingest finds the first.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
@@ -132,6 +133,7 @@ def ingest_log(
     data: bool = False,
     group: str = "",
     ahead: bool = False,
+    sent_before: Mapping[str, float] = MappingProxyType({}),
 ) -> Ingested:
     """Check a log and store it as a trial, see `Workspace.ingest`; store nothing on an error.
 
@@ -148,7 +150,7 @@ def ingest_log(
         read = read_own_trial(workspace, path, candidate, data)
     else:
         try:
-            read = read_log_file(workspace, path, candidate, data)
+            read = read_log_file(workspace, path, candidate, data, sent_before)
         except NoneWaits as error:
             read = best_run_again(workspace, path, error)
     read = copied(workspace, path, read, "" if data else candidate)

@@ -66,7 +66,8 @@ class ForeignLog:
             GroundedError: if the log contains no complete trial.
         """
         model, task = self.workspace.base_model, self.workspace.config.task
-        rest = np.array([task.start.get(name, 0.0) for name in model.input_names])
+        past = {n: s.before for n, s in self.mapping.inputs.items() if s.before is not None}
+        rest = np.array([{**task.start, **past}.get(name, 0.0) for name in model.input_names])
         found = to_grid(
             self.whole,
             task.dt,
@@ -333,8 +334,12 @@ def rates_of(model: Model) -> tuple[str, ...]:
 
 def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
     """Yield where data begin, the timing of their commands, and a dt that does not fit."""
-    if grid.moved_s > dt:
-        yield found("log.from", at=(grid.start_ns - grid.origin_ns) * 1e-9)
+    first = dict(zip(inputs, grid.inputs[0].tolist(), strict=True))
+    sent = {name: value for name, value in first.items() if value}
+    if sent and (grid.moved_s > dt or grid.assumed):
+        name, value = next(iter(sent.items()))
+        at = (grid.start_ns - grid.origin_ns) * 1e-9
+        yield found("log.from", *sent, at=at, name=name, value=value)
     slow = [one for one in grid.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER]
     if slow:
         every = 1 / max(one.rate_hz for one in slow)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
@@ -193,8 +194,14 @@ def _check_candidate(
         )
 
 
-def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
-    """Read a foreign log through [log].
+def read_log_file(
+    workspace: Folder,
+    path: Path,
+    candidate: str | None,
+    data: bool,
+    sent_before: Mapping[str, float] = MappingProxyType({}),
+) -> Read:
+    """Read a foreign log through [log]; `sent_before`: inputs' values until their first samples.
 
     Raises:
         GroundedError: if it can't be mapped or sampled, if no candidate is outstanding, or if [log]
@@ -204,7 +211,7 @@ def read_log_file(workspace: Folder, path: Path, candidate: str | None, data: bo
 
     if twice := twice_in_time(workspace):
         raise GroundedError(twice)
-    log = read_foreign(workspace, path, mapping_of(workspace, path))
+    log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)
     if not (data or ran):
