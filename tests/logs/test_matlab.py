@@ -144,4 +144,4 @@ def test_three_commands_lead_to_a_diagnosis(
     write(tmp_path / "run.mat", {"run": {"t": t, "w": w, "u_cmd": u}})
     assert grounded("init", "motor", "--from", "run.mat", "--yes").code == 0
     assert grounded("-C", "motor", "ingest", "--data", "run.mat").code == 0
-    assert {"tau_w", "gain_w"} <= {*Workspace("motor").diagnose().verdict.parameters}
+    assert {"tau_w", "gain_w_u_cmd"} <= {*Workspace("motor").diagnose().verdict.parameters}

@@ -81,5 +81,5 @@ def test_three_commands_lead_to_a_diagnosis(
     given = ("--columns", "w,u_cmd", "--rate", "50", "--yes")
     assert grounded("init", "motor", "--from", "run0.txt", *given).code == 0
     assert grounded("-C", "motor", "ingest", "--data", "run0.txt", "run1.txt").code == 0
-    assert {"tau_w", "gain_w"} <= {*Workspace("motor").diagnose().verdict.parameters}
+    assert {"tau_w", "gain_w_u_cmd"} <= {*Workspace("motor").diagnose().verdict.parameters}
     assert grounded("-C", "motor", "inspect", "run1.txt").code == 0

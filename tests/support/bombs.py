@@ -313,6 +313,28 @@ def _parquet() -> bytes:
     return out.getvalue()
 
 
+def _mat() -> bytes:
+    """Return a MATLAB file with a packed array of zeros."""
+    from scipy.io import savemat
+
+    out = io.BytesIO()
+    savemat(out, {"t": np.zeros(5 * 10**7), "x": 1.0}, do_compression=True)
+    return out.getvalue()
+
+
+def _mat73() -> bytes:
+    """Return a MATLAB file of version 7.3 with an array of which nothing is stored."""
+    import h5py
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.mat")
+        with h5py.File(path, "w", userblock_size=512) as file:
+            for name in ("t", "x"):
+                file.create_dataset(name, shape=(10**10,), chunks=(10**6,), dtype="f8")
+        data = path.read_bytes()
+    return b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + data[128:]
+
+
 def _npy(array: np.ndarray) -> bytes:
     out = io.BytesIO()
     np.save(out, array)
@@ -332,6 +354,8 @@ OTHERS: dict[str, tuple[str, Callable[[], bytes], str]] = {
     "ROS 1, lz4": ("bomb.bag", lambda: _bag("LZ4", 1_500_000_000), "/t.data[0]"),
     "a table, zstd": ("bomb.csv.zst", lambda: _packed_table(3 * 10**9), "/csv.x"),
     "parquet, one value": ("bomb.parquet", _parquet, "/parquet.x"),
+    "MATLAB, packed zeros": ("bomb.mat", _mat, "/mat.x"),
+    "MATLAB 7.3, nothing stored": ("bomb.mat", _mat73, "/mat.x"),
     "PX4, types of types": ("bomb.ulg", _ulog, "/t.timestamp"),
     "SQLite, generated columns": (
         "bomb.db3",
