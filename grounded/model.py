@@ -12,8 +12,8 @@ named values that the user's function receives.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Literal
@@ -341,6 +341,13 @@ class Model:
     def difference(self, a: Array, b: Array) -> Array:
         """Return the difference a - b of states (..., n), with angles wrapped to [-pi, pi]."""
         return wrapped(np.asarray(a, float) - np.asarray(b, float), self.angle_mask)
+
+    def holding(self, names: Collection[str]) -> Model:
+        """Return the model with some parameters constant, at their values; itself if none is."""
+        if not any(self.params[name].uncertain for name in names):
+            return self
+        held = {n: Param(p.value, p.unit) if n in names else p for n, p in self.params.items()}
+        return replace(self, params=held)
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Return a copy with other parameter values; bounds are widened to include them.

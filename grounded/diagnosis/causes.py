@@ -8,56 +8,28 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from grounded.diagnosis.levels import ALIKE, SURE
 from grounded.diagnosis.parts import Estimate, TrialValue
 from grounded.result import listed, number, with_unit
 
 if TYPE_CHECKING:  # whoever reads a diagnosis needs none of what makes it
     from grounded.effects import Effect
 
-AS_STRONG = 0.2  # a gain this close to -1 is a wrong sign and nothing else
-KNOWN = 2.0  # standard deviations from zero that a value needs to be worded
-
 
 def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """Fill names and values into the sentence of an effect's family; starts in lower case."""
-    from grounded import places
     from grounded.effects import ParamFamily
-    from grounded.effects.medium import factors
 
-    family, site, targets = effect.family, effect.site, effect.site.targets
-    model, (driven, _, source) = site.model, site.target.partition("<-")
-    if "d" in params and isinstance(family, ParamFamily) and site.target in model.params:
-        own = model.params[site.target]
-        now = params["d"].moved(own.value).text
-        return f"{site.target} = {now}, was {with_unit(number(own.value), own.unit)}"
+    family, site = effect.family, effect.site
+    if "d" in params and isinstance(family, ParamFamily) and site.target in site.model.params:
+        own = site.model.params[site.target]
+        return _changed(site.target, params["d"], own.value, own.unit)
     if "d" in params and effect.known:
-        now = params["d"].moved(effect.quantities[0].known).text
-        return f"{effect.name} = {now}, was {with_unit(number(effect.quantities[0].known), 's')}"
-    # words by slot: the values, then the names of what they act on
+        return _changed(effect.name, params["d"], effect.quantities[0].known, "s")
     constants = {q.name: Estimate(q.start, 0.0, None, q.unit) for q in effect.quantities if q.fixed}
-    known = {**constants, **params}
-    words = {name: with_unit(number(e.value), e.unit) for name, e in known.items()}
-    one = len(targets) == 1
-    words.setdefault("s", "s" if one else "")
-    centre = [name for name in places.position(model) if f"{name}0" in known]  # of a patch
-    axes = [*model.roles.get("position", ())][:2]
-    axes = axes if len(axes) == 2 else ["the first axis", "the second"]
-    words |= {
-        "has": "has" if one else "have",
-        "es": "es" if one else "",
-        "place": listed(f"{name} = {words[f'{name}0']}" for name in centre),
-        "least": "near zero",
-        "target": listed(targets),
-        "driven": driven,
-        "source": "its speed" if driven in model.inputs and not one else source,
-        "axis_1": axes[0],
-        "axis_2": axes[1],
-    }
-    if "L" in known and known["L"].value > 0:
-        words["least"] = f"at {words['L']}, its smallest"
-    if "{product}" in family.sentence:
-        words["product"] = " * ".join(factors(site))
-    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= KNOWN * e.std}
+    words = _words(effect, {**constants, **params})
+    # a part is left out if its quantities are zero, or not known
+    told = {n for n, e in params.items() if e.value != 0 and not abs(e.value) <= SURE * e.std}
     told |= {n for n, e in constants.items() if e.value}
 
     def kept(match: re.Match[str]) -> str:  # parts whose quantities are estimated and not zero
@@ -86,6 +58,41 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 
 
+def _changed(name: str, by: Estimate, was: float, unit: str) -> str:
+    return f"{name} = {by.moved(was).text}, was {with_unit(number(was), unit)}"
+
+
+def _words(effect: Effect, known: Mapping[str, Estimate]) -> dict[str, str]:
+    """Return words by slot of a family's sentence: the values, and the names they act on."""
+    from grounded import places
+    from grounded.effects.medium import factors
+
+    site, targets = effect.site, effect.site.targets
+    model, (driven, _, source) = site.model, site.target.partition("<-")
+    words = {name: with_unit(number(e.value), e.unit) for name, e in known.items()}
+    one = len(targets) == 1
+    words.setdefault("s", "s" if one else "")
+    centre = [name for name in places.position(model) if f"{name}0" in known]  # of a patch
+    axes = [*model.roles.get("position", ())][:2]
+    axes = axes if len(axes) == 2 else ["the first axis", "the second"]
+    words |= {
+        "has": "has" if one else "have",
+        "es": "es" if one else "",
+        "place": listed(f"{name} = {words[f'{name}0']}" for name in centre),
+        "least": "near zero",
+        "target": listed(targets),
+        "driven": driven,
+        "source": "its speed" if driven in model.inputs and not one else source,
+        "axis_1": axes[0],
+        "axis_2": axes[1],
+    }
+    if "L" in known and known["L"].value > 0:
+        words["least"] = f"at {words['L']}, its smallest"
+    if "{product}" in effect.family.sentence:
+        words["product"] = " * ".join(factors(site))
+    return words
+
+
 def acts_reversed(params: Mapping[str, Estimate]) -> bool:
     """Return whether the values of an effect are a gain that reverses the sign."""
     return "g" in params and params["g"].value < -1
@@ -97,7 +104,7 @@ def sign_only(name: str, params: Mapping[str, Estimate]) -> bool:
     Its sign is to be flipped; a reversed input of another strength is adopted.
     """
     gain = name.startswith("input_gain:") and acts_reversed(params)
-    return gain and abs(-1 - params["g"].value - 1) < AS_STRONG
+    return gain and abs(-1 - params["g"].value - 1) < ALIKE
 
 
 def furthest_apart(values: Sequence[TrialValue]) -> tuple[TrialValue, TrialValue]:

@@ -40,7 +40,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.sound_data import sound_data
+from grounded.diagnosis.sound_data import MOST_STATES, sound_data
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import (
@@ -215,10 +215,10 @@ def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
     if not isinstance(options, DiagnosisOptions | None):
         raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
     model = subject.model if isinstance(subject, Task) else subject
-    if model.n + model.m > MOST_NAMES:
+    if model.n + model.m > MOST_STATES:
         raise GroundedError(
             f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
-            f"most {MOST_NAMES} of both together, since each may affect each: diagnose a model of "
+            f"most {MOST_STATES} of both together, since each may affect each: diagnose a model of "
             "the part where the gap is"
         )
     return options or DiagnosisOptions()
@@ -371,7 +371,6 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 PAIR = 2  # effects at least that are sought without the leader
-MOST_NAMES = 50  # 36 states and 12 inputs already give 1,649 effects, each of which is filtered
 # The least share of a diagnosis that was done when it scanned for the k-th time or reached a stage,
 # in nine blind cases of four systems (7 s in the mean).
 SCANS = (0.05, 0.10, 0.19, 0.29, 0.35, 0.43, 0.50)

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from grounded.diagnosis.levels import ABOVE, FAR, MANY
 from grounded.result import Document, with_unit
 
-ABOVE = 1.3  # times the noise floor, above which a leftover is stated
-WIDE = 2.0  # times the noise floor, above which a leftover puts claims that gain little in doubt
-SURE = 3.0  # the same in standard deviations of the floor, since many channels are compared
 AT_MOST = "repeats, at most"  # source of a noise floor that holds errors of the model as well
 BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
@@ -267,7 +265,7 @@ class Remainder(Document):
     @property
     def wide(self) -> bool:
         """Whether the error is so far above the floor that what is claimed may stand in for it."""
-        return self.error > WIDE * self.floor > 0
+        return self.error > FAR * self.floor > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,4 +302,4 @@ def doubt_of(unsure: float) -> float:
     Args:
         unsure: standard deviation of the floor's logarithm, `RulerRow.floor_unsure`.
     """
-    return max(ABOVE, math.exp(SURE * unsure))
+    return max(ABOVE, math.exp(MANY * unsure))

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from grounded.diagnosis.error_report import AT_MOST, Remainder, RulerRow, doubt_of, furthest
+from grounded.diagnosis.levels import HALF, SHOWS
 from grounded.findings import Finding, Quantity, found
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Agreement
 
-HALF, MORE = 0.5, 0.2  # improvements: below HALF 1 s ahead and MORE of it over whole trials
-LITTLE = 0.1  # mean share of the errors below which a claim that ties gains too little to adopt
-SHOWS = 0.1  # relative change below which a channel is not named
-COUNTS = 0.03  # relative change below which a loss is not compared with gains elsewhere
 STATES = 2  # whose errors are told
+TINY = 1e-12  # an error that stands in for none
 
 
 def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
@@ -25,7 +23,7 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
     A heating process, for example, moves so little within 1 s that any model predicts it well.
     """
     ahead, whole = furthest(rows), _whole(rows)
-    if ahead and whole and _most(ahead) < HALF and _most(whole) > _most(ahead) + MORE:
+    if ahead and whole and _most(ahead) < HALF < _most(whole):
         return whole
     return ahead
 
@@ -46,33 +44,42 @@ def states_told(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
     return best or [name for name in [most_off(row)] if name]
 
 
+def changes(row: RulerRow) -> dict[str, float]:
+    """Return by how much the logarithm of each state's error grows; within the noise it does not.
+
+    States without an error are left out, as are those whose prediction diverged before.
+    """
+    found = {}
+    for name, before in row.crude.items():
+        now, floor = row.with_effects.get(name, math.nan), row.noise_floor.get(name, 0.0)
+        if before > 0 and math.isfinite(now) and row.tells(name, "crude"):
+            found[name] = math.log(max(now, floor, TINY) / max(before, floor, TINY))
+    return found
+
+
 def gains_of(row: RulerRow) -> dict[str, float]:
-    """Return the share of each channel's error that is gone, without diverging predictions."""
-    told = {n: e for n, e in row.crude.items() if row.tells(n, "crude", "with_effects")}
-    return {n: 1 - row.with_effects[n] / e for n, e in told.items() if e > 0}
+    """Return the share of each state's error that is gone, negative if it grew."""
+    return {name: 1 - math.exp(change) for name, change in changes(row).items()}
 
 
-def lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
-    """Return (factor, row, channel) of the channel whose error grows most.
+def lost_most(rows: Sequence[RulerRow]) -> tuple[RulerRow, str] | None:
+    """Return the row and the state whose error grows most; None if none grows so that it shows.
 
     Whole trials come first if they lose over all states, as they are what a plan is made for.
     """
-    last, ahead = _whole(rows), [row for row in rows if not row.whole_trial]
-    whole = [last] if last else []
-    losses = [_losses(some) for some in (whole, ahead + whole)]
-    lost, other = (max(some, key=lambda loss: loss[0], default=(0.0, None, "")) for some in losses)
-    return lost if lost[0] > 1 + SHOWS and lost[1] is not None and _loses(lost[1]) else other
-
-
-def worse_states(rows: Sequence[RulerRow]) -> bool:
-    """Check whether predictions of some state get clearly worse, or of all states together."""
-    return lost_most(rows)[0] > 1 + SHOWS or outweighed(rows)
+    rows = [row for row in rows if not row.drowned]
+    for some in ([row for row in rows if row.whole_trial and _loses(row)], rows):
+        losses = [(change, row, name) for row in some for name, change in changes(row).items()]
+        most, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
+        if row is not None and most > math.log(1 + SHOWS):
+            return row, name
+    return None
 
 
 def outweighed(rows: Sequence[RulerRow]) -> bool:
     """Check whether the states that get worse lose more than the other states gain."""
-    ratio, row, _ = lost_most(rows)
-    return row is not None and ratio > 1 + COUNTS and _loses(row)
+    lost = lost_most(rows)
+    return lost is not None and _loses(lost[0])
 
 
 def objection(
@@ -104,15 +111,29 @@ def objection(
     if gap and (wide or tied) and _gains_little(rows):
         return found("gap.next.doubt", *effects, why="little")
     differ = {one.effect for one in agreement if not one.agrees} & {*effects}
-    if not differ or not worse_states(rows):
+    if not differ or lost_most(rows) is None:
         return None
     return found("gap.next.doubt", *(name for name in effects if name in differ), why="disagree")
 
 
 def excess(rows: Sequence[RulerRow]) -> tuple[float, str, RulerRow] | None:
     """Return (error / noise, state, row) of the error furthest above the noise; None if none is."""
-    above = [one for one in _ratios(rows) if one[0] > doubt_of(one[2].floor_unsure)]
-    return max(above, key=lambda one: one[0], default=None)
+    each = [(o, name, row) for row in rows if not row.drowned for name, o in above(row).items()]
+    clear = [one for one in each if doubt_of(one[2].floor_unsure) < one[0] < math.inf]
+    return max(clear, key=lambda one: one[0], default=None)
+
+
+def above(row: RulerRow) -> dict[str, float]:
+    """Return each state's error relative to its noise; infinite if that is not known."""
+    known = {n: e for n, e in row.with_effects.items() if math.isfinite(e)}
+    floors = {n: row.noise_floor.get(n, 0.0) for n in known if row.tells(n, "with_effects")}
+    return {n: known[n] / floor if floor > 0 else math.inf for n, floor in floors.items()}
+
+
+def most_off(row: RulerRow) -> str:
+    """Return the state with the largest error relative to its noise; "" if none was measured."""
+    off = above(row)
+    return max(off, key=lambda name: (off[name], row.with_effects[name]), default="")
 
 
 def open_noise(rows: Sequence[RulerRow]) -> str:
@@ -125,16 +146,8 @@ def noise_unknown(row: RulerRow, names: Sequence[str]) -> bool:
     """Check whether only an upper bound of the noise is known, and errors may be within it."""
     if row.floor_from == AT_MOST:
         return True
-    bounds = (doubt_of(0.0) * row.noise_floor.get(name, math.nan) for name in names)
-    errors = (row.with_effects[name] for name in names)
-    return row.floor_at_most and any(e <= b for e, b in zip(errors, bounds, strict=True))
-
-
-def most_off(row: RulerRow) -> str:
-    """Return the state with the largest error relative to its noise; "" if none was measured."""
-    known = {n: e for n, e in row.with_effects.items() if e == e}
-    off = {n: e / max(row.noise_floor.get(n, math.nan), 1e-300) for n, e in known.items()}
-    return max(off, key=lambda n: off[n], default="")
+    off = above(row)
+    return row.floor_at_most and any(off.get(name, 0.0) <= doubt_of(0.0) for name in names)
 
 
 def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:
@@ -152,40 +165,16 @@ def _whole(rows: Sequence[RulerRow]) -> RulerRow | None:
 
 
 def _most(row: RulerRow) -> float:
-    return max((gain for gain in gains_of(row).values() if gain == gain), default=0.0)
+    return max(gains_of(row).values(), default=0.0)
 
 
 def _loses(row: RulerRow) -> bool:
     """Check whether the errors of a row grow, over all states."""
-    told = [n for n, e in row.crude.items() if e > 0 and row.tells(n, "crude", "with_effects")]
-    ends = [(row.with_effects[n], row.crude[n], row.noise_floor.get(n, 0.0)) for n in told]
-    least = 1e-12
-    logs = [math.log(max(now, f, least) / max(then, f, least)) for now, then, f in ends]
-    return sum(value for value in logs if math.isfinite(value)) > 0
-
-
-def _losses(rows: Sequence[RulerRow]) -> list[tuple[float, RulerRow | None, str]]:
-    """Return (factor, row, channel) by which the errors of each channel grow or shrink."""
-    return [
-        (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
-        for row in rows
-        if not row.drowned
-        for name, error in row.crude.items()
-        if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
-    ]
+    return sum(changes(row).values()) > 0
 
 
 def _gains_little(rows: Sequence[RulerRow]) -> bool:
-    """Check whether the errors of the furthest horizon shrink by less than LITTLE on average."""
+    """Check whether the mean share of the error that is gone a horizon ahead does not show."""
     row = furthest(rows)
-    gains = [] if row is None else [gain for gain in gains_of(row).values() if math.isfinite(gain)]
-    return bool(gains) and sum(gains) < LITTLE * len(gains)
-
-
-def _ratios(rows: Sequence[RulerRow]) -> Iterator[tuple[float, str, RulerRow]]:
-    """Yield (error / noise, state, row) of every state and horizon."""
-    for row in (row for row in rows if not row.drowned):
-        for name, noise in row.noise_floor.items():
-            error = row.with_effects.get(name, math.nan)
-            if noise > 0 and math.isfinite(error) and row.tells(name, "with_effects"):
-                yield error / noise, name, row
+    gains = [] if row is None else [*gains_of(row).values()]
+    return bool(gains) and sum(gains) < SHOWS * len(gains)

@@ -38,11 +38,10 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.causes import value_called
+from grounded.diagnosis.levels import NATS, SHOWS, WELL
 from grounded.diagnosis.likelihood.data import Data, prepare
-from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import foretold
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
@@ -63,11 +62,8 @@ from grounded.trial import Trial
 NOTHING = 0.1  # nats below which no trial can separate two effects
 REPLAYED = 4  # most recent trials whose commands are used to calibrate the expected evidence
 ADAPTED = 12  # iterations in which a rival is fitted to a run
-TWICE = 0.8  # two runs are asked for if they leave less than this part of what one leaves of `+-`
 SETTLED = 4  # iterations in which the track of an unmeasured state is found
-TEACHES = 0.1  # smallest relative reduction of a value's `+-` for which a probe is advised
 MOST = 0.1  # smallest fraction of a value's `+-` that is promised
-WELL = 0.005  # `+-` relative to a value, below which it is well known
 LITTLE = 1e-6  # fraction of a value's information, and of its size, that counts as zero
 
 
@@ -173,25 +169,12 @@ def _teaching(
     task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> Probe | None:
     """Find the probe that gives most information on claimed and calibrated values."""
-    known, task = _calibrated(task, diagnosis)
-    scales, h = _scales(task, trials), Hypothesis()
-    spreads: dict[str, Estimate] = {}  # by column
-    for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
-        row, effect = diagnosis.ranked(name), _effect(library, name, task, diagnosis, scales)
-        if row is None:
-            return None
-        h = h.plus(effect, row.values)
-        spreads |= {f"{q.name} of {name}": row.params[q.name] for q in effect.free}
-    noise, best = KnownNoise.of(task.model, diagnosis), None
-    data = noise.data(task, trials)
-    sizes = {data.model.param_names[i]: float(param_scale(data.model)[i]) for i in calibrated(data)}
-    if known:
-        h = replace(h, shift=np.zeros(data.model.system.k), spread=1.0)
-        spreads |= {n: known.get(n, Estimate(0.0, 0.0)) for n in sizes}
-    each = {name: e.std / sizes.get(name, 1.0) for name, e in spreads.items()}
-    std = np.array([s if np.isfinite(s) else 0.0 for s in each.values()])
-    if not std.any():
+    asked = _asked(task, diagnosis, trials, library)
+    if asked is None:
         return None
+    task, h, spreads, each = asked
+    noise, best = KnownNoise.of(task.model, diagnosis), None
+    std, values = np.array([*each.values()]).T
     groups = information(task, trials, h, noise)
     if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
         return None
@@ -217,17 +200,16 @@ def _teaching(
         return None
     gain, chosen, words, J = best
     once, twice = _left(groups, J, prior, std / unit_of, _misfit(diagnosis))
-    values = np.array([e.value / sizes.get(n, 1.0) for n, e in spreads.items()])
     well = bool(diagnosis.leftover or diagnosis.unconfirmed) & (std < WELL * np.abs(values))
     k = int(np.argmin(np.where((std > 0) & (~well | well[std > 0].all()), twice, np.inf)))
-    again = bool(twice[k] < TWICE * once[k])
+    again = bool(twice[k] < (1 - SHOWS) * once[k])
     shrunk = max(float(twice[k] if again else once[k]), MOST)
     name = list(spreads)[k]
-    of = data.model.params[name].unit if name in sizes else spreads[name].unit
+    of = spreads[name].unit
     now = float(spreads[name].std)
     then, called = now * shrunk, value_called(name, (diagnosis.made or Made()).effects)
     motion = diagnosis.motions == 1 < len(trials) and words != BASE
-    little = not motion and (shrunk > 1 - TEACHES or bool(well[k]))
+    little = not motion and (shrunk > 1 - SHOWS or bool(well[k]))
     step = found("gap.next.no_probe", name, value=called)
     if motion:
         step = found("gap.next.probe", name, probe=words, motion=True)
@@ -236,6 +218,38 @@ def _teaching(
         twice_run = 2 if again else None
         step = found("gap.next.probe", name, probe=words, value=called, runs=twice_run, **ends)
     return Probe(chosen, gain, (name,), step, little, then, 1 + again)
+
+
+def _asked(
+    task: Task, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
+) -> tuple[Task, Hypothesis, dict[str, Estimate], dict[str, tuple[float, float]]] | None:
+    """Return the calibrated task, the hypothesis of a diagnosis, and its values; None without any.
+
+    They are the values by name, and of each the standard deviation and the value in the unit of its
+    column.
+    """
+    known, task = _calibrated(task, diagnosis)
+    scales, h = _scales(task, trials), Hypothesis()
+    spreads: dict[str, Estimate] = {}
+    for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
+        row, effect = diagnosis.ranked(name), _effect(library, name, task, diagnosis, scales)
+        if row is None:
+            return None
+        h = h.plus(effect, row.values)
+        spreads |= {f"{q.name} of {name}": row.params[q.name] for q in effect.free}
+    model = task.model
+    sizes = {n: float(s) for n, s in zip(model.param_names, param_scale(model), strict=True)}
+    if known:
+        h = replace(h, shift=np.zeros(model.system.k), spread=1.0)
+        free = [n for n, size in sizes.items() if size > 0]
+        none = {n: Estimate(0.0, 0.0, None, model.params[n].unit) for n in free}
+        spreads |= {n: replace(known.get(n, none[n]), unit=none[n].unit) for n in free}
+    each = {
+        n: (e.std / size if np.isfinite(e.std) else 0.0, e.value / size)
+        for n, e in spreads.items()
+        for size in [sizes.get(n, 1.0)]
+    }
+    return (task, h, spreads, each) if any(std for std, _ in each.values()) else None
 
 
 def _left(groups: Array, J: Array, prior: Array, stated: Array, misfit: float) -> tuple[Array, ...]:

@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.causes import acts_reversed, sign_only
+from grounded.diagnosis.levels import HALF
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.findings import Finding, found
 from grounded.model import all_at_bounds
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from grounded.diagnosis.validation.claims import Claims
     from grounded.task import Task
     from grounded.trial import Trial
-
-HALF = 0.5  # of the time driven in a region, from which a trial can hardly spend more; of a gap
 
 
 def next_step(

@@ -32,6 +32,7 @@ from grounded.result import Document, figure, number, or_zero, seen, spread, wit
 
 Kind = Literal["effect", "several", "none", "unknown"]
 LARGE, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
+UNKNOWN = 1e4  # times a value, at least of 1: standard deviation from which it is unknown
 NEXT = "gap.next."  # before the codes of next steps
 
 
@@ -77,6 +78,11 @@ class Estimate(Document):
         shown = figure(value, digits) if large else f"{value:#.{digits}g}".rstrip(".")
         return with_unit(f"{shown if value else 0} +- {spread(std)}", self.unit)
 
+    @property
+    def known(self) -> bool:
+        """Whether its standard deviation is not so large that the value means nothing."""
+        return not self.std > UNKNOWN * max(abs(self.value), 1.0)
+
     def moved(self, by: float) -> Estimate:
         """Return the estimate shifted by a constant."""
         ends = None if self.interval is None else (self.interval[0] + by, self.interval[1] + by)
@@ -112,7 +118,7 @@ class Likeness(Document):
 
 @dataclass(frozen=True, eq=False)
 class Unconfirmed(Document):
-    """A likely effect that few trials show, mostly `trial` from `start` to `end` [s].
+    """A likely effect that few trials show, mostly `trial`.
 
     seen: number of trials that hold most of its action, and of all trials; `trials`: these, those
     that show it best first. region: where it acts.
@@ -124,8 +130,6 @@ class Unconfirmed(Document):
     params: Mapping[str, Estimate] = field(default_factory=dict)
     evidence: float = math.nan  # [nats]
     trial: str = ""
-    start: float = field(metadata={"key": "from"}, default=math.nan)
-    end: float = field(metadata={"key": "to"}, default=math.nan)
     seen: tuple[int, int] = (1, 1)
     region: Region | None = None
     repeats: bool = False

@@ -3,54 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import RulerRow, furthest
+from grounded.diagnosis.error_report import RulerRow
+from grounded.diagnosis.errors_told import changes
 from grounded.diagnosis.parts import Diagnosed
-from grounded.diagnosis.tables import larger
+from grounded.diagnosis.tables import columns_told, larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, percent, shown
 
 MOST = 12  # bars
-CREDIT_S = 1.0  # horizon at which a cause's worth is measured [s]
 STATES = 6  # whose error without each cause is drawn
-APART = 0.01  # relative difference of errors below which curves coincide
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
-MODELS = {  # keys of a prediction error: role, name
-    "outset": ("limit", "model.py"),
-    "crude": ("model", "model"),
-    "calibrated": ("step1", "calibrated"),
-    "with_effects": ("best", "as diagnosed"),
-    "noise_floor": ("other", "noise alone"),
+ROLES = {  # of the columns of prediction errors
+    "outset": "limit",
+    "crude": "model",
+    "calibrated": "step1",
+    "with_effects": "best",
+    "noise_floor": "other",
 }
-
-
-def models(error: RulerRow) -> dict[str, tuple[str, str]]:
-    """Return `MODELS`, with the noise labelled as a bound if it is one."""
-    bound = {"noise_floor": ("other", "noise, at most")}
-    return MODELS | bound if error.floor_bound else MODELS
-
-
-def _told_apart(errors: Sequence[RulerRow]) -> dict[str, tuple[str, str]]:
-    """Return `models`, merging those with the same errors everywhere: `model = as diagnosed`."""
-    found: dict[str, tuple[str, str]] = {}
-    for key, (role, name) in models(errors[0]).items():
-        alike = (other for other in found if all(_same(e, key, other) for e in errors))
-        other = next(alike, "")
-        if other and key != "noise_floor":
-            name = f"{found.pop(other)[1]} = {name}"
-        found[key] = role, name
-    return found
-
-
-def _same(error: RulerRow, one: str, other: str) -> bool:
-    """Check whether two columns coincide in a figure."""
-    a, b = getattr(error, one), getattr(error, other)
-    known = [n for n in a if n in b and math.isfinite(a[n]) and math.isfinite(b[n])]
-    return bool(known) and all(math.isclose(a[n], b[n], rel_tol=APART) for n in known)
 
 
 def gap_figures(diagnosis: Diagnosed) -> list[Figure]:
@@ -67,7 +41,8 @@ def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
     if not errors:
         return None
     apart = any(not e.whole_trial for e in errors) and len(errors) > 1
-    panels = _over_horizons(errors) if apart else _by_channel(errors[0])
+    columns = columns_told(diagnosis)
+    panels = _over_horizons(errors, columns) if apart else _by_channel(errors[0], columns)
     if not panels:
         return None
     held = "held-out data" if errors[0].held_out != "no" else "the data used for the diagnosis"
@@ -76,7 +51,7 @@ def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
-def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
+def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel | Bars]:
     """Return one panel per state: its error over the horizon, and apart, that of whole trials."""
     units = errors[0].unit_by_channel
     panels: list[Panel | Bars] = []
@@ -89,13 +64,13 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     ]
     for channel, unit in units.items():
         curves = []
-        for key, (role, name) in _told_apart(errors).items():
+        for key, name in columns.items():
             values = np.array([getattr(e, key).get(channel, math.nan) for e in errors], float)
             for rows, note in ((~whole, ""), (whole, WHOLE)):
                 if (values[rows] > 0).any():  # the axis is logarithmic
                     style = "line" if rows.sum() > 1 and not note else "points"
                     curves.append(
-                        Curve(at[rows], values[rows], role, name, 2.0, style=style, note=note)
+                        Curve(at[rows], values[rows], ROLES[key], name, 2.0, style=style, note=note)
                     )
         if curves:
             curves.sort(key=lambda curve: curve.role != "other")  # noise is drawn behind
@@ -105,14 +80,14 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     return panels
 
 
-def _by_channel(error: RulerRow) -> list[Panel | Bars]:
+def _by_channel(error: RulerRow, columns: Mapping[str, str]) -> list[Panel | Bars]:
     panels: list[Panel | Bars] = []
     for channel, unit in error.unit_by_channel.items():
         bars = []
-        for key, (role, name) in models(error).items():
+        for key, name in columns.items():
             value = getattr(error, key).get(channel, math.nan)
             if math.isfinite(value):
-                bars.append((name, value, role))
+                bars.append((name, value, ROLES[key]))
         if bars:
             when = WHOLE if error.whole_trial else f"{error.horizon_s:.3g} s ahead"
             panels.append(Bars(f"{channel}, {when}", _in_unit(bars, unit)))
@@ -132,8 +107,10 @@ def credit_figure(diagnosis: Diagnosed, states: int = STATES) -> Figure | None:
         diagnosis: the diagnosis.
         states: largest number of states, those with the largest improvement first.
     """
-    credit, error = diagnosis.credit, _second_ahead(diagnosis.prediction_error)
-    names = _improved(error)[:states] if error else []
+    credit, ahead = diagnosis.credit, [e for e in diagnosis.prediction_error if not e.whole_trial]
+    error = ahead[-1] if ahead and not ahead[-1].drowned else None
+    changed = changes(error) if error else {}
+    names = sorted(changed, key=lambda name: changed[name])[:states]
     panels = [worth_of(name, error, diagnosis) for name in names if error]
     if credit:
         bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST]]
@@ -155,30 +132,11 @@ def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
         rows += [(("best", "with all causes"), error.with_effects)]
     if len(causes) > 1:  # without the only one, it is the model before
         rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST]]
-    rows += [(models(error)["noise_floor"], error.noise_floor)]
+    rows += [(("other", columns_told(diagnosis)["noise_floor"]), error.noise_floor)]
     known = [(look, errors[name]) for look, errors in rows if name in errors]
     bars = [(label, v, role) for (role, label), v in known if math.isfinite(v)]
     unit = error.unit_by_channel.get(name, "")
     return Bars(f"{name}: error {error.horizon_s:.3g} s ahead", _in_unit(bars, unit))
-
-
-def _improved(error: RulerRow) -> list[str]:
-    """Return the states by how much better they are predicted, best first."""
-    gain = {
-        name: error.crude[name] / max(after, 1e-300)
-        for name, after in error.with_effects.items()
-        if error.crude.get(name) and math.isfinite(error.crude[name])
-    }
-    return sorted(gain, key=lambda name: -gain[name])
-
-
-def _second_ahead(errors: Sequence[RulerRow]) -> RulerRow | None:
-    """Return the errors at the horizon at which credit is measured; None if they tell nothing."""
-    horizons = [e for e in errors if not e.whole_trial]
-    if horizons and horizons[0].horizon_s > CREDIT_S / 2:  # a slow process
-        return furthest(horizons)
-    ahead = (e for e in horizons if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1))
-    return next((e for e in ahead if not e.drowned), None)
 
 
 def where_figure(diagnosis: Diagnosed) -> Figure | None:

@@ -9,13 +9,11 @@ from typing import Any
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.causes import effect_of, furthest_apart, sign_only, value_called
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise, worse_states
+from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise
+from grounded.diagnosis.levels import ALIKE, SAME, SURE
 from grounded.diagnosis.parts import Diagnosed, Estimate
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
-
-CLOSE = 0.2  # relative distance of a gain from a power of ten
-NEARLY = 0.95  # share of a claimed effect's signal from which another makes nearly the same
 
 
 def quantity(e: Estimate) -> Quantity:
@@ -42,7 +40,7 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
     for one in d.lookalikes:
         if one.share >= 1.0:
             yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
-        elif one.share > NEARLY:
+        elif one.share > SAME:
             yield found("gap.alike", one.effect, effect=one.effect, like=one.like)
     for seen in d.unconfirmed:
         yield found(
@@ -105,8 +103,8 @@ def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
 def _of_errors(d: Diagnosed) -> Iterator[Finding]:
     """Errors that grow, and those that stay above the noise without a cause."""
     rows = d.prediction_error
-    _, row, name = lost_most(rows)
-    if row is not None and worse_states(rows):
+    if lost := lost_most(rows):
+        row, name = lost
         ends = errors(row, name, now="with_effects", before="crude")
         yield found("gap.worse", name, state=name, **_when(row), **ends)
     if (above := excess(rows)) and not d.leftover:
@@ -123,8 +121,6 @@ def _when(row: RulerRow) -> dict[str, Any]:
 
 def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
     """What values rest on, stopped at, and may be zero."""
-    from grounded.diagnosis.likelihood.levels import SURE
-
     rests: dict[tuple[str, ...], list[str]] = {}
     for name, on in d.conditions.items():
         rests.setdefault(on, []).append(value_called(name, adopted))
@@ -151,7 +147,7 @@ def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
 
 def _power_of_ten(ratio: float) -> bool:
     power = round(math.log10(ratio)) if ratio > 0 else 0
-    return power != 0 and abs(ratio / 10.0**power - 1) <= CLOSE
+    return power != 0 and abs(ratio / 10.0**power - 1) <= ALIKE
 
 
 def _of_model(d: Diagnosed, model: Model) -> Iterator[Finding]:

@@ -14,6 +14,8 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
+MOST_STATES = 50  # of a filter, whose step costs their cube; of a diagnosis with the inputs
+
 
 def sound_data(
     subject: Task | Model,

@@ -8,13 +8,17 @@ from collections.abc import Iterable
 from grounded.accounts.finding import Finding
 from grounded.diagnosis.error_report import RulerRow, furthest
 from grounded.diagnosis.errors_told import telling
-from grounded.diagnosis.parts import Diagnosed, Estimate, Ranked
+from grounded.diagnosis.parts import Diagnosed, Ranked
 from grounded.result import figure, or_zero, percent, shown
 
 Cells = tuple[str, ...]
-WIDEST = 1e4  # an interval wider than this times the value, and than UNBOUNDED, says nothing
-UNBOUNDED = 1e6
-INTERVAL = 2 * 1.96  # width of a 95 % interval in standard deviations
+COLUMNS = {
+    "outset": "model.py",
+    "crude": "model",
+    "calibrated": "calibrated",
+    "with_effects": "as diagnosed",
+    "noise_floor": "noise",
+}
 
 
 def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
@@ -32,14 +36,7 @@ def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[lis
     if not (whole_trials or not ahead or (row is not None and row.whole_trial)):
         whole = []
     shown_rows = (*ahead, *whole)
-    columns = {"crude": "crude", "calibrated": "calibrated", "with_effects": "as diagnosed"}
-    if any(one.outset for one in ahead):
-        columns = {"outset": "model.py"} | columns | {"crude": "now"}
-    if diagnosis.no_cause or not diagnosis.verdict.causes:  # what was fitted is no finding
-        columns = {k: v for k, v in columns.items() if k in ("outset", "crude")}
-    elif not any(one.calibrated for one in ahead):
-        del columns["calibrated"]
-    columns["noise_floor"] = "noise" + ", at most" * any(one.floor_bound for one in ahead)
+    columns = columns_told(diagnosis)
     rows: list[Cells] = []
     for one in shown_rows:
         when = "whole trial" if one.whole_trial else f"{one.horizon_s:.3g} s ahead"
@@ -49,6 +46,19 @@ def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[lis
                 figures = (_cell(one, key, name) for key in columns)
                 rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
+
+
+def columns_told(diagnosis: Diagnosed) -> dict[str, str]:
+    """Return the columns of `RulerRow` that are told, with their names."""
+    rows, columns = diagnosis.prediction_error, dict(COLUMNS)
+    if not any(row.outset for row in rows):
+        del columns["outset"]
+    if diagnosis.no_cause or not diagnosis.verdict.causes:  # what was fitted is no finding
+        del columns["calibrated"], columns["with_effects"]
+    elif not any(row.calibrated for row in rows):
+        del columns["calibrated"]
+    columns["noise_floor"] += ", at most" * any(row.floor_bound for row in rows)
+    return columns
 
 
 def _cell(row: RulerRow, column: str, name: str) -> str:
@@ -131,14 +141,5 @@ def _evidence(row: Ranked) -> str:
 def values_of(row: Ranked) -> str:
     """Format the quantities of an effect with their standard deviations and units."""
     return ", ".join(
-        f"{name} = {'unknown' if _unknown(e) else e.text}" for name, e in row.params.items()
+        f"{name} = {e.text if e.known else 'unknown'}" for name, e in row.params.items()
     )
-
-
-def undetermined(width: float, value: float) -> bool:
-    """Return whether a 95 % interval is so wide that the value means nothing."""
-    return width > max(WIDEST * abs(value), UNBOUNDED)
-
-
-def _unknown(e: Estimate) -> bool:
-    return e.std == math.inf or undetermined(INTERVAL * e.std, e.value)

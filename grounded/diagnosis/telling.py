@@ -13,6 +13,7 @@ from typing import Any
 
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.errors_told import errors, excess, noise_unknown, states_told, telling
+from grounded.diagnosis.levels import SHOWS
 from grounded.diagnosis.parts import NEXT, Diagnosed
 from grounded.diagnosis.tables import Cells, values_of
 from grounded.findings import Finding, Quantity, found, settle
@@ -25,7 +26,6 @@ LINES = frozenset(  # codes of the lines, which are made from the facts
 )
 CAUSES = 2  # told in words; the table has all
 FINDINGS = 3  # told beside the lines; the others with --details
-LEAST_SHARE = 0.005  # of the gap: a channel below it is not told
 
 
 @dataclass(frozen=True)
@@ -168,9 +168,7 @@ def open_line(d: Diagnosed) -> Iterator[Finding]:
         )
         return
     # NaN: only noise
-    channels = [
-        one for one in d.where.channels if LEAST_SHARE <= one.share < math.inf
-    ]  # NaN: only noise
+    channels = [one for one in d.where.channels if SHOWS <= one.share < math.inf]  # NaN: only noise
     if not channels:
         return
     first, second, region = channels[0], channels[1:2], d.where.regions[:1]

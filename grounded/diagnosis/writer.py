@@ -60,7 +60,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
-NAMED, VALUED = 3, 2  # parameters in the words of a cause: at most, and with their values
+NAMED = 2  # most parameters in the words of a cause
 
 
 class Writer:
@@ -117,7 +117,7 @@ class Writer:
             off_too = [data.model.state_names.index(one.channel) for one in remainder]
             gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
         channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
-        seen = unconfirmed(self.claims, self.decision.doubtful, groups, furthest(rows))
+        seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         moved, parameters = len(data.groups), self.claims.parameters()
         identified = tuple(_identified(self.uncertain, self.best, parameters))
@@ -244,7 +244,7 @@ class Writer:
             for c, n in zip(called, off, strict=True)
         )
         more = [f"{len(off) - NAMED} more"] * (len(off) > NAMED)
-        shown = tuple(each) if len(off) <= VALUED else None
+        shown = tuple(each) if len(off) <= NAMED else None
         own = found("model.off", values=shown, names=(*called[:NAMED], *more)).sentence
         return tuple(
             meaning(effects[one.of], values[one.of]) if one.of in effects else own for one in credit

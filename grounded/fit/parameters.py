@@ -8,7 +8,7 @@ fitted is the effect `delay`, as in a diagnosis. The errors before and after are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -27,10 +27,11 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import FAR, level
 from grounded.diagnosis.likelihood.linearise import thresholds
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.likelihood.polish import SAME as STILL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.sound_data import sound_data
+from grounded.diagnosis.sound_data import MOST_STATES, sound_data
 from grounded.diagnosis.validation.limits import counted_once, held
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
@@ -39,7 +40,7 @@ from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError, list_of, nearest, type_of
 from grounded.fit.result import Fit, Found, PredictionError, errors_of, nothing, report
 from grounded.frozen import Array
-from grounded.model import Model, Param
+from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.share import share_of
 from grounded.task import Task
@@ -47,8 +48,6 @@ from grounded.trial import Trial
 
 Latency = Literal["known", "common", "each"] | Mapping[str, tuple[int, ...]]
 GRID = 21  # values of a threshold that are tried
-LEVEL = 0.05  # [nats] difference that is none
-MOST_STATES = 50  # with twice as many, 200 steps take minutes
 BOUNDS = (
     "to fit a parameter, give bounds, Param(value, unit, low, high), or a prior, "
     "Param(value, unit, std=s)"
@@ -128,7 +127,7 @@ def fit(
     for inputs in delayed.values():
         late[list(inputs)] = late[inputs[0]]
     kept = asked if names is not None else {n for n in asked if data.model.params[n].uncertain}
-    data = replace(data, model=_only(given, kept), latency=late)
+    data = replace(data, model=given.holding({*given.params} - {*kept}), latency=late)
     with (
         np.errstate(all="ignore"),
         interruptible(lambda: tick.so_far),
@@ -194,7 +193,7 @@ def _identified(
             return done
         params = data.model.params
         surest = min(lost, key=lambda n: params[n].spread / max(abs(params[n].value), 1e-9))
-        data = replace(data, model=_only(data.model, {*data.model.uncertain} - {surest}))
+        data = replace(data, model=data.model.holding([surest]))
 
 
 def _searched(search: Alone, late: Sequence[Effect], tick: Stages) -> Fitted | None:
@@ -283,11 +282,11 @@ def _at(fit: Fitted, data: Data, j: int, value: float) -> Hypothesis:
 def _centred(search: Alone, fit: Fitted) -> Fitted:
     """Return a fit with each threshold amid the values that are as likely: no sample is there."""
     for j in thresholds(search.predictor, fit):
-        move = sum(level(search.predictor, fit, j, LEVEL)) / 2
+        move = sum(level(search.predictor, fit, j, STILL)) / 2
         unit = np.arange(fit.gram.shape[-1]) == j
         start = (moved(search.data, fit.hypothesis, move * unit), fit.noise, fit.track)
         (there,) = refine(search.predictor, [start], iterations=1, fixed_noise=True) or [fit]
-        if there.peak > fit.peak - LEVEL:
+        if there.peak > fit.peak - STILL:
             fit = replace(there, settled=fit.settled, fine=fit.fine)
     return fit
 
@@ -348,9 +347,3 @@ def _asked(model: Model, names: Sequence[str] | None, more: bool) -> tuple[str, 
     if not chosen and not more:
         raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
     return chosen
-
-
-def _only(model: Model, kept: Collection[str]) -> Model:
-    """Return the model with all parameters constant but some."""
-    params = {n: p if n in kept else Param(p.value, p.unit) for n, p in model.params.items()}
-    return replace(model, params=params)

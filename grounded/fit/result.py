@@ -13,14 +13,14 @@ import numpy as np
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.levels import LEAST, NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.gain import LEAST, Gain
+from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.errors import GroundedError

@@ -11,7 +11,7 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
-from grounded.diagnosis.likelihood.levels import NATS
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.parts import Ranked
 from grounded.diagnosis.validation.blame import fewest, loss, still
 from grounded.diagnosis.writer import MOST_EFFECTS, Writer

@@ -169,7 +169,7 @@ def test_names_are_text_never_markup(cart):
     assert "".join(tags.text).count("window.hacked=2") > 10
 
 
-@pytest.mark.parametrize("interval", [None, [None, None], [-3e9, 3e9], [0.4, 0.5]])
+@pytest.mark.parametrize("interval", [None, [None, None], [0.4, 0.5]])
 def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     value = {"value": 0.3, "std": 0.01, "unit": "1/s", "interval": interval}
     entry = DIAGNOSIS["ranking"][0] | {"params": {"k": value}}

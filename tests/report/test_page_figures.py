@@ -272,7 +272,8 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     )
     late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
     dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
-    found = Diagnosis(Verdict("effect"), credit=(late, dry), prediction_error=(row,))
+    verdict = Verdict("several", ("delay:u", "dead_zone:u"), ("late", "dry"))
+    found = Diagnosis(verdict, credit=(late, dry), prediction_error=(row,))
     share, worth = credit_figure(found, 1).panels
     assert [(bar.label, bar.value) for bar in share.bars] == [
         ("delay:u", 0.9),

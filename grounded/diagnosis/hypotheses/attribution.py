@@ -25,9 +25,9 @@ from grounded.diagnosis.hypotheses.search import (
 )
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.hypotheses.variations import HOPEFUL, TUNED, reordered, swapped, varied
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler

@@ -2,7 +2,7 @@
 
 The correction of a channel's rate is a curve (`grounded.effects.correction`) over the state or
 input for which it gains most likelihood on held-out trials; a second curve is added if it gains
-CLAIM nats more. It may be adopted if predictions of each trial, with weights from the other trials,
+PICKED nats more. It may be adopted if predictions of each trial, with weights from the others,
 improve by more than their scatter between trials. It is not an explanation.
 """
 
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.error_report import Correction, Curve
-from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, filter_of, held_out_columns
+from grounded.diagnosis.hypotheses.leftover import Leftover, filter_of, held_out_columns
+from grounded.diagnosis.levels import LEAST, PICKED, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ahead import missed
 from grounded.diagnosis.validation.prediction_error import Horizon
@@ -28,7 +28,6 @@ from grounded.frozen import Array
 from grounded.result import per_second
 
 MOST = 2  # most variables
-LEAST = 0.02  # smallest relative reduction of the held-out squared error to be adoptable
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ def correction(
         return None
     i = predictor.data.model.state_names.index(left[0].channel)
     chosen, gains = list[_Curve](), filter_of(predictor, fit)
-    best, weights = CLAIM, np.zeros((predictor.data.count + 1, 0))
+    best, weights = PICKED, np.zeros((predictor.data.count + 1, 0))
     while len(chosen) < MOST:
         rivals = [c for c in _curves(predictor, fit) if c.over not in [o.over for o in chosen]]
         tried = [
@@ -72,7 +71,7 @@ def correction(
         if not tried:
             break
         (gain, _, each), curve = max(tried, key=lambda pair: pair[0][0])
-        if gain < best + CLAIM * bool(chosen):
+        if gain < best + PICKED * bool(chosen):
             break
         best, weights, chosen = gain, each, [*chosen, curve]
     if not chosen:
@@ -145,7 +144,7 @@ def _judged(
         channel=channel,
         over=tuple(one.over for one in curves),
         held_out_gain=gain,
-        adoptable=gain > max(LEAST, SURE * scatter),
+        adoptable=gain > max(2 * LEAST, SURE * scatter),
         unit=unit,
         curves=tuple(shapes),
     )

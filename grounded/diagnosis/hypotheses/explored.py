@@ -26,10 +26,10 @@ from itertools import combinations
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor

@@ -26,9 +26,9 @@ from grounded.diagnosis.hypotheses.search import (
 )
 from grounded.diagnosis.hypotheses.tuning import tune
 from grounded.diagnosis.hypotheses.variations import LATE, push, varied
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded import places
+from grounded.diagnosis.levels import PICKED
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -29,7 +30,6 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.result import per_second
 
-CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
 PENALTIES = (3.0, 30.0)  # ridge: relative prior variances of the weights
 LAGS = (1, 2, 4, 7)  # steps
 RHO_LAGS = 10  # autocorrelation lags of the test for white innovations
@@ -58,7 +58,7 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
         if i in data.hidden:
             continue
         gain, step_gain, correction = _channel(predictor, fit, gains, features, i)
-        if gain > CLAIM:
+        if gain > PICKED:
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
             found.append(Leftover(name, gain, size, per_second(unit), correction, step_gain))

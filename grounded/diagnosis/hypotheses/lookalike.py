@@ -34,6 +34,7 @@ from grounded import places
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.hypotheses.scan import scan_candidates
 from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
@@ -298,7 +299,6 @@ def _rate(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
 
 
 # -- one clock
-SLIGHT = 1e-9  # fraction of a step's largest slope that counts as no dependence
 FAMILIES = {"delay": "sensor_delay", "sensor_delay": "delay"}
 
 
@@ -353,7 +353,7 @@ def _parts(model: Model) -> list[set[str]]:
     slopes = np.abs(np.concatenate([f_x - np.eye(model.n), f_u], axis=-1)).max(axis=0)
     names = (*model.state_names, *model.input_names)
     parts = [{name} for name in names]
-    for i, j in np.argwhere(slopes > SLIGHT * slopes.max()):
+    for i, j in np.argwhere(slopes > ROUNDING * slopes.max()):
         one, other = (next(p for p in parts if names[k] in p) for k in (i, j))
         if one is not other:
             parts.remove(other)

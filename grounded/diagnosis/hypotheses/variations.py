@@ -22,9 +22,9 @@ from grounded import places
 from grounded.diagnosis.hypotheses.orders import orders
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.hypotheses.tuning import tune
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.levels import NATS
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.actuator import delay

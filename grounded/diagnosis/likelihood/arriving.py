@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from grounded.compile import Named
+from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.memory import Sent, part_of, settled, shifted, shifted_within
 from grounded.frozen import Array
 
-WHOLE = 1e-9  # steps by which a latency may differ from a whole number
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]
 
 
@@ -45,7 +45,7 @@ def within_steps(acting: Acting, data: Data) -> bool:
     """Check whether an input may change within a step."""
     parts = np.abs(data.latency / data.dt - np.round(data.latency / data.dt))
     moving = (e.family for e, _ in acting if isinstance(e.family, MemoryFamily))
-    return bool((parts > WHOLE).any()) or any(f.transport or f.lead is not None for f in moving)
+    return bool((parts > ROUNDING).any()) or any(f.transport or f.lead is not None for f in moving)
 
 
 def delayed(acting: Acting, data: Data) -> Array | None:

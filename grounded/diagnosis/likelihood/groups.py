@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.levels import ALIKE
 from grounded.frozen import Array
 
 REPEATS = 0.03  # fraction of a signal's power below which two trials make the same motion
 TENTHS = 10  # stretches whose means are compared
-LENGTH = 0.2  # relative difference of the lengths of trials of one group, at most
 MOTION, LEVEL = 1 / 3, 0.5  # most of all steps that are left out together, see `folds`
 MOST_FOLDS = 20
 
@@ -68,7 +68,7 @@ class Signals:
         apart = 0.5 * ((self.means - self.means[i]) ** 2).mean(axis=1)
         same = (apart <= REPEATS * self.spread)[:, self.moves].all(axis=1)
         longer = np.maximum(self.lengths, self.lengths[i])
-        same &= longer <= (1 + LENGTH) * np.minimum(self.lengths, self.lengths[i])
+        same &= longer <= (1 + ALIKE) * np.minimum(self.lengths, self.lengths[i])
         named = (self.named != "") | (self.named[i] != "")
         return np.where(named, self.named == self.named[i], same)
 

@@ -14,8 +14,8 @@ is small and the values are far apart.
 
 Between two groups, the difference of their values relative to its standard error is the evidence of
 a change. The standard error is at least that of the jackknife over trials (Efron & Stein, "The
-jackknife estimate of variance", Annals of Statistics 9, 1981), and held-out trials must be likelier
-with the change. Changes are found by forward selection, the largest first, each given those before.
+jackknife estimate of variance", Annals of Statistics 9, 1981). Changes are found by forward
+selection, the largest first, each given those before.
 """
 
 from __future__ import annotations
@@ -27,17 +27,14 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.levels import CHANCE, MANY, PICKED, SHOWS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.parts import Agreement, Changed, Estimate, TrialValue
 from grounded.frozen import Array
 
-CHANCE = 1e-3  # p-value of a common value below which trials disagree, if
-APART = 0.05  # their scatter beyond chance is more than this fraction of the value
-OFF = 3.0  # standard deviations from which a single trial is off
 GOES_WITH = 0.8  # correlation from which a value depends on a condition
-CHANGE = 5.0  # nats from which a change is stated
 RIVALS = 8  # hypotheses of one, and of two effects, that are also tested for changes
 
 
@@ -107,10 +104,10 @@ def by_trial(
         chi2 = float((info * (own - mean) ** 2).sum())
         chance = float(chdtrc(len(some) - 1, chi2))
         beyond = np.sqrt(max(float((own - mean).var() - (1 / info).mean()), 0.0)) * one.scale
-        differs = chance < CHANCE and beyond > APART * abs(one.value)
+        differs = chance < CHANCE and beyond > SHOWS * abs(one.value)
         std = one.scale / np.sqrt(info)
         for i, d, e in zip(some, one.scale * own, std, strict=True):
-            far = differs and abs(d - one.scale * mean) > OFF * e
+            far = differs and abs(d - one.scale * mean) > MANY * e
             name = data.ids[i] or f"#{i + 1}"
             rows.append(TrialValue(name, one.effect, one.quantity, one.value + d, e, not far))
         with_ = _goes_with(data, some, own) if differs else ""
@@ -154,31 +151,27 @@ def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> t
     fits += [fit for size in (1, 2) for fit in search.of_size(size)[:RIVALS]]
     found = [_compared(fit, search.data, first) for fit in fits]
     worth = [
-        search.score(fit) + sum(one.evidence - CHANGE for one in some)
+        search.score(fit) + sum(one.evidence - PICKED for one in some)
         for fit, some in zip(fits, found, strict=True)
     ]
     return found[int(np.nanargmax(worth))]
 
 
 def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> tuple[Changed, ...]:
-    """Compare two groups under one hypothesis; held-out trials must support each change."""
+    """Compare two groups under one hypothesis."""
     from scipy.special import chdtrc
 
     group = np.where(np.asarray(first)[data.trial_of], 0, 1)
     units = _units(data.trial_of, group)
     every = [f"parameter:{name}" for name in data.model.param_names]
-    values, found = {v.column: v for v in _values(fit, data, every)}, []
-    taken: list[int] = []
-    left = {k: _difference(fit, group, taken, k, units) for k in values}
-    while left:
-        k = max(left, key=lambda c: left[c].evidence)
-        if not (left[k].evidence > CHANGE and _pays(fit, group, taken, k, units)):
-            left = {c: d for c, d in left.items() if c != k and d.evidence > CHANGE}
-            continue
-        found.append(k)
-        taken = [*taken, k]
-        left = {c: _difference(fit, group, taken, c, units) for c in values if c not in taken}
-    told = {k: _difference(fit, group, [c for c in taken if c != k], k, units) for k in found}
+    values, taken = {v.column: v for v in _values(fit, data, every)}, list[int]()
+    while left := {
+        c: one
+        for c in values.keys() - {*taken}
+        if (one := _difference(fit, group, taken, c, units)).evidence > PICKED
+    }:
+        taken.append(max(left, key=lambda c: left[c].evidence))
+    told = {k: _difference(fit, group, [c for c in taken if c != k], k, units) for k in taken}
 
     def row(k: int) -> Changed:
         one, seen = values[k], told[k]
@@ -189,7 +182,7 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> tuple[Changed, 
         chance = float(chdtrc(1, 2 * seen.evidence))
         return Changed(one.effect, one.quantity, a, b, seen.evidence, chance)
 
-    return tuple(map(row, found))
+    return tuple(map(row, taken))
 
 
 def _units(trial_of: Array, group: Array) -> Array:
@@ -238,44 +231,3 @@ def _difference(
         jackknife = (count - 1) * float(np.var(without)) if count > 1 else 0.0
         stds[g] = np.sqrt(max(float(inverse[-1, -1]), jackknife))
     return _Difference(shifts, stds)
-
-
-def _pays(fit: Fitted, group: Array, taken: Sequence[int], k: int, units: Array) -> bool:
-    """Check whether held-out units are likelier if the groups also differ in a column."""
-    if min(len(np.unique(units[group == g])) for g in (0, 1)) < 2:
-        return True  # nothing can be left out
-    gain = 0.0
-    for unit in np.unique(units):
-        out = units == unit
-        g = int(group[out][0])
-        G, s = fit.gram[out].sum(axis=0), fit.score[out].sum(axis=0)
-        with_, without = (
-            _fitted(fit, group, ~out, common, apart, g)
-            for common, apart in (([], [*taken, k]), ([k], [*taken]))
-        )
-        gain += float(s @ (without - with_)) + 0.5 * float(
-            without @ G @ without - with_ @ G @ with_
-        )
-    return gain > 0
-
-
-def _fitted(
-    fit: Fitted, group: Array, used: Array, common: list[int], apart: list[int], g: int
-) -> Array:
-    """Return the values (C,) of group g, with some columns common to both and some separate."""
-    C = fit.score.shape[1]
-    count = len(common) + 2 * len(apart)
-    N, b = np.zeros((count, count)), np.zeros(count)
-    for other in (0, 1):
-        at = [*range(len(common))]
-        at += [len(common) + other * len(apart) + i for i in range(len(apart))]
-        own = used & (group == other)
-        columns = [*common, *apart]
-        N[np.ix_(at, at)] += fit.gram[own].sum(axis=0)[np.ix_(columns, columns)]
-        b[at] -= fit.score[own].sum(axis=0)[columns]
-    found = np.linalg.pinv(N, hermitian=True) @ b
-    delta = np.zeros(C)
-    delta[common] = found[: len(common)]
-    begin = len(common) + g * len(apart)
-    delta[apart] = found[begin : begin + len(apart)]
-    return delta

@@ -19,13 +19,13 @@ from collections.abc import Callable
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
+from grounded.diagnosis.levels import PICKED
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
 
-SLIGHT = 0.01  # smallest weight of another fit, relative to the claim's
 MOST = 50.0  # most nats by which another fit counts as likelier
 
 Sure = tuple[Array, Array]
@@ -62,7 +62,7 @@ def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[F
     names, own, found = sorted(fit.hypothesis.names), _values(fit.hypothesis), []
     for (_, _, some), other in search.fits.items():
         nats = search.score(other) - search.score(fit)
-        likely = other is not fit and list(some) == names and nats > math.log(SLIGHT)
+        likely = other is not fit and list(some) == names and nats > -PICKED
         if likely and set(_values(other.hypothesis)) == set(own):
             worse = ruler.held_out and ruler.gain(other, fit).clear
             found += [] if worse else [(other, math.exp(min(nats, MOST)))]

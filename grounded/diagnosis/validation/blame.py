@@ -20,15 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.levels import NATS, SHARE, SURE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.likelihood.levels import NATS, SURE
-from grounded.diagnosis.validation.choose import SHARE
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
-
-STILL = 1.0  # standard deviations within which a shift is none
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float
 def still(H: Array, b: Array, free: Sequence[int]) -> list[int]:
     """Return the selected shifts that may be none, the smallest last, if another one clearly is."""
     sizes = np.abs(b) / np.sqrt(np.diag(np.linalg.pinv(H, hermitian=True)) + 1e-300)
-    none = [i for i in sorted(free, key=lambda i: -sizes[i]) if sizes[i] < STILL]
+    none = [i for i in sorted(free, key=lambda i: -sizes[i]) if sizes[i] < SURE]
     return none if sizes.max(initial=0.0) > SURE else []
 
 

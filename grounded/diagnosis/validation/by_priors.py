@@ -23,6 +23,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Combination
 from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.levels import HALF, WELL
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import fisher
@@ -33,9 +34,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 ALONE = 5.0  # times as wide without the priors: as many standard deviations may one be wrong
-LEAST = 0.02  # part of a value; a smaller standard deviation is no news, whatever it comes from
 PART = 0.2  # part of the variance of a value that a prior has at least if the value rests on it
-MOST = 0.5  # part that such priors have together; many parameters are hardly all off alike
 
 Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
 
@@ -77,12 +76,12 @@ def by_priors(predictor: Predictor, fit: Fitted, worth: float = 1.0) -> ByPriors
     value = np.concatenate([h.theta, (model.values + shift)[held]]) / unit
     C = _inverse(G + np.diag([0.0] * k + [1.0] * len(kept)))
     std = np.sqrt(np.diag(C))
-    lone = (fisher(G) > ALONE * std) & (std > LEAST * np.abs(value))
+    lone = (fisher(G) > ALONE * std) & (std > WELL * np.abs(value))
     parts = C[:, k:] ** 2 / np.maximum(np.diag(C), 1e-300)[:, None]
     parts[parts < PART] = 0.0
     rest = {  # of each such value, the parameters that it rests on
         i: {k + j for j in np.flatnonzero(parts[i]).tolist()}
-        for i in np.flatnonzero(lone & (parts.sum(axis=1) > MOST)).tolist()
+        for i in np.flatnonzero(lone & (parts.sum(axis=1) > HALF)).tolist()
     }
     found = []
     for members in _joined(rest):

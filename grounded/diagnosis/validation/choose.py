@@ -24,10 +24,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from grounded.diagnosis.likelihood.levels import NATS
+from grounded.diagnosis.levels import NATS, SHARE
 from grounded.diagnosis.validation.gain import Errors, Gain
-
-SHARE = 0.02  # of what a set gains, below which a cause of it does not matter
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -21,14 +21,14 @@ from grounded.diagnosis.hypotheses.lookalike import (
     twins,
 )
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
+from grounded.diagnosis.levels import NATS, SAME, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
-from grounded.diagnosis.likelihood.levels import NATS, SURE
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.averaged import averaged
-from grounded.diagnosis.validation.blame import STILL, Blame, moved_parameters
+from grounded.diagnosis.validation.blame import Blame, moved_parameters
 from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
@@ -38,10 +38,8 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.frozen import Array
 
-UNTOLD = 1e6  # times a value: standard deviation from which it counts as unknown
 LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
 RANKED = 12  # explanations that are listed
-SAME = 0.95  # share of a parameter's signal from which an effect is equivalent
 
 
 def has_size(effect: Effect, known: Mapping[str, Estimate], least: float = LEAST_TOLD) -> bool:
@@ -77,7 +75,7 @@ class Claims:
     ) -> None:
         """`uncertain`: evaluates hypotheses with those parameters free that the search held."""
         self.search, self.best, self.known = decision.search, decision.fit, known
-        self.ruler = ruler
+        self.ruler, self.lost = ruler, decision.lost
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
         self._uncertain = uncertain or search.predictor
@@ -110,20 +108,19 @@ class Claims:
             sizes[one.index] = abs(e.value - float(model.values[one.index])) / max(e.std, 1e-300)
         if max(sizes.values(), default=0.0) < SURE:
             return tuple(off)
-        least = {one.index: STILL if one.nats > NATS else SURE for one in off}
-        return tuple(one for one in off if sizes[one.index] > least[one.index])
+        return tuple(one for one in off if sizes[one.index] > SURE)
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
         """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
         rows: list[Ranked] = []
-        parts = self.parts()
+        lost = self.lost
         after = gap_of(self.predictor, self.best, where)
         for name in ordered(self.credit, self.names):
             claimed = not self.known.no_cause
-            rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
+            rows.append(self._row(self.best, name, lost[name], after, before, claimed=claimed))
         rows += self.off(after, before)
         listed = [row.effect for row in rows]
-        for name, (fit, evidence) in self.tied(parts).items():
+        for name, (fit, evidence) in self.tied().items():
             if name not in listed:
                 gap = gap_of(self.predictor, fit, where)
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
@@ -163,34 +160,6 @@ class Claims:
             )
         return rows
 
-    def parts(self) -> dict[str, float]:
-        """Return the loss of evidence without each claimed effect, parameters as free as with it.
-
-        If another effect becomes invalid without it (a delay too short to count), both are left
-        out. Noise of another structure can absorb an effect, and be likelier than the claim that
-        predictions chose; then the noise keeps its structure. NaN if that is likelier, too.
-        """
-        found = {}
-        for name in self.names:
-            lost = self._lost(name, self.search.fits.values())
-            if lost < NATS:
-                own = self.best.noise.structure
-                alike = [f for f in self.search.fits.values() if f.noise.structure == own]
-                lost = self._lost(name, alike)
-            found[name] = lost if lost > 0 else math.nan
-        return found
-
-    def _lost(self, name: str, fits: Iterable[Fitted]) -> float:
-        """Return the loss of evidence without a claimed effect, beside the most of the others."""
-        rest, score = {n for n in self.names if n != name}, self.search.score
-        free, scores = self.best.hypothesis.spread > 0, dict[int, float]()
-        for f in fits:
-            names, value = set(f.hypothesis.names), score(f)
-            as_free = (f.hypothesis.spread > 0) == free
-            if names and names <= rest and as_free and math.isfinite(value):
-                scores[len(names)] = max(value, scores.get(len(names), -math.inf))
-        return score(self.best) - (scores[max(scores)] if scores else self.base)
-
     def _row(
         self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
     ) -> Ranked:
@@ -214,9 +183,8 @@ class Claims:
             some = {}
             for q in effect.free:
                 v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
-                told = s < UNTOLD * max(abs(v), 1.0)
-                interval = (v - w, v + w) if told else None
-                some[q.name] = Estimate(v, s if told else math.inf, interval, q.unit)
+                e = Estimate(v, s, (v - w, v + w), q.unit)
+                some[q.name] = e if e.known else Estimate(v, math.inf, None, q.unit)
                 at += 1
             found.append(some)
         return found
@@ -375,12 +343,12 @@ class Claims:
             self._same[key] = known and twins(self.predictor, effects[name], effects[other], free)
         return self._same[key]
 
-    def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
+    def tied(self) -> dict[str, tuple[Fitted, float]]:
         """Return each rival's fit in place of a claimed effect, and its evidence there."""
         best, found = self.search.score(self.best), dict[str, tuple[Fitted, float]]()
         for name in self.names:
             for other, fit in self.rivals(name):
-                found.setdefault(other, (fit, parts[name] + self.search.score(fit) - best))
+                found.setdefault(other, (fit, self.lost[name] + self.search.score(fit) - best))
         return found
 
     def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:

@@ -26,9 +26,9 @@ from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
-from grounded.diagnosis.likelihood.levels import SURE
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.choose import Choice, Option, Rule
@@ -39,7 +39,6 @@ from grounded.frozen import Array
 
 MEASURED = 6  # likeliest sets of each size, with and without free parameters, that are measured
 REFIT = 12  # iterations after a cause was removed
-LIKELY = 10.0  # nats from which an effect that is not claimed is told
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +59,7 @@ class Decision:
     fit: Fitted
     crude: Fitted
     without: dict[str, Fitted]  # by effect, or "calibration"
+    lost: dict[str, float]  # evidence without it, by cause [nats]
     choice: Choice
     doubtful: tuple[Doubtful, ...]  # likeliest first
     left: tuple[Leftover, ...]  # structure that the claim leaves
@@ -109,7 +109,8 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
         choice = rule.choose()
     own = choice.chosen.causes
     fit, crude = options.fits[own], options.fits[frozenset()]
-    less = {c: options.fits[one.causes] for c in own if (one := options.less(choice.chosen, c))}
+    rest = {c: one for c in own if (one := options.less(choice.chosen, c))}
+    less = {c: options.fits[one.causes] for c, one in rest.items()}
     search.settled([fit, *less.values(), search.best_null()])
     fit, less = search.latest(fit), {c: search.latest(less[c]) for c in causes(fit)}
     left = leftovers(search.predictor, fit)
@@ -118,6 +119,7 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
         fit,
         search.latest(crude),
         less,
+        {c: choice.chosen.evidence - one.evidence for c, one in rest.items()},
         choice,
         _doubtful(options, rule, choice),
         tuple(left),
@@ -294,7 +296,7 @@ def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, .
     found, own, search = list[Doubtful](), choice.chosen.causes, options.search
     for option in rule.options if rule.held_out else ():
         nats = option.evidence - choice.chosen.evidence
-        if own < option.causes and len(option.causes) == len(own) + 1 and nats > LIKELY:
+        if own < option.causes and len(option.causes) == len(own) + 1 and nats > NATS:
             (name,) = option.causes - own
             fit = options.fits[option.causes]
             if name in equations(fit) and rule.unsupported(option):

@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.likelihood.levels import SURE
+from grounded.diagnosis.levels import LEAST, SURE
 from grounded.frozen import Array
-
-LEAST = 0.01  # log gain in some channel at some horizon below which a difference does not matter
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
+from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -36,7 +37,7 @@ from grounded.effects.actuator import backlash
 from grounded.effects.sensed import moved_model
 from grounded.findings import Finding, found
 from grounded.frozen import Array
-from grounded.model import Model, Param
+from grounded.model import Model
 from grounded.places import LITTLE, integrals, told_by
 from grounded.trial import Trial
 
@@ -44,7 +45,6 @@ FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
 DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor
 FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
-ROUNDING = 1e-9  # of a channel's largest value: smaller differences are rounding, not noise
 SAMPLES = 20  # of the slopes by which inputs are compared
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
@@ -149,7 +149,7 @@ def constant_inputs(data: Data) -> list[str]:
         if float(
             np.ptp(np.concatenate([data.commands[i, :T, j] for i, T in enumerate(data.lengths)]))
         )
-        <= 1e-9 * max(data.scales.peak(name), 1e-12)
+        <= ROUNDING * max(data.scales.peak(name), 1e-12)
     ]
 
 
@@ -179,7 +179,7 @@ def still_states(data: Data) -> list[str]:
         if i in data.hidden:
             continue
         values = data.states[np.isfinite(data.states[:, i]), i]
-        if values.size and float(np.ptp(values)) <= 1e-9 * max(data.scales.peak(name), 1e-12):
+        if values.size and float(np.ptp(values)) <= ROUNDING * max(data.scales.peak(name), 1e-12):
             found.append(name)
     return found
 
@@ -367,10 +367,7 @@ def with_measured_filters(model: Model, findings: Iterable[Fault]) -> Model:
     position, became 0.035 s.
     """
     seen = {f"sensor_lag_{one.signal}_tau" for one in findings if one.kind == "lag"}
-    params = {
-        name: Param(p.value, p.unit) if name in seen else p for name, p in model.params.items()
-    }
-    return replace(model, params=params) if seen & {*params} else model
+    return model.holding(seen & {*model.params})
 
 
 def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Model:
@@ -395,9 +392,7 @@ def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Mode
         if not lost:
             break
         free.remove(min(lost, key=lambda i: sure[i]))
-    fixed = {names[i] for i in range(len(names)) if i not in free}
-    params = {n: Param(p.value, p.unit) if n in fixed else p for n, p in model.params.items()}
-    return replace(model, params=params) if fixed else model
+    return model.holding([names[i] for i in range(len(names)) if i not in free])
 
 
 def without_others(data: Data, adopted: Collection[str], library: Library) -> Model:
@@ -418,8 +413,7 @@ def without_others(data: Data, adopted: Collection[str], library: Library) -> Mo
         if family.loose and target in family.targets(model):
             effect = library.effect(name, model, data.scales)
             held |= {param_name(name, q.name) for q in effect.quantities}
-    params = {n: Param(p.value, p.unit) if n in held else p for n, p in model.params.items()}
-    return replace(model, params=params) if held else model
+    return model.holding(held)
 
 
 def _information(predictor: Predictor, fit: Fitted) -> Array:

@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.error_report import (
-    ABOVE,
     AT_MOST,
     BOUNDS,
-    SURE,
     Credit,
     Part,
     Remainder,
     RulerRow,
 )
 from grounded.diagnosis.hypotheses.leftover import Leftover, whiteness
+from grounded.diagnosis.levels import ABOVE, CHANCE, FAR, HALF, MANY, WILD
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.ahead import unseen
@@ -35,11 +34,8 @@ from grounded.diagnosis.validation.ruler import Ruler, repeated
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-MOSTLY, FEW = 0.5, 0.2  # of the error above the noise, in a part with at most this share of all
-FAR = 3.0  # times the noise floor, above which a leftover is stated despite any uncertainty
-WHITE = 0.01  # p-value below which the innovations are not white
+FEW = 0.2  # of all errors: at most this share is in a part that holds most of those above the noise
 MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
-AWAY = 30.0  # times a state's measured range, above which a prediction has diverged
 
 
 class Measured:
@@ -64,7 +60,7 @@ class Measured:
         self.left, self.flexible = decision.left, decision.flexible
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
-        self.is_white = not self.left and min(told, default=0.0) * len(told) > WHITE
+        self.is_white = not self.left and min(told, default=0.0) * len(told) > CHANCE
         self.floor, self.source = self.noise_floor()  # sets `unsure`, std of its log, (K, 1)
         self.at_most = self.source == "short horizon" and not self.is_white
 
@@ -172,7 +168,7 @@ class Measured:
                 for key, rms in columns.items()
             }
             away = {
-                key: tuple(n for n, e in found[key].items() if e > AWAY * self.reach[n] > 0)
+                key: tuple(n for n, e in found[key].items() if e > WILD * self.reach[n] > 0)
                 for key in columns
             }
             rows.append(
@@ -240,7 +236,7 @@ class Measured:
         k = int(np.flatnonzero(~self.drowned[:-1]).max(initial=0))
         now, fine = self.rms(self.best), ruler.fine[ruler.shown]
         short = slice(0, k + 1)
-        unsure = np.hypot(2 * ruler.doubt(self.best), SURE * self.unsure)
+        unsure = np.hypot(2 * ruler.doubt(self.best), MANY * self.unsure)
         doubt = np.minimum(unsure, np.log(FAR))
         least = np.maximum(np.log(ABOVE), doubt)
         above = (np.log(now / self.floor) > least) & (now > 2 * fine)
@@ -282,7 +278,7 @@ class Measured:
         above = np.maximum(total - count * floor**2, 0.0)
         most = int(np.argmax(above))
         share = above[most] / max(float(above.sum()), 1e-300)
-        if share < MOSTLY or count[most] > FEW * count.sum():
+        if share < HALF or count[most] > FEW * count.sum():
             return None
         run = int(ruler.run_of[most])
         trial = int(data.trial_of[run])

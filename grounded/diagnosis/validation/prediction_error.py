@@ -18,6 +18,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import Region, TimeShare
 from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.levels import FAR, MANY
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -28,8 +29,6 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 MOST_STARTS = 400
-SURE = 3.0  # standard deviations by which the share of a region exceeds that of its time
-CLEARLY = 3.0  # times as dense as outside: with less of the gap a region is not worth naming
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +201,9 @@ def _stump(name: str, signal: Array, gain: Array, valid: Any, whole: float) -> R
                 share = float(gain[inside].sum()) / whole
                 if occupancy < 0.03 or share - occupancy <= margin:
                     continue
-                if share * (1 - occupancy) < CLEARLY * (1 - share) * occupancy:
+                if share * (1 - occupancy) < FAR * (1 - share) * occupancy:
                     continue  # the gap is nearly everywhere that was driven
-                if share - occupancy < SURE * _scatter(gain, inside, min(share, 1.0), whole):
+                if share - occupancy < MANY * _scatter(gain, inside, min(share, 1.0), whole):
                     continue  # it may be there by chance
                 margin = share - occupancy
                 shown = 0.0 if abs(level) < nothing else level

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.levels import ALIKE, SHARE, WILD
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -43,10 +44,7 @@ WHOLE_STEPS = 4000  # most steps of these together, unless that leaves fewer tha
 LEAST_WHOLE = 3
 FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
 SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
-ODD = 10.0  # a trial that misses more than this times the best repeat is not a repeat
 MOMENTS = 20  # most moments at which repeats are compared
-AS_LONG = 1.25  # whole trials up to this times as long as the repeats have their floor
-ALIKE = 0.02  # most rms difference of repeated commands, as a fraction of their spread
 
 
 class Ruler:
@@ -266,7 +264,7 @@ class Ruler:
             length = int(data.lengths[data.trial_of[runs]].min())
             own = int(data.valid[runs].sum(axis=1).min())
             for k, steps in enumerate((*self.steps, length)):
-                if k == len(self.steps) and longest > AS_LONG * length:
+                if k == len(self.steps) and longest > (1 + ALIKE) * length:
                     continue
                 last = min(own - 1, length - steps)
                 if last < 0:  # what is used of the runs is shorter than this horizon
@@ -313,7 +311,7 @@ class Ruler:
         if not own:
             return runs
         least = np.fmin.reduce(own) + self.fine[self._watched]
-        return runs[[not (one > ODD * least).any() for one in own]]  # NaN compares as False
+        return runs[[not (one > WILD * least).any() for one in own]]  # NaN compares as False
 
     @property
     def _watched(self) -> list[int]:
@@ -362,8 +360,8 @@ def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]
                 break
             length = min(int(data.lengths[i]), int(data.lengths[group[0]]))
             apart = (trial.inputs[:length] - one.inputs[:length]) / scale
-            same = abs(int(data.lengths[i]) - int(data.lengths[group[0]])) <= 0.1 * length
-            if same and np.sqrt((apart**2).mean(axis=0)).max() < ALIKE:
+            same = abs(int(data.lengths[i]) - int(data.lengths[group[0]])) <= ALIKE * length
+            if same and np.sqrt((apart**2).mean(axis=0)).max() < SHARE:
                 group.append(i)
                 break
         else:

@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.diagnosis.parts import Estimate, Ranked
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.tables import undetermined, weighed_beside
+from grounded.diagnosis.tables import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.frozen import Array
@@ -231,7 +231,7 @@ def _interval(v: Estimate) -> str:
         return figure(v.value)
     low, high = v.interval
     value = or_zero(v.value, low, high)
-    known = low <= v.value <= high and not undetermined(high - low, v.value)
+    known = low <= v.value <= high and v.known
     low, high = extent(low, high)
     return f"{figure(value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
