@@ -33,6 +33,7 @@ COMMANDED = re.compile(
     r"|goal|control|\baction\b|\.reference\.|\.output\.|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
     "|comando"
 )
+DONE = re.compile(r"\.(feedback|actual)\.")  # what a controller's joints did
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
 EFFORT_UNITS = NAMES_BY_UNIT.keys() - {"A"}  # a current in a log is mostly a measured one
@@ -83,7 +84,8 @@ def _noise_only(field: FieldReport) -> bool:
 
 def called_input(name: str, path: str) -> bool:
     """Return whether a number of a log is named like a command."""
-    return bool(COMMANDED.search(path.lower()) or SIDES.search(name))
+    called = COMMANDED.search(path.lower()) or SIDES.search(name)
+    return bool(called and not DONE.search(path))
 
 
 def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
