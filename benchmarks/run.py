@@ -3,6 +3,7 @@
     python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
     python benchmarks/run.py --peers /tmp/peers/bin/python     solve alone, beside the peers
     python benchmarks/run.py process                           whole commands
+    python benchmarks/run.py diagnose                          seconds by trials, steps, states
 
 Every solver gets the same problem (`peers.py`), the same start, and has to reach the best known
 cost to a part in 10^4. Times are CPU times of the solve alone, least of several; building a
@@ -17,6 +18,7 @@ import os
 import platform
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import llvmlite
@@ -25,7 +27,9 @@ from helpers import fastest, grounded, python
 from peers import CLOSE, case
 
 from grounded.compile import DescentOptions
+from grounded.diagnosis.diagnose import diagnose
 from grounded.solve.ddp import solve
+from grounded_trials import Workspace
 
 HERE = Path(__file__).parent
 ROOM = os.pathsep.join(str(HERE.parent / folder) for folder in ("", "cli", "trials"))
@@ -122,7 +126,54 @@ def process_part(options):
         print(f"  propose, improvement, warm  {min(proposed('c0002') for _ in range(7)):.3f}")
 
 
-PARTS = {"solve": solve_part, "process": process_part}
+LAWS = {  # example, trials, steps of each: three points a law
+    "trials": [("car-figure8", count, 100) for count in (2, 4, 8)],
+    "steps": [("car-figure8", 4, steps) for steps in (50, 100, 200)],
+    "states": [(name, 4, 60) for name in ("pendulum", "car-turn", "flight-figure8")],
+}
+
+
+def diagnose_part(options):
+    """Time diagnoses of the examples' trials: CPU seconds, ratios to importing NumPy, the law.
+
+    The kernels of the models are compiled before; those of hypotheses belong to the diagnosis.
+    """
+    numpy = min(python("-c", "import numpy").seconds for _ in range(5))
+    print(f"\nDiagnosis, CPU seconds ({numpy:.3f} for `import numpy`)")
+    with tempfile.TemporaryDirectory() as folder:
+        workspaces = {}
+        for law, points in LAWS.items():
+            rows = []
+            for name, count, steps in points:
+                if name not in workspaces:
+                    workspaces[name] = tried(Path(folder) / name, name)
+                task, trials = workspaces[name]
+                some = [shortened(trial, steps) for trial in trials[:count]]
+                seconds = fastest(lambda task=task, some=some: diagnose(task, some), 1)
+                size = {"trials": len(some), "steps": some[0].steps, "states": task.model.n}[law]
+                rows.append((size, seconds))
+                found = f"  {name:<15} {len(some)} x {some[0].steps:<4} {task.model.n:>2} states"
+                print(f"{found} {seconds:8.1f} s, ratio {seconds / numpy:7.0f}", flush=True)
+            slope = np.polyfit(*np.log(np.array(rows, float)).T, 1)[0]
+            print(f"  seconds go with {law} to the power {slope:.2f}")
+
+
+def tried(folder, name, count=8):
+    """Return the task of an example and the trials of its first candidates."""
+    workspace = Workspace.create(folder, example=name)
+    for _ in range(count):
+        if (candidate := workspace.propose().candidate) is None:  # the search ended
+            break
+        workspace.ingest(workspace.run(candidate.id).trial_file)
+    return workspace.task, [stored.trial for stored in workspace.trials()]
+
+
+def shortened(trial, steps):
+    """Return the first steps of a trial."""
+    return replace(trial, states=trial.states[: steps + 1], inputs=trial.inputs[:steps])
+
+
+PARTS = {"solve": solve_part, "process": process_part, "diagnose": diagnose_part}
 
 
 def main():

@@ -86,10 +86,20 @@ class HypothesisSearch(FittedHypotheses):
         iterations: int = 6,
         *,
         rivals: bool = False,
+        bar: float = -math.inf,
     ) -> list[Fitted]:
-        """Refine hypotheses and keep the fits; of rivals, those far behind stop early."""
-        worth = self.score if rivals else None
-        fits = refine(self.predictor, starts, iterations=iterations, tick=self._ticks, worth=worth)
+        """Refine hypotheses and keep the fits; of rivals, those far behind stop early.
+
+        bar: the score of the best rival that is known already.
+        """
+        fits = refine(
+            self.predictor,
+            starts,
+            iterations=iterations,
+            tick=self._ticks,
+            worth=self.score if rivals else None,
+            bar=bar,
+        )
         self.keep(fits)
         return fits
 
@@ -276,7 +286,14 @@ class HypothesisSearch(FittedHypotheses):
             late: include common delays of two states.
         """
         starts = self.one_more(fit, count or self.most, late=late)
-        return self.refined([fit, *starts], iterations, rivals=True)[1:]
+        h, structure, size = fit.hypothesis, fit.noise.structure, len(fit.hypothesis.names) + 1
+        known = [
+            self.score(other)
+            for (noise, spread, names), other in self.fits.items()
+            if (noise, spread, len(names)) == (structure, h.spread, size)
+        ]
+        bar = max(known, default=-math.inf)
+        return self.refined([fit, *starts], iterations, rivals=True, bar=bar)[1:]
 
     def one_more(self, fit: Fitted, count: int, *, late: bool = True) -> list[Start]:
         """Return the starts of a fit with each shortlisted effect added."""

@@ -116,6 +116,7 @@ def refine(
     tick: Callable[[], None] | None = None,
     fixed_noise: bool = False,
     worth: Callable[[Fitted], float] | None = None,
+    bar: float = -np.inf,
     share: float = 1.0,
 ) -> list[Fitted]:
     """Fit hypotheses that share a noise structure.
@@ -127,6 +128,7 @@ def refine(
         tick: called whenever a block of fits is done.
         fixed_noise: keep the noise as it is.
         worth: value of a rival; those far behind the best stop early. None: all continue.
+        bar: the worth of the best rival that is known already.
         share: fraction of the thresholds (in nats) at which a fit ends.
 
     Returns:
@@ -147,7 +149,7 @@ def refine(
     lap = KEPT if simulated(predictor.data.model) else 1
     while worth is not None and len(works) > 1 and iterations > lap:
         works = _after(predictor, works, (lap, fixed_noise, False), size, tick)
-        _race(works, worth)
+        _race(works, worth, bar)
         iterations -= lap
     works = _after(predictor, works, (iterations, fixed_noise, True), size, tick)
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
@@ -195,12 +197,12 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool])
     return [replace(work, along=None) for work in works]
 
 
-def _race(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+def _race(works: list[Work], worth: Callable[[Fitted], float], bar: float) -> None:
     """Give up works that stay CLOSE nats behind the best with AHEAD times what a step promises."""
     value = [-np.inf if work.best is None else worth(work.best) for work in works]
     for work, mine in zip(works, value, strict=True):
         reach = mine + AHEAD * np.nan_to_num(work.hope) + CLOSE
-        work.given_up = work.given_up or -np.inf < reach < max(value)
+        work.given_up = work.given_up or -np.inf < reach < max(bar, *value)
 
 
 def _of_one_shape(works: list[Work], data: Data) -> list[list[int]]:
