@@ -199,6 +199,7 @@ class DescentOptions:
     tolerance: float = 1e-8  # stop when the predicted change is below this times the cost
     halvings: int = 11  # alpha = 1 ... 1/2^11
     accept: float = 0.1  # least part of the predicted change
+    enough: float = 0.0  # stop after an accepted step that gains less; not by compiled systems
 
 
 @dataclass(frozen=True, eq=False)

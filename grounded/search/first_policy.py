@@ -16,7 +16,8 @@ starts, and the plan with the lowest cost is taken:
                      a joint that sticks has no slope
 
 A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
-iteration promises less than ROUGH of its cost, and a rival gets as many iterations as the reference
+iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of what standing still
+costs (an error of a thousandth of the way), and a rival gets as many iterations as the reference
 took. Its slopes are differences, which a joint that sticks or a contact makes wrong: smaller
 promises are often not kept, and such a search would go on for as long again.
 
@@ -32,6 +33,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.compile import DescentOptions, Problem
+from grounded.compile.run.interpreted import tracking_error
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.first_guess import first_guess
@@ -224,7 +226,9 @@ def finished(
     piece = int(np.clip(AT_ONCE / problem.horizon, 1, most))
     options = DescentOptions(max_iterations=piece)
     if problem.system.simulated:
-        options = DescentOptions(max_iterations=most, tolerance=ROUGH)
+        still = tracking_error(problem, np.tile(problem.z_start(), (problem.horizon + 1, 1)))
+        enough = ROUGH**2 * float(np.sum(problem.state_weight * still**2))
+        options = DescentOptions(max_iterations=most, tolerance=ROUGH, enough=enough)
     result = ddp.solve(problem, inputs, K, z, options, told)
     trace = list(result.trace)
     while result.status == "max iterations" and len(trace) < most:

@@ -126,6 +126,7 @@ def descended(
     state = _State(run.z[0], run.u[0], float(run.cost[0]), 0.0)
     lines: list[tuple[float, float, float, float]] = []
     gains: Backward | None = None
+    gained = np.inf  # by the last accepted step
 
     def ended(status: Status, failed_at: int = -1) -> Descent:
         k, K = (np.zeros(0), np.zeros(0)) if gains is None else (gains.k, gains.K)
@@ -139,12 +140,15 @@ def descended(
         gains = found.gains
         if not found.ok:
             return ended("not finite", gains.failed_at)
-        if -(gains.d1 + gains.d2) <= options.tolerance * abs(state.cost) + LEAST:
+        promised = -(gains.d1 + gains.d2)
+        if promised <= options.tolerance * abs(state.cost) + LEAST or gained < options.enough:
             small = found.mu < LARGE_MU  # or else it is mu that makes the change small
             return ended("converged" if small else "no improvement")
         if len(lines) >= options.max_iterations:
             return ended("max iterations")
+        before = state.cost
         state, alpha = _search(problem, state, found, options)
+        gained = before - state.cost if alpha else gained
         lines.append((state.cost, gains.d1 + gains.d2, alpha, found.mu))
         if each is not None:
             each(len(lines), state.cost)
