@@ -161,7 +161,7 @@ class Writer:
             ),
             leftover=remainder,
             unconfirmed=seen,
-            correction=correction(predictor, self.best, self.left, where),
+            correction=correction(self.ruler, self.best, self.left),
             noise=self.noise(),
             parameters=parameters,
             identifiable=identified,

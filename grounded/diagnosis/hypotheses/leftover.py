@@ -21,6 +21,7 @@ import numpy as np
 
 from grounded import places
 from grounded.diagnosis.levels import PICKED
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -69,11 +70,9 @@ def corrections(
     ruler: Ruler, fit: Fitted, left: Sequence[Leftover]
 ) -> dict[str, tuple[Leftover, Errors]]:
     """Return, by channel, the leftovers of a fit whose correction improves predictions."""
-    names, found = ruler.data.model.state_names, {}
+    found = {}
     for one in left:
-        rate = np.zeros((*one.correction.shape, len(names)))
-        rate[..., names.index(one.channel)] = one.correction
-        gain, errors = ruler.corrected(fit, rate)
+        gain, errors = ruler.corrected(fit, one.channel, one.correction)
         if gain.clear:
             found[one.channel] = one, errors
     return found
@@ -134,11 +133,13 @@ def _channel(
 ) -> tuple[float, Array, Array]:
     """Return the held-out gain in one channel (total, by step (L, B)) and its correction (L, B)."""
     gain, by_step, weights = held_out_columns(predictor, fit, gains, features, i)
-    left_out, rate = predictor.data.folds, np.zeros_like(by_step)
-    for k, trial in enumerate(np.unique(left_out)):
-        own = left_out == trial
-        rate[:, own] = features[:, own] @ weights[k]
-    return gain, by_step, rate
+    return gain, by_step, held_out_rate(predictor.data, features, weights)
+
+
+def held_out_rate(data: Data, features: Array, weights: Array) -> Array:
+    """Return the rate (L, B) of features (L, B, K), in each fold with the weights of the others."""
+    of_run = np.unique(data.folds, return_inverse=True)[1]
+    return np.asarray(np.einsum("lbk,bk->lb", features, weights[of_run]))
 
 
 def held_out_columns(

@@ -85,8 +85,8 @@ def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
     return replace(other, shift=shift)
 
 
-def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> tuple[Array, Array]:
-    """Return the changes of all values without each fold (S, C), and its rss with them (S,).
+def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> Array:
+    """Return the changes of all values without each fold, (S, C).
 
     One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i. What only the fold itself shows
     returns to the value at which its effect vanishes, so that it predicts nothing there: a weak
@@ -98,7 +98,7 @@ def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> tuple[Arr
     for k in (k for own in h.sizes for k in own):
         size[k] = h.theta[k] - [q.start for e in h.effects for q in e.free][k]
         weak[k] = unseen * total[k, k]
-    shifts, rss = np.zeros((len(names), C)), np.zeros(len(names))
+    shifts = np.zeros((len(names), C))
     for i, name in enumerate(names):
         own = fold == name
         G, s = fit.gram[own].sum(axis=0), fit.score[own].sum(axis=0)
@@ -108,5 +108,4 @@ def leave_one_out(fit: Fitted, fold: Array, unseen: float = UNSEEN) -> tuple[Arr
             scaled = A * np.outer(scale, scale)
             pull = scale * (s - weak * size)
             shifts[i] = scale * np.linalg.lstsq(scaled, pull, rcond=1e-8)[0]
-        rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
-    return shifts, rss
+    return shifts

@@ -62,7 +62,7 @@ def standard_deviations(
         return np.zeros(0), np.zeros(0)
     std = fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
     half = NORMAL * std
-    shifts, _ = leave_one_out(fit, trial_of, unseen=0.0)
+    shifts = leave_one_out(fit, trial_of, unseen=0.0)
     for some in (shifts, *_by_stretch(predictor, fit)):
         if len(some) >= 3:
             scatter = np.sqrt((len(some) - 1) * some.var(axis=0))

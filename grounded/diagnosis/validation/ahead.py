@@ -32,7 +32,7 @@ def by_fold(data: Data, fit: Fitted) -> tuple[list[Hypothesis], Any]:
     h, (folds, of_run) = fit.hypothesis, np.unique(data.folds, return_inverse=True)
     if len(folds) < 2 or not (h.effects or h.spread > 0):
         return [h], np.zeros_like(of_run)
-    shifts, _ = leave_one_out(fit, data.folds)
+    shifts = leave_one_out(fit, data.folds)
     return [moved(data, h, shift) for shift in shifts], of_run
 
 

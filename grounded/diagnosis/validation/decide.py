@@ -284,7 +284,7 @@ def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> int:
     if not (family.loose or several):
         return 0
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
-    for g, shift in zip(np.unique(group), leave_one_out(fit, group)[0], strict=True):
+    for g, shift in zip(np.unique(group), leave_one_out(fit, group), strict=True):
         others = worth * fit.gram[group != g].sum(axis=0) + np.diag(fit.prior)
         if (np.abs(h.theta[own] + shift[own]) < SURE * fisher(others)[own]).all():
             return len(np.unique(data.trial_of[group == g]))

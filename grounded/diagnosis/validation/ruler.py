@@ -194,11 +194,13 @@ class Ruler:
         """Return the gain of `after` over `before`."""
         return self.compared(self.errors(before), self.errors(after))
 
-    def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
-        """Return the gain of adding a rate (L, B, n) [unit/s] along the log, and the new errors."""
+    def corrected(self, fit: Fitted, channel: str, rate: Array) -> tuple[Gain, Errors]:
+        """Return the gain of adding a rate (L, B) to a state along the log, and the new errors."""
+        step = np.zeros((*rate.shape, self.data.model.n))
+        step[..., self.data.model.state_names.index(channel)] = rate * self.data.dt
         plain, other, of_run = self._none(), self._none(), np.zeros(len(self.data.valid), int)
         first = unseen(self.predictor, fit.hypothesis)
-        for found, added in ((plain, None), (other, rate * self.data.dt)):
+        for found, added in ((plain, None), (other, step)):
             self._add(found, [fit.hypothesis], of_run, fit.states, first, added, whole=False)
         return self.compared(plain, other), other
 
