@@ -41,6 +41,8 @@ from grounded.frozen import Array
 LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
 RANKED = 12  # explanations that are listed
 
+Params = dict[str, Estimate]
+
 
 def has_size(effect: Effect, known: Mapping[str, Estimate], least: float = LEAST_TOLD) -> bool:
     """Check whether the strength of an effect is known: its coefficients, or else thresholds.
@@ -112,68 +114,43 @@ class Claims:
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
         """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
-        rows: list[Ranked] = []
-        lost = self.lost
+
+        def row(fit: Fitted, name: str, evidence: float, of: Params | None = None) -> Ranked:
+            h, claimed = fit.hypothesis, fit is self.best and not self.known.no_cause
+            index = h.names.index(name) if of is None else -1
+            params = self.estimates(fit)[index] if of is None else of
+            fixed = h.effects[index].fixed if of is None else {}
+            gap = after if fit is self.best else gap_of(self.predictor, fit, where)
+            shrinkage = 1 - gap / before if before > 0 else 0.0
+            return Ranked(name, params, fixed, evidence, gap, shrinkage, claimed)
+
         after = gap_of(self.predictor, self.best, where)
-        for name in ordered(self.credit, self.names):
-            claimed = not self.known.no_cause
-            rows.append(self._row(self.best, name, lost[name], after, before, claimed=claimed))
-        rows += self.off(after, before)
-        listed = [row.effect for row in rows]
-        for name, (fit, evidence) in self.tied().items():
-            if name not in listed:
-                gap = gap_of(self.predictor, fit, where)
-                rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
-                listed.append(name)
-        others = (f for f in self.search.of_size(1) if f.hypothesis.names[0] not in listed)
+        rows = [row(self.best, n, self.lost[n]) for n in ordered(self.credit, self.names)]
+        rows += [row(self.best, *one) for one in self.off()]
+        listed = {one.effect for one in rows}
+        tied = {n: one for n, one in self.tied().items() if n not in listed}
+        rows += [row(fit, name, evidence) for name, (fit, evidence) in tied.items()]
         likely = (  # no absurd values
             f
-            for f in others
-            if math.isfinite(self.search.score(f)) and not no_limits(self.data, f.hypothesis)
+            for f in self.search.of_size(1)
+            if f.hypothesis.names[0] not in {*listed, *tied}
+            and math.isfinite(self.search.score(f))
+            and not no_limits(self.data, f.hypothesis)
+            and has_size(f.hypothesis.effects[0], self.estimates(f)[0])
         )
-        sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
-        for fit in islice(sized, max(RANKED - len(rows), 3)):
-            name, gap = fit.hypothesis.names[0], gap_of(self.predictor, fit, where)
-            evidence = self.search.score(fit) - self.base
-            rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
+        for f in islice(likely, max(RANKED - len(rows), 3)):
+            rows.append(row(f, f.hypothesis.names[0], self.search.score(f) - self.base))
         return tuple(rows)
 
-    def off(self, after: float, before: float) -> list[Ranked]:
-        """Return rows of the model's own parameters, if calibrating them explains the gap."""
-        model, known, rows = self.data.model, self.parameters(), []
+    def off(self) -> list[tuple[str, float, Params]]:
+        """Return the model's own parameters that are off: name, evidence (NaN: too inexact), by."""
+        model, known, found = self.data.model, self.parameters(), []
         for blame in self.blamed:
             name = model.param_names[blame.index]
-            nominal, e = float(model.values[blame.index]), known[name]
-            assert e.interval is not None
-            low, high = (end - nominal for end in e.interval)
-            d = Estimate(e.value - nominal, e.std, (low, high), e.unit)
-            rows.append(
-                Ranked(
-                    effect=f"parameter:{name}",
-                    params={"d": d},
-                    fixed={},
-                    evidence=blame.nats if blame.nats > NATS else math.nan,  # too inexact
-                    gap_after=after,
-                    shrinkage=1 - after / before if before > 0 else 0.0,
-                    claimed=not self.known.no_cause,
-                )
-            )
-        return rows
-
-    def _row(
-        self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
-    ) -> Ranked:
-        index = fit.hypothesis.names.index(name)
-        effect = fit.hypothesis.effects[index]
-        return Ranked(
-            effect=name,
-            params=self.estimates(fit)[index],
-            fixed=effect.fixed,
-            evidence=evidence,
-            gap_after=gap,
-            shrinkage=1 - gap / before if before > 0 else 0.0,
-            claimed=claimed,
-        )
+            by = known[name].moved(-float(model.values[blame.index]))
+            nats = blame.nats if blame.nats > NATS else math.nan
+            found.append((f"parameter:{name}", nats, {"d": by}))
+        return found
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Return the values of each effect with standard deviations and intervals."""
