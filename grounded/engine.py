@@ -30,7 +30,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from grounded.errors import GroundedError, needs
+from grounded.checks import one_of, refused, wrong
+from grounded.errors import needs
 from grounded.forked import Forks, possible
 
 STACK = 16 * 2**20  # [bytes] stack size of a thread: kernels keep their matrices there
@@ -105,13 +106,11 @@ class Engine:
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
-            raise GroundedError(f"--jobs must be 1 or more, got {self.jobs}")
-        if self.name not in ("local", "dask"):
-            raise GroundedError(f"--engine must be 'local' or 'dask', got '{self.name}'")
+            raise wrong("--jobs", self.jobs, must="whole", low=1)
+        one_of("--engine", self.name, ("local", "dask"))
         if (self.name == "dask") != (self.address is not None):
-            raise GroundedError(
-                "--address (tcp://host:8786) is required with --engine dask and only valid there"
-            )
+            pair = ("--engine dask", "--address (tcp://host:8786)")
+            raise refused("given.either", *pair, how="both")
 
     @property
     def alone(self) -> bool:
@@ -139,9 +138,7 @@ class Engine:
         try:
             client = distributed.Client(self.address, timeout=CONNECT_S)
         except OSError as error:
-            raise GroundedError(
-                f"no Dask scheduler answers at {self.address}: is it running? ({error})"
-            ) from error
+            raise refused("file.unreadable", self.address, why=str(error)) from error
         try:
             there = joblib.parallel_config(backend="dask", client=client)
             with there, joblib.Parallel(n_jobs=-1, **settings) as pool:

@@ -42,6 +42,16 @@ class GroundedError(Exception):
         super().__init__(message if self.finding is None else message.sentence)
         self.then = then or getattr(self.finding, "then", None)
 
+    def at(self, where: str, unless: str = "") -> GroundedError:
+        """Return it with the file or key where it was found, unless its area of codes says that."""
+        if self.finding is None:
+            return GroundedError(f"{where}: {self}", self.then)
+        if self.finding.code.startswith(f"{unless}."):
+            return self
+        inner = self.finding.facts.get("where", "")
+        whole = f"{where}: {inner}" if inner else where
+        return GroundedError(self.finding.also(where=whole), self.then)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to copy it, whatever its class is made from (for another process)."""
         return _copied, (type(self), self.args, vars(self))
@@ -56,27 +66,6 @@ def _copied(kind: type[GroundedError], args: tuple[Any, ...], fields: dict[str, 
 def type_of(value: object) -> str:
     """Return the name of a value's type, for a message: "str", "Candidate"."""
     return type(value).__name__
-
-
-def list_of(values: Iterable[T], kind: type | tuple[type, ...], name: str) -> list[T]:
-    """Return a collection as a list, whose elements must all be of a type.
-
-    Args:
-        values: what was given.
-        kind: the type of its elements, or several.
-        name: the name of the argument.
-
-    Raises:
-        GroundedError: if it is anything else.
-    """
-    found, kinds = type_of(values), kind if isinstance(kind, tuple) else (kind,)
-    if isinstance(values, Iterable) and not isinstance(values, str):
-        items = list(values)
-        other = [type_of(one) for one in items if not isinstance(one, kinds)]
-        if not other:
-            return items
-        found = f"{found} of {other[0]}"
-    raise GroundedError(f"{name} must be a list of {kinds[0].__name__}s, got a {found}")
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:

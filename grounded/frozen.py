@@ -1,4 +1,4 @@
-"""Read-only arrays for frozen dataclasses, checks of input, medians, noise and wrapped angles."""
+"""Read-only arrays for frozen dataclasses, medians, noise and wrapped angles."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from grounded.errors import GroundedError
 
 Array = NDArray[np.float64]
 MEDIAN = 0.6745  # median of |x| of a standard normal x
@@ -30,42 +28,6 @@ def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
         array = np.array(array, dtype=dtype, order="C")
         array.flags.writeable = False
     return array
-
-
-def numbers(values: Any, what: str) -> Any:
-    """Return user input as a read-only array of floats.
-
-    Raises:
-        GroundedError: if it is not an array of numbers; the message begins with `what`.
-    """
-    try:
-        return readonly(values)
-    except (TypeError, ValueError):
-        raise GroundedError(f"{what}: expected an array of numbers, got {values!r:.80}") from None
-
-
-def positive(what: str, value: Any) -> None:
-    """Check that user input is a positive, finite number of seconds.
-
-    Raises:
-        GroundedError: if it is not; the message begins with `what`.
-    """
-    if not isinstance(value, (int, float, np.number)) or not (np.isfinite(value) and value > 0):
-        raise GroundedError(f"{what} must be a positive number of seconds, got {value!r:.60}")
-
-
-def whole_number(what: str, value: Any, low: int, high: int) -> None:
-    """Check that user input is a whole number from `low` to `high`.
-
-    Raises:
-        GroundedError: if it is not; the message begins with `what`.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise GroundedError(
-            f"{what} must be a whole number from {low} to {high}, got {value!r:.60}"
-        )
-    if not low <= value <= high:
-        raise GroundedError(f"{what} must be {low} to {high}, got {value}")
 
 
 def median(values: Array) -> Array:

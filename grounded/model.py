@@ -20,8 +20,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from grounded.checks import finite, known, of_type, one_of, refused, unknown, whole_number, wrong
 from grounded.compile import System, system_of
-from grounded.errors import GroundedError, alike, nearest
+from grounded.errors import GroundedError, alike
+from grounded.findings import found
 from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
@@ -63,20 +65,19 @@ class Param:
 
     def __post_init__(self) -> None:
         numbers = [self.value] + [n for n in (self.low, self.high, self.std) if n is not None]
-        if bad := [one for one in numbers if not isinstance(one, (int, float, np.number))]:
-            raise GroundedError(f"a parameter's numbers must be numbers, got {bad[0]!r:.60}")
-        if not np.isfinite(self.value):
-            raise GroundedError(f"a parameter's value must be a finite number, got {self.value}")
+        for one in numbers:
+            of_type("a parameter's number", one, int, float, np.number)
+        finite("a parameter's value", self.value)
         low = -np.inf if self.low is None else self.low
         high = np.inf if self.high is None else self.high
         if low > high:
             raise GroundedError(
-                f"a parameter's bounds are the wrong way round: low = {low:g}, high = {high:g}"
+                found("given.order", "a parameter", low=f"{low:g}", high=f"{high:g}")
             )
         if not low <= self.value <= high:
-            raise GroundedError(f"a parameter's value {self.value} lies outside [{low}, {high}]")
+            raise wrong("a parameter's value", self.value, low=low, high=high)
         if self.std is not None and not (np.isfinite(self.std) and self.std > 0):
-            raise GroundedError(f"a parameter's std must be positive and finite, got {self.std}")
+            raise wrong("a parameter's std", self.std, must="positive")
 
     @property
     def uncertain(self) -> bool:
@@ -96,14 +97,11 @@ class Param:
             GroundedError: if it does not, or is not a finite number.
         """
         if not isinstance(value, int | float | np.number) or not np.isfinite(value):
-            raise GroundedError(f"{name} must be a finite number, got {value!r:.60}")
+            raise wrong(name, value, must="finite")
         low = -np.inf if self.low is None else self.low
         high = np.inf if self.high is None else self.high
         if not (low <= value <= high or self.at_bound(float(value))):
-            raise GroundedError(
-                f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}: correct the "
-                "value, or widen the bounds of its Param"
-            )
+            raise wrong(name, value, must="bounded", low=low, high=high, do="widen")
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -198,42 +196,29 @@ class Model:
         for attribute in ("states", "inputs", "params", "roles"):
             given = getattr(self, attribute)
             if not isinstance(given, Mapping):
-                raise GroundedError(
-                    f"a model's {attribute} must be a dict by name, as in states={{'x': 'm', 'v': "
-                    f"'m/s'}}, got {given!r:.60}"
-                )
+                like = "{'x': 'm', 'v': 'm/s'}"
+                raise wrong(f"a model's {attribute}", given, must="dict", like=like)
             value = dict(given)
             if attribute == "roles" and isinstance(value.get("position"), str):
                 value["position"] = (value["position"],)
             object.__setattr__(self, attribute, MappingProxyType(value))
         object.__setattr__(self, "angles", tuple(self.angles))
         if (self.derivative is None) == (self.step is None):
-            raise GroundedError(
-                f"model '{self.name}' needs exactly one of derivative= (ds/dt) and "
-                "step= (next state)"
-            )
-        if self.integrator not in ("rk4", "euler"):
-            raise GroundedError(f"integrator must be 'rk4' or 'euler', got '{self.integrator}'")
-        if not (isinstance(self.substeps, int) and 1 <= self.substeps <= MAX_SUBSTEPS):
-            raise GroundedError(f"substeps must be 1 to {MAX_SUBSTEPS}, got {self.substeps}")
+            both = ("derivative= (ds/dt)", "step= (next state)")
+            raise refused("given.either", *both, how="one")
+        one_of("integrator", self.integrator, ("rk4", "euler"))
+        whole_number("substeps", self.substeps, 1, MAX_SUBSTEPS)
         if self.step is not None and self.substeps > 1:
-            raise GroundedError("substeps only apply to derivative=; a step= chooses its own")
+            raise refused("given.either", "derivative=", "substeps=", how="first")
         if self.step is None and self.jacobian is not None:
-            raise GroundedError("jacobian= is only for step=; derivative= is differentiated here")
+            raise refused("given.either", "step=", "jacobian=", how="first")
         if not self.states:
-            raise GroundedError(f"model '{self.name}' needs at least one state")
+            raise refused("given.no_input", f"model '{self.name}'", what="state")
         if not self.inputs:
-            raise GroundedError(
-                f"model '{self.name}' needs at least one input. For a free motion, such "
-                "as a pendulum that was let go, add the force or torque that nobody applied, "
-                "and to the log a column of zeros for it"
-            )
+            raise refused("given.no_input", f"model '{self.name}'", what="input")
         if self.n + self.m > MAX_SIZE:
-            raise GroundedError(
-                f"model '{self.name}' has {self.n} states and {self.m} inputs; at most {MAX_SIZE} "
-                "of both together can be planned with and fitted: keep those that the reward and "
-                "the inputs act on, and leave out the rest"
-            )
+            sizes = {"states": self.n, "inputs": self.m, "most": MAX_SIZE, "what": "plan"}
+            raise refused("given.large", f"model '{self.name}'", **sizes)
         self._check_names()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -246,40 +231,25 @@ class Model:
         names = [*self.states, *self.inputs, *self.params]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise GroundedError(f"model '{self.name}' uses the name '{twice[0]}' twice")
+            raise refused("given.twice", f"model '{self.name}'", name=twice[0])
         for name in names:
             if not name.isidentifier():
-                raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
+                raise wrong(f"a name of model '{self.name}'", name, must="name")
         units: dict[str, object] = {**self.states, **self.inputs}
         for name, param in dict[str, object](self.params).items():
-            if not isinstance(param, Param):
-                found = type(param).__name__
-                raise GroundedError(
-                    f"model '{self.name}': params '{name}' is a {found}, expected a Param: "
-                    f"{name}=Param(value, unit)"
-                )
+            of_type(f"{self.name}.params['{name}']", param, Param)
         for name, unit in units.items():
-            if not isinstance(unit, str):
-                found = type(unit).__name__
-                raise GroundedError(f"model '{self.name}': the unit of '{name}' is a {found}")
+            of_type(f"unit of '{name}' in model '{self.name}'", unit, str)
         for name in self.angles:
-            if name not in self.states:
-                raise GroundedError(f"angle '{name}' is not a state: {nearest(name, self.states)}")
+            known("angle among the states", [name], self.states, f"model '{self.name}'")
         place = self.roles.get("position", ())
         if len(place) > 3:
-            raise GroundedError(
-                f"role 'position' names {len(place)} states: {', '.join(place)}; expected one "
-                "along an axis, two in a plane (horizontal first), or three"
-            )
+            raise wrong("role 'position'", place, must="place")
         for role, targets in self.roles.items():
             if role not in ROLES and alike(role, ROLES):  # others may be for user-defined effects
-                raise GroundedError(f"unknown role '{role}': {nearest(role, ROLES)}")
+                raise unknown("role", role, ROLES)
             for name in (targets,) if isinstance(targets, str) else targets:
-                if name not in self.states and name not in self.inputs:
-                    raise GroundedError(
-                        f"role '{role}' names '{name}', which is neither a state nor an input: "
-                        + nearest(name, [*self.states, *self.inputs])
-                    )
+                known(f"signal of the role '{role}'", [name], [*self.states, *self.inputs])
 
     @property
     def n(self) -> int:
@@ -360,10 +330,7 @@ class Model:
         """
         params = dict(self.params)
         for name, value in values.items():
-            if name not in params:
-                raise GroundedError(
-                    f"'{name}' is not a parameter of model '{self.name}': {nearest(name, params)}"
-                )
+            known("parameter", [name], params, f"model '{self.name}'")
             old = params[name]
             params[name] = Param(
                 float(value),

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
@@ -131,6 +131,5 @@ class Plant:
 
     @staticmethod
     def _index(name: str, names: tuple[str, ...]) -> int:
-        if name not in names:
-            raise GroundedError(f"the simulated system has no '{name}': {nearest(name, names)}")
+        known("state or input", [name], names, "the simulated system")
         return names.index(name)

@@ -13,9 +13,19 @@ from functools import cached_property
 
 import numpy as np
 
+from grounded.checks import (
+    finite,
+    numbers,
+    of_shape,
+    of_type,
+    positive,
+    refused,
+    same_names,
+    whole_number,
+    wrong,
+)
 from grounded.compile import Problem
-from grounded.errors import GroundedError, type_of
-from grounded.frozen import Array, numbers, positive
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import with_unit
@@ -72,22 +82,16 @@ class Task:
 
     def __post_init__(self) -> None:
         for name, kind in (("model", Model), ("reward", Reward)):
-            if not isinstance(getattr(self, name), kind):
-                found = type(getattr(self, name)).__name__
-                raise GroundedError(f"task: {name} must be a {kind.__name__}, got a {found}")
+            of_type(f"task: {name}", getattr(self, name), kind)
         if not isinstance(self.feedback, bool | np.bool_):
-            raise GroundedError(f"task: feedback must be True or False, got {self.feedback!r:.60}")
+            raise wrong("task: feedback", self.feedback, must="bool")
         n, m = self.model.n, self.model.m
         target = numbers(self.target, "task: target")
         if target.ndim != 2 or target.shape[1] != n:
-            turned = ": transpose it" * (target.ndim == 2 and len(target) == n)
-            raise GroundedError(
-                f"task: target must have shape (H + 1, {n}), one row for each control step and one "
-                f"for the end, one column for each state; got {target.shape}{turned}"
-            )
+            do = "turned" if target.ndim == 2 and len(target) == n else "rows"
+            raise wrong("task: target", target.shape, shape=f"(H + 1, {n})", do=do)
         H = len(target) - 1
-        if not 1 <= H <= MAX_HORIZON:
-            raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
+        whole_number("task: horizon", H, 1, MAX_HORIZON)
         defaults = {
             "latency": np.zeros(m),
             "input_target": np.zeros((H, m)),
@@ -99,19 +103,13 @@ class Task:
         for name, shape in shapes.items():
             given = getattr(self, name)
             if given is None and name not in defaults:
-                free = ", infinite for no limit" if name in ("low", "high") else ""
-                raise GroundedError(f"task: {name} must have shape {shape}{free}, got None")
+                do = "free" if name in ("low", "high") else "rows"
+                raise wrong(f"task: {name}", got="None", shape=str(shape), do=do)
             value = numbers(defaults[name] if given is None else given, f"task: {name}")
-            if value.shape != shape:
-                raise GroundedError(f"task: {name} must have shape {shape}, got {value.shape}")
+            of_shape(f"task: {name}", value, shape)
             object.__setattr__(self, name, value)
         for name, size in {"state": n, "terminal": n, "input": m, "input_change": m}.items():
-            if (found := getattr(self.reward, name).shape) != (size,):
-                each = "state" if name in ("state", "terminal") else "input"
-                raise GroundedError(
-                    f"[reward] {name}: expected {size} weights, one for each {each} of the model, "
-                    f"got an array of shape {found}"
-                )
+            of_shape(f"[reward] {name}", getattr(self.reward, name), (size,))
         self._check_values()
 
     def __repr__(self) -> str:
@@ -123,51 +121,36 @@ class Task:
     def _check_values(self) -> None:
         positive("task: dt", self.dt)
         if not (np.isfinite(self.smoothing) and self.smoothing >= 0):
-            raise GroundedError(f"[model] smoothing must not be negative, got {self.smoothing}")
+            raise wrong("[model] smoothing", self.smoothing, must="weights")
         assert self.latency is not None
         assert self.safety_low is not None and self.safety_high is not None
         for i, name in enumerate(self.model.state_names):
             if not self.safety_low[i] < self.safety_high[i]:
-                raise GroundedError(
-                    f"[safety] {name}: the lower bound {self.safety_low[i]:g} must be below the "
-                    f"upper bound {self.safety_high[i]:g}"
-                )
+                ends = {"low": f"{self.safety_low[i]:g}", "high": f"{self.safety_high[i]:g}"}
+                raise refused("given.order", f"[safety] {name}", **ends)
         for i, name in enumerate(self.model.input_names):
             if not self.low[i] < self.high[i]:
-                raise GroundedError(
-                    f"[limits] {name}: the lower limit {self.low[i]:g} must be below the upper "
-                    f"limit {self.high[i]:g}"
-                )
+                ends = {"low": f"{self.low[i]:g}", "high": f"{self.high[i]:g}"}
+                raise refused("given.order", f"[limits] {name}", **ends)
             if not 0 <= self.latency[i] <= 50 * self.dt:
-                raise GroundedError(
-                    f"[task] latency of {name} must be 0 to 50 control steps "
-                    f"({50 * self.dt:g} s), got {self.latency[i]:g} s"
+                most = f"{50 * self.dt:g} s (50 control steps)"
+                raise wrong(
+                    f"[task] latency of {name}", got=f"{self.latency[i]:g} s", low=0, high=most
                 )
         weighted = self.reward.state + self.reward.terminal > 0
         for i, name in enumerate(self.model.state_names):
             bad = ~np.isfinite(self.target[:, i])
             if weighted[i] and bad.any():
-                raise GroundedError(
-                    f"[reward] weighs state '{name}', but the target has no value for it at "
-                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target (for a "
-                    f"line: `--to {name}=0`; if only `terminal` weighs it, only the last value "
-                    "counts, the others may be anything) or drop the weight"
-                )
-        if not np.isfinite(self.start).all():
-            raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")
-        if not np.isfinite(self.past).all():
-            raise GroundedError(
-                f"task: the input held before the start must be finite, got {self.past.tolist()}"
-            )
+                raise refused("given.unweighed", name, step=str(np.argmax(bad)))
+        finite("task: start", self.start)
+        finite("task: past, the input held before the start,", self.past)
         for i, (name, unit) in enumerate(self.model.inputs.items()):
             low, held, high = float(self.low[i]), float(self.past[i]), float(self.high[i])
             room = HELD * (high - low if np.isfinite(high - low) else abs(held))
             if not low - room <= held <= high + room:
-                raise GroundedError(
-                    f"{name} = {with_unit(f'{held:g}', unit)} is held before the start, outside "
-                    f"its limits, {low:g} to {high:g}: hold a value inside ([task] start; in "
-                    "Python past), or widen the limits if the robot may receive that value"
-                )
+                given = with_unit(f"{held:g}", unit)
+                what = f"{name}, held before the start,"
+                raise wrong(what, got=given, low=low, high=high, do="hold")
 
     @property
     def horizon(self) -> int:
@@ -259,13 +242,8 @@ class Task:
         Raises:
             GroundedError: if the trial has other states or inputs than the model.
         """
-        names = (self.model.state_names, self.model.input_names)
-        if (trial.state_names, trial.input_names) != names:
-            raise GroundedError(
-                f"a trial of this task has the states {', '.join(names[0])} and the inputs "
-                f"{', '.join(names[1])}, in this order; got {', '.join(trial.state_names)} and "
-                f"{', '.join(trial.input_names)}"
-            )
+        same_names("the trial", "states", trial.state_names, self.model.state_names)
+        same_names("the trial", "inputs", trial.input_names, self.model.input_names)
         trial = trial.whole(self.horizon)
         T = trial.steps
         assert self.input_target is not None
@@ -283,8 +261,7 @@ class Task:
         Raises:
             GroundedError: if `trial` is not a `Trial`.
         """
-        if not isinstance(trial, Trial):
-            raise GroundedError(f"utility takes the Trial of a run, got a {type_of(trial)}")
+        of_type("the trial", trial, Trial)
         judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
         return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
 

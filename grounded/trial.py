@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.errors import GroundedError
-from grounded.frozen import Array, calm, numbers, positive, readonly, resampled_noise, wrapped
+from grounded.checks import numbers, of_shape, positive, wrong
+from grounded.frozen import Array, calm, readonly, resampled_noise, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
 LAST = 2  # steps at the end of a run that may be missing and are extrapolated,
@@ -67,32 +67,27 @@ class Trial:
             names = getattr(self, kind)
             several = isinstance(names, Iterable) and not isinstance(names, str)
             if not several or not all(isinstance(name, str) for name in names):
-                raise GroundedError(f"trial: {kind} must be a tuple of names, got {names!r:.60}")
+                raise wrong(f"trial: {kind}", names, must="names")
             object.__setattr__(self, kind, tuple(names))
         positive("trial: dt", self.dt)
         n, m, rows = len(self.state_names), len(self.input_names), len(states) if states.ndim else 0
         if states.ndim != 2 or states.shape[1] != n or not rows:
-            turned = ": transpose it" * (states.ndim == 2 and rows == n)
-            raise GroundedError(
-                f"a trial of {n} states needs an array (T+1, {n}), one row for each control step "
-                f"and one for the end; got {states.shape}{turned}"
-            )
+            do = "turned" if states.ndim == 2 and rows == n else "rows"
+            raise wrong("trial: states", states.shape, shape=f"(T + 1, {n})", do=do)
         if inputs.shape != (rows - 1, m):
             mend = {
                 (rows, m): ": the last state has no input, leave out the last row",
                 (rows - 1,): ": make it a column, inputs[:, None]" * (m == 1),
                 (m, rows - 1): ": transpose it",
             }
-            raise GroundedError(
-                f"a trial with {rows} rows of states and {m} inputs needs inputs of shape "
-                f"({rows - 1}, {m}), got {inputs.shape}{mend.get(inputs.shape, '')}"
-            )
+            mend = {(rows, m): "last", (m, rows - 1): "turned"}
+            mend |= {(rows - 1,): "column"} if m == 1 else {}
+            of_shape("trial: inputs", inputs, (rows - 1, m), do=mend.get(inputs.shape))
         object.__setattr__(self, "states", states)
         object.__setattr__(self, "inputs", inputs)
         if self.start_inputs is not None:
             held = numbers(self.start_inputs, "trial: start_inputs")
-            if held.shape != (m,):
-                raise GroundedError(f"trial: start_inputs must have shape ({m},), got {held.shape}")
+            of_shape("trial: start_inputs", held, (m,))
             object.__setattr__(self, "start_inputs", held)
 
     def __repr__(self) -> str:

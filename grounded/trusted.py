@@ -14,26 +14,27 @@ from functools import cache
 from pathlib import Path
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
 
 TRUST = "GROUNDED_TRUST"  # environment variable: folders whose code is executed without this check
 
 
-def suspicion(path: Path) -> str:
-    """Return why another user may have changed a file or folder; "" if none can.
+def suspicion(path: Path) -> Finding | None:
+    """Return why another user may have changed a file or folder; None if none can.
 
     Raises:
         OSError: if the path can't be read.
     """
     if not hasattr(os, "getuid"):  # Windows has another permission model
-        return ""
+        return None
     status = path.stat()
     if status.st_uid not in (os.getuid(), 0):
-        return f"{path} belongs to another user ({status.st_uid})"
+        return found("file.untrusted", str(path), by="owner", id=str(status.st_uid))
     if status.st_mode & stat.S_IWOTH:
-        return f"{path} is writable by everybody"
+        return found("file.untrusted", str(path), by="all")
     if status.st_mode & stat.S_IWGRP and not _private(status.st_gid):
-        return f"{path} is writable by its group ({status.st_gid})"
-    return ""
+        return found("file.untrusted", str(path), by="group", id=str(status.st_gid))
+    return None
 
 
 def check_own(folder: Path, paths: Iterable[Path]) -> None:
@@ -51,15 +52,11 @@ def check_own(folder: Path, paths: Iterable[Path]) -> None:
         return
     for path in (folder, *paths):
         try:
-            found = suspicion(path)
+            seen = suspicion(path)
         except OSError:  # missing, or unreadable and hence not executed either
             continue
-        if found:
-            raise GroundedError(
-                f"{found}, so another user may have changed its code; nothing in {folder} is "
-                f"executed. If it is yours: chown -R $USER and chmod -R go-w, or name the folder "
-                f"in {TRUST}"
-            )
+        if seen:
+            raise GroundedError(seen.also(folder=str(folder), trust=TRUST))
 
 
 @cache

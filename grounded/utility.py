@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.frozen import Array, numbers
+from grounded.checks import numbers, wrong
+from grounded.frozen import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,7 @@ class Reward:
         for name in ("state", "terminal", "input", "input_change"):
             weights = numbers(getattr(self, name), f"[reward] {name}")
             if not np.isfinite(weights).all() or (weights < 0).any():
-                raise GroundedError(
-                    f"[reward] {name}: weights must be finite and not negative, got "
-                    f"{weights.tolist()}"
-                )
+                raise wrong(f"[reward] {name}", weights.tolist(), must="weights")
             object.__setattr__(self, name, weights)
 
 

@@ -41,16 +41,10 @@ def command(json_: bool, details: bool) -> None:
         show_json(status.to_json())
         return
     show(summary(status))
-    settled, model = None, workspace.config.model
-    if model.effects or model.params:  # else nothing was adopted, and slow imports are saved
-        from grounded_trials.report.settled import settled_in
-        from grounded_trials.workspace.last_diagnosis import Since
-
-        settled = settled_in(workspace, status.diagnosis, status.since or Since())
     tell(status.findings, all_=details)
     for name, why in status.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
-    if settled:
+    if settled := status.settled:
         show(f"\n{table(settled.rows, ('adopted', 'value'))}")
         for one in filter(None, (settled.gained, settled.open)):
             show("\n".join(wrapped(one.sentence, "  ", "  ")))
@@ -77,8 +71,6 @@ def verify(json_: bool) -> None:
 
 def summary(status: Status) -> str:
     """Return the history as a table, the utilities as bars, and the certainty of the last gain."""
-    from grounded_trials.workspace.candidates.trust import much_noise
-
     standing, lines = status.standing, []
     if standing.history:
         lines.append(table(*standing.table()))
@@ -88,8 +80,8 @@ def summary(status: Status) -> str:
         lines.append("\n" + field("utility", bars) if bars else "")
     if (best := standing.incumbent) is not None:
         text = f"{best.candidate.id}, utility {number(best.utility)}"
-        if noise := much_noise(best.noise_cost, best.utility):
-            text += f", {number(noise)} of it by sensor noise"
+        if status.noise:
+            text += f", {number(status.noise)} of it by sensor noise"
         lead = standing.lead
         if lead is not None and lead.before.utility and best.candidate.base:
             failed = not math.isfinite(lead.before.utility)

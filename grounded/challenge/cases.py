@@ -20,8 +20,8 @@ from grounded.challenge import systems
 from grounded.challenge.draws import JOINT, draw_effect, draw_withheld, values_of
 from grounded.challenge.mechanism import Mechanism, simulator
 from grounded.challenge.truth import Disturbance, Truth
+from grounded.checks import known
 from grounded.effects import Effect, ParamFamily, scales_of
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
@@ -75,10 +75,9 @@ def make(
     Raises:
         GroundedError: for an unknown kind or system, or mechanisms without MuJoCo.
     """
-    if kind not in KINDS:
-        raise GroundedError(f"kinds of challenge: {', '.join(KINDS)}; got '{kind}'")
-    if only is not None and only not in systems.SYSTEMS:
-        raise GroundedError(f"systems of the challenge: {', '.join(systems.SYSTEMS)}; got '{only}'")
+    known("kind", [kind], KINDS, "the challenge")
+    if only is not None:
+        known("system", [only], systems.SYSTEMS, "the challenge")
     share = shares_of(groups)
     if only is None and "mujoco" in groups:
         simulator()
@@ -99,10 +98,7 @@ def shares_of(groups: Sequence[str]) -> dict[str, float]:
     Raises:
         GroundedError: for an unknown group, or none.
     """
-    if not groups or not set(groups) <= set(systems.GROUPS):
-        raise GroundedError(
-            f"groups of systems: {', '.join(systems.GROUPS)}; got '{', '.join(groups)}'"
-        )
+    known("group", groups or [""], systems.GROUPS, "the challenge")
     weight = {g: max(len(groups) - 1, 1) if g == "own" else 1 for g in groups}
     total = sum(weight.values())
     return {

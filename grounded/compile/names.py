@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import refused, unknown, wrong
+from grounded.errors import GroundedError
 
 _NOT_THE_USER = (str(Path(__file__).parents[1]), str(Path(np.__file__).parent), "<frozen")
 
@@ -46,10 +47,8 @@ class Named(Mapping[str, Any]):
             raise self._unknown(name, sys._getframe(1)) from None
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise GroundedError(
-            f"{line_of(sys._getframe(1))}: a {self.__dict__[' what']} can't be assigned to; "
-            f"use a local variable for '{name}'"
-        )
+        what = self.__dict__[" what"]
+        raise refused("model.assigned", line_of(sys._getframe(1)), what=what, name=name)
 
     def __iter__(self) -> Iterator[str]:
         what = self.__dict__[" what"]
@@ -64,13 +63,10 @@ class Named(Mapping[str, Any]):
     def _unknown(self, name: object, frame: FrameType) -> GroundedError:
         what = self.__dict__[" what"]
         if isinstance(name, int | slice):
-            return GroundedError(
-                f"{line_of(frame)}: the {what}s have names, not numbers such as [{name}]: write "
-                f"s.{next(iter(self))} for a function f(s, ...); they are {', '.join(self)}"
+            return wrong(
+                f"{line_of(frame)}: a {what}", name, must="named", like=f"s.{next(iter(self))}"
             )
-        return GroundedError(
-            f"{line_of(frame)}: there is no {what} '{name}': {nearest(str(name), list(self))}"
-        )
+        return unknown(what, name, [*self], where=line_of(frame))
 
 
 class Name(str):
@@ -89,10 +85,7 @@ class Name(str):
         return self
 
     def _slip(self, frame: FrameType) -> GroundedError:
-        return GroundedError(
-            f"{line_of(frame)}: '{self}' names one of the {self.what}s and is not its value: "
-            f"unpacking gives names. Write s.{self} for a function f(s, ...), or unpack s.values()"
-        )
+        return refused("model.name_only", line_of(frame), name=str(self), what=self.what)
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise self._slip(sys._getframe(1))
@@ -140,22 +133,14 @@ def check_names(values: Any, states: Sequence[str], function: Any) -> None:
         GroundedError: naming the function's file and line, what is missing and what is too much.
     """
     if not isinstance(values, Mapping):
-        raise GroundedError(
-            f"{where(function)}: the model must return a dict of state names, "
-            f"got {type(values).__name__}; return {{{', '.join(f'{s!r}: ...' for s in states)}}}"
-        )
+        kind = type(values).__name__
+        raise refused("model.returns", where(function), type=kind, states=tuple(states))
     extra = [name for name in values if name not in states]
     if extra:
-        raise GroundedError(
-            f"{where(function)}: the model returned '{extra[0]}', which is not a state: "
-            + nearest(str(extra[0]), states)
-        )
+        raise unknown("state", extra[0], states, "the model", where(function))
     missing = [name for name in states if name not in values]
     if missing:
-        raise GroundedError(
-            f"{where(function)}: the model returned {len(values)} of {len(states)} states; "
-            f"missing: {', '.join(missing)}"
-        )
+        raise refused("model.returns", where(function), missing=tuple(missing))
 
 
 def wrong_value(name: str, value: Any, function: Any) -> GroundedError:
@@ -172,6 +157,4 @@ def wrong_value(name: str, value: Any, function: Any) -> GroundedError:
         found = f"{type(value).__name__} ({value!r})"
     else:
         found = f"{value!r}"
-    return GroundedError(
-        f"{where(function)}: the model must return one real number for state '{name}', got {found}"
-    )
+    return wrong(f"{where(function)}: state '{name}' that is returned", got=found, must="real")

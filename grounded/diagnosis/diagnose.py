@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import SENSOR_DELAY, Preflight, late_as_positions
+from grounded.checks import list_of, of_type, positive, refused, whole_number
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -56,9 +57,7 @@ from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.effects import Effect, Library, param_name
 from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError, type_of
 from grounded.findings import found
-from grounded.frozen import positive, whole_number
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.result import listed
@@ -102,8 +101,7 @@ class DiagnosisOptions:
     origin: Task | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.library, Library):
-            raise GroundedError(f"library must be a Library, got a {type_of(self.library)}")
+        of_type("library", self.library, Library)
         if self.max_effects is not None:
             whole_number("max_effects", self.max_effects, 1, MOST_EFFECTS)
         positive("horizon", self.horizon)
@@ -205,22 +203,14 @@ def diagnose(
 
 def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
     """Return the options; raise GroundedError for arguments of another type, or too large."""
-    several = hasattr(trials, "__iter__")
-    loose = [type(t).__name__ for t in trials if not isinstance(t, Trial)] if several else []
-    if loose or not several or not isinstance(subject, Task | Model):
-        raise GroundedError(
-            "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
-            f"{type(subject).__name__} and {' of '.join([type(trials).__name__, *loose[:1]])}"
-        )
-    if not isinstance(options, DiagnosisOptions | None):
-        raise GroundedError(f"options must be DiagnosisOptions(...), got a {type_of(options)}")
+    of_type("model", subject, Task, Model)
+    list_of(trials, Trial, "trials")
+    if options is not None:
+        of_type("options", options, DiagnosisOptions)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_STATES:
-        raise GroundedError(
-            f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
-            f"most {MOST_STATES} of both together, since each may affect each: diagnose a model of "
-            "the part where the gap is"
-        )
+        sizes = {"states": model.n, "inputs": model.m, "most": MOST_STATES, "what": "diagnosis"}
+        raise refused("given.large", f"model '{model.name}'", **sizes)
     return options or DiagnosisOptions()
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal, Self
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.accounts.finding import late_effects
+from grounded.checks import known
 from grounded.diagnosis.error_report import (
     BRIEF,
     Combination,
@@ -26,7 +27,7 @@ from grounded.diagnosis.error_report import (
     Where,
 )
 from grounded.diagnosis.errors_told import objection
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.errors import NextCommand
 from grounded.findings import Finding
 from grounded.result import Document, figure, number, or_zero, seen, spread, with_unit
 
@@ -332,9 +333,7 @@ class Diagnosed(Document):
             GroundedError: if the diagnosis has no values of this effect.
         """
         found = self.quantities
-        if effect not in found:
-            there = f": {nearest(effect, found)}" if found else "; it has none of any effect"
-            raise GroundedError(f"this diagnosis has no values of '{effect}'{there}")
+        known("value of the effect", [effect], found, "this diagnosis")
         return found[effect]
 
     @property

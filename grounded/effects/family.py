@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known, wrong
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -385,14 +385,11 @@ class Effect:
         """
         names = [q.name for q in self.quantities]
         for name in values:
-            if name not in names:
-                raise GroundedError(
-                    f"effect '{self.name}' has no quantity '{name}': {nearest(name, names)}"
-                )
+            known("quantity", [name], names, f"effect '{self.name}'")
         whole = {**self.fixed, **{name: float(value) for name, value in values.items()}}
         missing = [name for name in names if name not in whole]
         if missing:
-            raise GroundedError(f"effect '{self.name}' needs a value for '{missing[0]}'")
+            raise wrong(f"'{missing[0]}' of effect '{self.name}'", must="given")
         return MappingProxyType({name: whole[name] for name in names})
 
 

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded import places
+from grounded.checks import refused, unknown
 from grounded.effects import actuator, friction, geometry, joint, medium, rate, sensor
 from grounded.effects.correction import correction
 from grounded.effects.drive import speed_weights
@@ -42,7 +43,6 @@ from grounded.effects.family import (
     Site,
 )
 from grounded.effects.sensed import moved_model
-from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import derived_states, outright_states
@@ -85,7 +85,7 @@ class Library:
         names = [family.name for family in self.families]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise GroundedError(f"two effect families are called '{twice[0]}': rename one")
+            raise refused("given.twice", "the effect families", name=twice[0])
 
     def with_families(self, more: Iterable[Family]) -> Library:
         """Return a library that also has these families."""
@@ -110,7 +110,7 @@ class Library:
             if family.name == name:
                 return family
         known = [family.name for family in self.families]
-        raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
+        raise unknown("effect family", name, known)
 
     def effect(self, name: str, model: Model, scales: Scales | None = None) -> Effect:
         """Return the effect `family:target` at a model; of joint inputs, any several will do.
@@ -122,10 +122,8 @@ class Library:
         family = self.family(family_name)
         known = list(family.targets(model))
         if target not in known and not _part_of(family, target, known):
-            raise GroundedError(
-                f"effect '{name}' does not apply to model '{model.name}': "
-                + nearest(name, [f"{family_name}:{t}" for t in known])
-            )
+            there = [f"{family_name}:{t}" for t in known]
+            raise unknown("effect", name, there, f"model '{model.name}'")
         return _build(family, target, model, scales or Scales())
 
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:

@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.checks import unknown
 from grounded.compile.names import Named
 from grounded.effects.actuator import delay
 from grounded.effects.family import (
@@ -53,7 +54,6 @@ from grounded.effects.losses import step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
-from grounded.errors import GroundedError
 from grounded.model import Model, Param
 from grounded.places import integrated, partner
 
@@ -93,7 +93,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     }
     build = next((build for kind, build in make.items() if isinstance(family, kind)), None)
     if build is None:
-        raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
+        raise unknown("effect that can be adopted", effect.name, ())
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
     vars(step)["queued"] = getattr(family, "transport", False) or getattr(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known, wrong
 from grounded.frozen import Array, readonly
 from grounded.model import Model
 
@@ -65,8 +65,7 @@ def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
     """
     names = model.state_names if names is None else tuple(names)
     for name in names:
-        if name not in model.states:
-            raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
+        known("state", [name], model.states, f"model '{model.name}'")
     index = [model.state_names.index(name) for name in names]
     pick = np.eye(model.n)[index]
     return Measurement(
@@ -96,8 +95,7 @@ def of_function(
         GroundedError: for an angle that is not a channel.
     """
     for name in angles:
-        if name not in names:
-            raise GroundedError(f"angle '{name}' is not measured: {nearest(name, names)}")
+        known("measured angle", [name], names)
     return Measurement(
         names=tuple(names),
         function=function,
@@ -141,7 +139,7 @@ class NoiseStd:
         for name in ("process", "measurement"):
             value = readonly(getattr(self, name))
             if value.ndim != 1 or not np.isfinite(value).all() or (value < 0).any():
-                raise GroundedError(f"{name} noise must be finite standard deviations, got {value}")
+                raise wrong(f"{name} noise", value, must="weights")
             object.__setattr__(self, name, value)
         if (self.measurement == 0).any():
-            raise GroundedError("a measurement noise of zero can't be filtered: give a small std")
+            raise wrong("measurement noise", self.measurement, must="above")

@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.errors import GroundedError, list_of, nearest
+from grounded.checks import known, list_of, of_shape, refused, same_names, wrong
 from grounded.estimate.measurement import Measurement
 from grounded.frozen import Array, readonly
 from grounded.model import Model
@@ -70,12 +70,9 @@ class Record:
             (self.command_times, self.commands, "commands"),
         ):
             if times.ndim != 1 or rows.ndim != 2 or len(times) != len(rows) or not len(times):
-                raise GroundedError(
-                    f"a record needs one row of {what} for each of its times (at least one); got "
-                    f"times {times.shape} and {what} {rows.shape}"
-                )
+                raise wrong(f"{what} of a record", rows.shape, shape=f"({len(times)}, m)")
             if not (np.diff(times) > 0).all():
-                raise GroundedError(f"the times of a record's {what} must ascend")
+                raise wrong(f"times of {what}", must="ascending")
         if not np.isfinite(self.commands).all():
             object.__setattr__(self, "commands", _held(self.commands, np.asarray(self.past)))
 
@@ -135,16 +132,9 @@ def record_of(model: Model, trial: Trial) -> Record:
         GroundedError: if the trial lacks an input of the model or has none of its states.
     """
     for name in model.input_names:
-        if name not in trial.input_names:
-            raise GroundedError(
-                f"the trial has no input '{name}' of model '{model.name}': "
-                + nearest(name, trial.input_names)
-            )
+        known("input", [name], trial.input_names, "the trial")
     if not set(model.state_names) & set(trial.state_names):
-        raise GroundedError(
-            f"the trial measures none of the states of model '{model.name}' "
-            f"({', '.join(model.state_names)}); it has {', '.join(trial.state_names)}"
-        )
+        same_names("the trial", "states", trial.state_names, model.state_names)
     measured = np.full((len(trial.states), model.n), np.nan)
     for i, name in enumerate(model.state_names):
         if name in trial.state_names:
@@ -200,13 +190,9 @@ def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
     trials = list_of(given, (Trial, Record), "trials")
     records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
     if not records:
-        raise GroundedError("there are no trials to estimate from; ingest at least one")
+        raise refused("search.no_trial")
     for record in records:
-        if record.commands.shape[1] != model.m:
-            raise GroundedError(
-                f"model '{model.name}' has {model.m} inputs, a record has "
-                f"{record.commands.shape[1]}"
-            )
+        of_shape("commands of a record", record.commands, (len(record.commands), model.m))
     return records
 
 
@@ -262,11 +248,7 @@ def batch_of(
     u, slope, dt = np.zeros((T, B, m)), np.zeros((T, B, m)), np.zeros((T, B))
     starts = []
     for b, record in enumerate(records):
-        if record.measured.shape[1] != ny:
-            raise GroundedError(
-                f"the measurement has {ny} channels ({', '.join(measurement.names)}), a record "
-                f"has {record.measured.shape[1]}"
-            )
+        of_shape("measurements of a record", record.measured, (len(record.measured), ny))
         t = record.steps
         seen[: t + 1, b] = np.isfinite(record.measured)
         y[: t + 1, b] = np.where(seen[: t + 1, b], record.measured, 0.0)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import wrong
 from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record
 from grounded.filter.kalman import predicted
@@ -62,10 +62,8 @@ class Tracker:
         self.covariance = np.diag(std**2)
         sizes = (len(self.state), len(std), len(noise.process), len(noise.measurement))
         if sizes != (model.n, model.n, model.n, self.measurement.ny):
-            raise GroundedError(
-                f"a tracker of model '{model.name}' needs start, start_std and process noise of "
-                f"{model.n} and measurement noise of {self.measurement.ny} numbers, got {sizes}"
-            )
+            wanted = str((model.n, model.n, model.n, self.measurement.ny))
+            raise wrong("start, start_std, process and measurement noise", sizes, shape=wanted)
         self._times: list[float] = []
         self._commands: list[Array] = []
 
@@ -82,9 +80,7 @@ class Tracker:
         """
         if self._times and t <= self._times[-1]:
             if t < self._times[-1]:
-                raise GroundedError(
-                    f"a command at {t:g} s came after one at {self._times[-1]:g} s; send in order"
-                )
+                raise wrong("time of a command", t, must="ascending")
             self._commands[-1] = np.array(u, float)
             return
         self._times.append(float(t))

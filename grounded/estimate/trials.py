@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import of_shape, refused
 from grounded.estimate.extended import Filtered, filter_batch, smooth
 from grounded.estimate.likelihood import NoiseEstimate, enough, first_noise, maximum_likelihood
 from grounded.estimate.measurement import Measurement, NoiseStd, of_states
@@ -67,11 +67,8 @@ def smooth_trials(
         GroundedError: if a trial does not match the model or the measurement.
     """
     measurement = of_states(model) if measurement is None else measurement
-    if len(noise.process) != model.n or len(noise.measurement) != measurement.ny:
-        raise GroundedError(
-            f"noise is needed for {model.n} states and {measurement.ny} channels, got "
-            f"{len(noise.process)} and {len(noise.measurement)}"
-        )
+    of_shape("process noise", noise.process, (model.n,))
+    of_shape("measurement noise", noise.measurement, (measurement.ny,))
     records = records_of(model, trials)
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(records, measurement, model.n, delay)
@@ -113,7 +110,7 @@ def noise_of(
     measurement = of_states(model) if measurement is None else measurement
     records = records_of(model, trials)
     if max(r.steps for r in records) < 2:
-        raise GroundedError("noise can't be estimated: no trial has more than two samples")
+        raise refused("given.short", what="noise", needs=2)
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(enough(records, rng), measurement, model.n, delay)
     start = first_noise(batch, measurement, sizes)

@@ -61,11 +61,12 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """What was found, and what to do where the entry has a remedy."""
+        """What was found, and what to do where the entry has a remedy, after its place `where`."""
         entry = entry_of(self.code)
         facts = {"about": self.about, **self.facts}
         texts = (filled(text, facts).strip() for text in (entry.short, entry.remedy))
-        return "; ".join(text for text in texts if text)
+        place = f"{self.facts['where']}: " if "where" in self.facts else ""
+        return place + "; ".join(text for text in texts if text)
 
     def knowing(self, facts: Mapping[str, Fact | None]) -> Finding:
         """Return it with more facts; those that are None are left out."""

@@ -71,8 +71,8 @@ def shaped(value: Any, how: str) -> str:
     """Return a fact as text, in one of the ways that the module lists."""
     number = getattr(value, "value", value)
     if "=" in how:
-        words = dict(pair.split("=", 1) for pair in how.split(","))
-        return words[str(value)]
+        words = dict(pair.split("=", 1) for pair in re.split(r",(?=\w+=)", how))
+        return words.get(str(value), "")
     if isinstance(value, tuple | list | set | frozenset):
         if not how:
             return listed(map(str, value))

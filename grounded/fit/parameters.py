@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from grounded.checks import known, list_of, of_type, one_of, refused, wrong
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
     TO_THE_TOP,
@@ -37,7 +38,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError, list_of, nearest, type_of
+from grounded.errors import GroundedError
 from grounded.fit.result import Fit, Found, PredictionError, errors_of, nothing, report
 from grounded.frozen import Array
 from grounded.model import Model
@@ -48,10 +49,6 @@ from grounded.trial import Trial
 
 Latency = Literal["known", "common", "each"] | Mapping[str, tuple[int, ...]]
 GRID = 21  # values of a threshold that are tried
-BOUNDS = (
-    "to fit a parameter, give bounds, Param(value, unit, low, high), or a prior, "
-    "Param(value, unit, std=s)"
-)
 
 
 @steady()
@@ -94,25 +91,18 @@ def fit(
         GroundedError: for an unknown or constant parameter, trials that do not match the model, are
             too short or unusable, or a model with too many states.
     """
-    if not isinstance(model, Model | Task):
-        raise GroundedError(
-            "fit(model, trials) takes a Model or a Task and a list of Trials, got "
-            f"{type_of(model)} and {type_of(trials)}"
-        )
+    of_type("model", model, Model, Task)
     logged = list_of([trials] if isinstance(trials, Trial) else trials, Trial, "trials")
     if isinstance(names, str) or not isinstance(names, Sequence | None):
-        raise GroundedError(f"names must be a list of parameters, got {names!r:.60}")
+        raise wrong("names", names, must="names")
     given = model.model if isinstance(model, Task) else model
     if given.n > MOST_STATES:
-        raise GroundedError(
-            f"model '{given.name}' has {given.n} states; a fit filters the trials with at most "
-            f"{MOST_STATES}, since a step costs their cube: fit the parameters in a model of the "
-            "part that they belong to, and copy them into this one"
-        )
+        sizes = {"states": given.n, "inputs": given.m, "most": MOST_STATES, "what": "fit"}
+        raise refused("given.large", f"model '{given.name}'", **sizes)
     delayed = _delayed(given, fit_latency)
     asked = _asked(given, names, bool(delayed))
     if max((trial.known_steps for trial in logged), default=0) < 3:
-        raise GroundedError("a fit needs a trial of at least 3 steps")
+        raise refused("given.short", what="fit", needs=3)
     # the data of a diagnosis; what is not asked for is constant
     share, tick = share_of(logged), Stages(progress, _done)
     tick("instruments")
@@ -133,11 +123,11 @@ def fit(
         interruptible(lambda: tick.so_far),
         running(engine, copied=not simulated(given)),
     ):
-        found = _identified(data, delayed, tick)
-        if isinstance(found, GroundedError):
-            return nothing(given, data, asked, delayed, found)
+        result = _identified(data, delayed, tick)
+        if isinstance(result, GroundedError):
+            return nothing(given, data, asked, delayed, result)
         tick("predict")
-        return report(given, asked, found, looked.findings, share.finding)
+        return report(given, asked, result, looked.findings, share.finding)
 
 
 def prediction_error(
@@ -324,8 +314,7 @@ def _delayed(model: Model, fit_latency: Latency) -> dict[str, tuple[int, ...]]:
     }
     if not isinstance(fit_latency, str):
         return dict(fit_latency)
-    if fit_latency not in choices:
-        raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
+    one_of("fit_latency", fit_latency, choices)
     return choices[fit_latency]
 
 
@@ -337,13 +326,9 @@ def _asked(model: Model, names: Sequence[str] | None, more: bool) -> tuple[str, 
     """
     chosen = model.uncertain if names is None else tuple(names)
     for name in chosen:
-        if name not in model.params:
-            raise GroundedError(
-                f"'{name}' is not a parameter of model '{model.name}': "
-                + nearest(name, model.params)
-            )
+        known("parameter", [name], model.params, f"model '{model.name}'")
         if not model.params[name].uncertain:
-            raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
+            raise refused("given.constant", f"model '{model.name}'", name=name)
     if not chosen and not more:
-        raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
+        raise refused("given.constant", f"model '{model.name}'")
     return chosen

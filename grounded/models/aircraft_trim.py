@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import known, wrong
 from grounded.frozen import Array, readonly
 from grounded.model import Model
 
@@ -52,8 +52,7 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     """
     speed, turn_rate = np.broadcast_arrays(np.atleast_1d(speed), np.atleast_1d(turn_rate))
     names = model.state_names
-    if not {*FREE, "north", "east", "altitude", "psi"} <= set(names):
-        raise GroundedError(f"'{model.name}' lacks the states of an aircraft: {', '.join(names)}")
+    known("state", [*FREE, "north", "east", "altitude", "psi"], names, f"model '{model.name}'")
     x, a = _first_guess(model, speed, turn_rate)
     free = [names.index(name) for name in FREE]
     worst = np.inf
@@ -70,10 +69,10 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
         x[:, free] += scale[:, None] * step[:, : len(free)]
         a += scale[:, None] * step[:, len(free) :]
     if not worst < 1e-6:
-        raise GroundedError(
-            f"no level flight was found at {speed.min():.2f} to {speed.max():.2f} m/s and turn "
-            f"rates up to {np.abs(turn_rate).max():.2f} rad/s: the residual is {worst:.1e}"
+        got = (
+            f"{speed.min():.2f} to {speed.max():.2f} m/s, up to {np.abs(turn_rate).max():.2f} rad/s"
         )
+        raise wrong("speed and turn rate", got=got, must="level")
     return Trim(_due_north(model, x, a, dt), a)
 
 

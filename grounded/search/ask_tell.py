@@ -17,7 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError, list_of, nearest, type_of
+from grounded.checks import known, list_of, of_type, refused, same_dt, same_names, wrong
+from grounded.errors import GroundedError
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
@@ -73,10 +74,9 @@ class Search:
         trials: Iterable[Trial] = (),
         planner: Planner | None = None,
     ) -> None:
-        if not isinstance(task, Task):
-            raise GroundedError(f"a Search needs a Task, got a {type_of(task)}")
-        if not isinstance(options, SearchOptions | None):
-            raise GroundedError(f"options must be gr.SearchOptions(...), got a {type_of(options)}")
+        of_type("task", task, Task)
+        if options is not None:
+            of_type("options", options, SearchOptions)
         self.task, self.options = task, options or SearchOptions()
         self.planner = planner or Planner(task, task)
         self._candidates = list_of(candidates, Candidate, "candidates")
@@ -168,14 +168,9 @@ class Search:
         if not isinstance(effects, Mapping) or not all(
             isinstance(values, Mapping) for values in effects.values()
         ):
-            raise GroundedError(
-                "adopt takes each effect with its values, as in Diagnosis.joining: "
-                f"{{'delay:steering': {{'d': 0.02}}}}; got {effects!r:.60}"
-            )
+            raise wrong("effects", effects, must="dict", like="Diagnosis.joining")
         if not isinstance(params, Mapping | None):
-            raise GroundedError(
-                f"params must map parameters to values, such as {{'mass': 1.2}}; got {params!r:.60}"
-            )
+            raise wrong("params", params, must="dict", like="{'mass': 1.2}")
         model, values = self.task.model, params or {}
         for name in values.keys() & model.params.keys():
             model.params[name].within(name, values[name])
@@ -188,27 +183,15 @@ class Search:
     def _fits(self, trial: Trial) -> None:
         given: Any = trial
         if not isinstance(given, Trial):
-            told = " (grounded_trials.store.trial_file.read_trial reads a file)"
-            raise GroundedError(
-                f"expected a Trial of the run, got a {type_of(given)}"
-                + told * isinstance(given, str | Path)
-            )
+            do = "read" if isinstance(given, str | Path) else None
+            raise wrong("the trial", got=f"a {type(given).__name__}", must="trial", do=do)
         model, task_dt = self.task.model, self.task.dt
         for kind, has, expected in (
             ("states", trial.state_names, model.state_names),
             ("inputs", trial.input_names, model.input_names),
         ):
-            if has != expected:
-                order = " in this order" * (sorted(has) == sorted(expected))
-                raise GroundedError(
-                    f"the trial does not fit the task: its {kind} are {', '.join(has)}; the task "
-                    f"has {', '.join(expected)}{order}"
-                )
-        if trial.dt != task_dt:
-            raise GroundedError(
-                f"the trial does not fit the task: its dt is {trial.dt:g} s; the task has "
-                f"{task_dt:g} s"
-            )
+            same_names("the trial", kind, has, expected)
+        same_dt("the trial", trial.dt, task_dt)
 
     def tell(self, trial: Trial) -> None:
         """Add a trial of the real system; warn if it is evidently not its candidate's run.
@@ -249,15 +232,9 @@ class Search:
         if not trial.candidate:
             waiting = self.standing.outstanding
             if waiting is None:
-                raise GroundedError(
-                    "no candidate is waiting for a trial: ask() for one first, or name the one "
-                    "that was run as the trial's `candidate`"
-                )
+                raise refused("search.none_waits")
             trial = replace(trial, candidate=waiting.id)
-        if trial.candidate not in ids:
-            raise GroundedError(
-                f"this search has no candidate '{trial.candidate}': {nearest(trial.candidate, ids)}"
-            )
+        known("candidate", [trial.candidate], ids, "this search")
         self._trials.append(trial)
         self._planned = None
 
@@ -291,12 +268,9 @@ def learn(
     """
     search = Search(task, options)
     if not callable(run):
-        raise GroundedError(
-            "learn(task, run) needs a function that runs a candidate on the robot and returns its "
-            f"Trial, got a {type_of(run)}"
-        )
+        raise wrong("run", got=f"a {type(run).__name__}", must="call")
     if not isinstance(max_iterations, int | None):
-        raise GroundedError(f"max_iterations must be a whole number, got {max_iterations!r:.60}")
+        raise wrong("max_iterations", max_iterations, must="whole")
     while True:
         proposal = search.proposal
         done = max_iterations is not None and proposal.standing.iteration >= max_iterations
@@ -328,14 +302,7 @@ def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
     except AttributeError as error:
         if error.obj is not candidate or not hasattr(candidate.policy, error.name or ""):
             raise
-        raise GroundedError(
-            f"the function that runs the robot asks for '{error.name}', which a policy has: it is "
-            "called with a Candidate. Use its policy: learn(task, lambda c: robot(c.policy))"
-        ) from error
+        raise wrong(f"the object whose '{error.name}' is read", must="policy") from error
     if not isinstance(trial, Trial):
-        raise GroundedError(
-            f"the function that runs the robot returned {'nothing' if trial is None else 'a '}"
-            f"{'' if trial is None else type_of(trial)}, expected the gr.Trial of the run: end it "
-            "with `return gr.Trial(...)`"
-        )
+        raise wrong("what run(candidate) returns", got=f"a {type(trial).__name__}", must="trial")
     return trial

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError, list_of, type_of
+from grounded.checks import list_of, of_type, refused
 from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded.search.candidate import BY_STEP, Candidate, Tried
@@ -92,15 +92,11 @@ def propose(
         GroundedError: if the model gives no plan to start from (the message says where it fails),
             or no weight of the reward is above 0.
     """
-    if not (isinstance(task, Task) and isinstance(options, SearchOptions)):
-        raise GroundedError(
-            "propose(task, candidates, trials, options) takes a Task, lists of Candidates and of "
-            f"Trials, and SearchOptions; got a {type_of(task)} and, as options, a "
-            f"{type_of(options)}"
-        )
+    of_type("task", task, Task)
+    of_type("options", options, SearchOptions)
     reward = task.reward
     if not any(w.any() for w in (reward.state, reward.terminal, reward.input, reward.input_change)):
-        raise GroundedError(found("plan.no_weight", state=task.model.state_names[0]))
+        raise refused("plan.no_weight", state=task.model.state_names[0])
     candidates = list_of(candidates, Candidate, "candidates")
     trials = list_of(trials, Trial, "trials")
     planner = planner or Planner(task, task)
@@ -117,7 +113,7 @@ def propose(
     if now.incumbent is None:
         policy, plan = planner.first_policy(now.caution, tick)
         if not plan.ok:
-            raise GroundedError(found("plan.none", why=plan.sentence))
+            raise refused("plan.none", why=plan.sentence)
         model = planner.plan.problem(exact=True)
         made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
         if plan.status == "converged":

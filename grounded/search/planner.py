@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.checks import known
 from grounded.compile import Problem, deepest
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
@@ -313,8 +313,7 @@ WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps
 
 
 def _input(task: Task, name: str, target: str) -> int:
-    if target not in task.model.input_names:
-        raise GroundedError(f"effect '{name}': '{target}' is not an input of the model")
+    known("input", [target], task.model.input_names, f"effect '{name}'")
     return task.model.input_names.index(target)
 
 

@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.checks import refused
 from grounded.compile import Problem
-from grounded.errors import GroundedError
 from grounded.frozen import Array, median
 from grounded.rollout import augmented
 from grounded.solve.levenberg_marquardt import LeastSquares, Rows, solve
@@ -81,10 +81,8 @@ def ground(
     """
     trial = trial.until(task.horizon)
     if trial.steps < task.horizon or trial.finite_steps < trial.steps:
-        raise GroundedError(
-            f"a bias needs a whole trial of {task.horizon} steps; this one is finite for "
-            f"{trial.finite_steps}"
-        )
+        facts = {"needs": task.horizon, "has": trial.finite_steps}
+        raise refused("given.short", what="bias", **facts)
     problem = task.problem(exact=exact)
     z, received = _along(problem, trial)
     if match_inputs and shift is None:

@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.checks import of_shape, wrong
 from grounded.compile import Backward, Descent, DescentOptions, Problem, Status
 from grounded.compile.problem import (
     CEILING,
@@ -43,7 +44,6 @@ from grounded.compile.problem import (
     SEARCH_FLOOR,
     Controls,
 )
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 
 
@@ -226,14 +226,13 @@ def _first_slope(problem: Problem, found: Descent) -> str:
 
 def _check(problem: Problem, u: Array, K: Array | None, z: Array | None) -> None:
     H, m, nz = problem.horizon, problem.system.m, problem.nz
-    if u.shape != (H, m):
-        raise GroundedError(f"inputs must have shape {(H, m)}, got {u.shape}")
-    if K is not None and K.shape != (H, m, nz):
-        raise GroundedError(f"a gain must have shape {(H, m, nz)}, got {K.shape}")
+    of_shape("inputs", u, (H, m))
+    if K is not None:
+        of_shape("gain", K, (H, m, nz))
     if K is not None and z is None:
-        raise GroundedError("a gain needs the reference zbar it is about")
+        raise wrong("reference", got="None", shape=str((H + 1, nz)))
     if z is not None and z.shape not in ((H, nz), (H + 1, nz)):
-        raise GroundedError(f"a reference must have shape {(H + 1, nz)}, got {z.shape}")
+        raise wrong("reference", z.shape, shape=str((H + 1, nz)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.checks import of_shape
 from grounded.compile import Problem
 from grounded.compile.run.interpreted import Quadratic
 from grounded.compile.run.interpreted import linearised as quadratic_model
-from grounded.errors import GroundedError
 from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate
 
@@ -59,10 +59,7 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
     if policy is None or policy.gain is None or policy.reference is None:
         g, _ = adjoint(local, np.zeros((*u.shape, z.shape[1])), free)
         return Gradient(g * free)
-    if policy.gain.shape != (*u.shape, z.shape[1]):
-        raise GroundedError(
-            f"a gain must have shape {(*u.shape, z.shape[1])}, got {policy.gain.shape}"
-        )
+    of_shape("gain", policy.gain, (*u.shape, z.shape[1]))
     g, _ = adjoint(local, policy.gain, free)
     dz = wrapped(z[:-1] - policy.reference, problem.angles)
     return Gradient(g * free, (g * free)[:, :, None] * dz[:, None, :])
@@ -71,11 +68,8 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
 def linearised(problem: Problem, z: Array, u: Array) -> Quadratic:
     """The problem's dynamics and cost about z (H+1, nz), u (H, m)."""
     H, nz = problem.horizon, problem.nz
-    if z.shape != (H + 1, nz) or u.shape != (H, problem.system.m):
-        raise GroundedError(
-            f"a trajectory must have shapes {(H + 1, nz)} and {(H, problem.system.m)}, "
-            f"got {z.shape} and {u.shape}"
-        )
+    of_shape("states of a trajectory", z, (H + 1, nz))
+    of_shape("inputs of a trajectory", u, (H, problem.system.m))
     return quadratic_model(problem.system, problem, z, u)
 
 

@@ -89,7 +89,7 @@ def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
     refused(w, "ingest", trial, "--candidate", "c0001", "--data", holds=["--data"])
     other = make(tmp_path / "o", "pendulum").folder
     for more in ([], ["--data"]):
-        refused(other, "ingest", trial, *more, holds=["another robot"])
+        refused(other, "ingest", trial, *more, holds=["states"])
     half = CONFIG.replace("dt = 0.05", "dt = 0.025").replace("horizon = 40", "horizon = 20")
     rows = "\n".join(f"{0.025 * i:.3f},0.0" for i in range(21))
     slow = make(tmp_path / "slow", config=half, target="t,x\n" + rows + "\n").folder
@@ -102,7 +102,7 @@ def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
     assert grounded("-C", twin, "ingest", trial, "--data").code == 0
     config = (w / "grounded.toml").read_text()
     (w / "grounded.toml").write_text(config.replace("x = 10.0", "x = 11.0"))
-    refused(w, "ingest", trial, holds=["another task", "--data"])
+    refused(w, "ingest", trial, holds=["earlier task", "--data"])
     kept = grounded("-C", w, "ingest", trial, "--data", "--json").json["trials"][0]
     assert kept["candidate"] is None and kept["utility"] is None
 
@@ -213,14 +213,14 @@ GRID = "".join(f"{0.05 * i:.2f},0,1\n" for i in range(41))
 TARGETS = {  # the text of target.csv, and what the message names
     "empty": ("", []),
     "header": ("t,x\n", []),
-    "no t": ("x,t\n0,0\n", ["'t'", "'x'"]),
+    "no t": ("x,t\n0,0\n", ["t", "'x'"]),
     "unknown": ("t,xx\n0,0\n", ["'xx'", "'x'"]),
     "text": ("t,x\n0,fast\n", ["line 2", "'fast'", "'x'"]),
     "nan": ("t,x\n0,nan\n", ["line 2", "nan", "'x'"]),
     "ragged": ("t,x\n0,0\n0.05\n", ["line 3"]),
     "short": ("t,x\n0,0\n0.05,0\n", ["41", "horizon = 1"]),
     "twice": ("t,x,x\n" + GRID, ["'x'"]),
-    "grid": ("t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)), ["dt = 0.05", "0.04 s"]),
+    "grid": ("t,x\n" + "".join(f"{0.04 * i},0\n" for i in range(41)), ["0.05 s", "0.04"]),
     "semicolons": ("t;x\n0;0\n", ["'t;x'"]),
     "binary": ("\x00\x00", []),
 }

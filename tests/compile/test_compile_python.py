@@ -31,7 +31,7 @@ def test_names():
         {"x": 1.0, "v": 2.0},
     )
     for ask in (lambda: s.velocity, lambda: s["velocity"], lambda: s[3]):
-        with pytest.raises(GroundedError, match=r"test_compile_python\.py:\d+: .*\bx, v\b"):
+        with pytest.raises(GroundedError, match=r"test_compile_python\.py:\d+: .*\bx\b"):
             ask()
     with pytest.raises(GroundedError, match=holding("'x'")):
         s.x = 3.0
@@ -115,7 +115,7 @@ def test_derivatives_of_a_linear_model_are_exact():
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (lambda s, a, p: {"x": s.v + 1j, "v": a.f}, "one real number for state 'x'.*complex"),
+        (lambda s, a, p: {"x": s.v + 1j, "v": a.f}, "state 'x'.*one real number.*complex"),
         (lambda s, a, p: {"x": s.v, "v": np.zeros(3)}, r"array of shape \(3,\)"),
         (lambda s, a, p: {"x": s.v, "v": None}, "NoneType"),
         (lambda s, a, p: {"x": s.v, "v": a.f + "1"}, "raised"),

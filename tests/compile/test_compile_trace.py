@@ -171,7 +171,7 @@ def test_mismatch_is_an_error_with_both_values():
     ("values", "message"),
     [
         (lambda s: {"x": s.v}, "missing: v"),
-        (lambda s: {"x": s.v, "v": s.x, "w": 0.0}, "'w', which is not a state"),
+        (lambda s: {"x": s.v, "v": s.x, "w": 0.0}, "no state 'w'"),
         (lambda s: {"x": s.v * 1j, "v": s.x}, "complex"),
         (lambda s: {"x": 1j, "v": s.x}, "complex"),
         (lambda s: {"x": np.array([s.v, s.x]), "v": s.x}, "shape"),

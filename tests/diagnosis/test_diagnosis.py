@@ -144,7 +144,7 @@ def test_a_constant_input_is_not_blamed():
 
 def test_no_trials_and_foreign_trials_are_refused():
     model, trials = pushed_cart()
-    with pytest.raises(GroundedError, match="no trials"):
+    with pytest.raises(GroundedError, match="no trial"):
         diagnose(model, [])
     with pytest.raises(GroundedError, match="states"):
         diagnose(pendulum, trials)

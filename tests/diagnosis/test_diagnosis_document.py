@@ -129,5 +129,5 @@ def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is()
     found = Diagnosis.from_json(DIAGNOSIS)
     with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
         found.values("drag:v")
-    with pytest.raises(GroundedError, match="none of any effect"):
+    with pytest.raises(GroundedError, match="no value"):
         Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")

@@ -261,7 +261,7 @@ def test_missing_and_unknown_quantities_are_named():
     effect = Library().effect("dead_zone:throttle", car)
     with pytest.raises(GroundedError, match="no quantity 'width'"):
         wrap(effect, {"width": 0.1}, DT)
-    with pytest.raises(GroundedError, match="needs a value for 'c'"):
+    with pytest.raises(GroundedError, match="'c' of effect"):
         wrap(effect, {}, DT)
 
 

@@ -329,11 +329,11 @@ def test_a_model_that_runs_away_is_a_status():
 
 def test_misuse_says_what_to_do():
     _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
-    with pytest.raises(GroundedError, match=holding("2 states", "2 channels")):
+    with pytest.raises(GroundedError, match=holding("process noise", "(2,)", "(3,)")):
         filter_trials(SPRING, trials, NoiseStd(np.ones(3), np.ones(2), DT))
     with pytest.raises(GroundedError, match=r"\bingest\b"):
         filter_trials(SPRING, [], SPRING_NOISE)
     with pytest.raises(GroundedError, match=holding("'steering'")):
         filter_trials(car, trials, CAR_NOISE)
-    with pytest.raises(GroundedError, match="finite standard"):
+    with pytest.raises(GroundedError, match="finite"):
         NoiseStd(np.array([np.nan]), np.ones(1), DT)

@@ -20,7 +20,7 @@ def sample(text: str) -> dict:
     facts: dict = {}
     for name, how in SLOT.findall(text):
         if "=" in how:
-            facts[name] = how.split(",")[0].split("=")[0]
+            facts[name] = how.split("=")[0]
         elif how in ("", None):
             facts.setdefault(name, ("v", "yaw") if name == "about" else "v")
         elif how == "size":

@@ -216,7 +216,7 @@ def test_misuse_says_what_to_do():
         fit(SPRING, trials, ["kk"])
     with pytest.raises(GroundedError, match=holding("known", "common", "each")):
         fit(SPRING, trials, fit_latency="yes")
-    with pytest.raises(GroundedError, match=holding("3 steps")):
+    with pytest.raises(GroundedError, match=holding("fit", 3)):
         fit(SPRING, [Trial(np.zeros((2, 2)), np.zeros((1, 1)), DT, ("x", "v"), ("force",))])
 
 

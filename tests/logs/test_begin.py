@@ -471,8 +471,8 @@ def test_a_line_takes_the_seconds_that_are_given(tmp_path, paces, most):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (("line", "--to", "x=2", "--accel", "0.4"), "--accel 0.5"),
-        (("line", "--to", "x=2", "--speed", "0.4"), "--speed 0.4"),
+        (("line", "--to", "x=2", "--accel", "0.4"), "0.5"),
+        (("line", "--to", "x=2", "--speed", "0.4"), "--seconds"),
         (("line", "--to", "x=2", "--speed", "1", "--accel", "1"), "--seconds"),
         (("circle",), "--seconds"),
         (("run.csv",), "--seconds"),

@@ -42,7 +42,7 @@ def test_what_does_not_fit_is_refused(name):
 def test_a_weighted_state_needs_a_target():
     target = np.array(cart_task().target)
     target[5, 0] = np.nan
-    with pytest.raises(GroundedError, match=holding("'x'", "step 5")):
+    with pytest.raises(GroundedError, match=holding("x", "step 5")):
         cart_task(target=target)
 
 

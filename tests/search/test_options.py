@@ -18,7 +18,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions
         ({"repeats": 2.5}, ("repeats", "2.5")),
         ({"repeats": True}, ("repeats", "True")),
         ({"max_trials": 0}, ("max_trials", "1", "0")),
-        ({"tolerance": "a"}, ("tolerance", "'a'", "[0, 1)")),
+        ({"tolerance": "a"}, ("tolerance", "'a'", "from 0 below 1")),
         ({"tolerance": float("nan")}, ("tolerance", "nan")),
         ({"refit": "no"}, ("refit", "'no'", "False")),
     ],

@@ -31,14 +31,14 @@ def files(w):
     [
         ({"y": LINE}, ("'y'", "state")),
         ({"torque": LINE}, ("'torque'",)),
-        ({"theta": LINE, "omega": LINE[1:]}, ("theta 21", "omega 20")),
+        ({"theta": LINE, "omega": LINE[1:]}, ("'theta': 21", "'omega': 20")),
         ({"theta": np.where(LINE == 0.5, np.nan, LINE)}, ("'theta'", "nan", "row 10")),
         ({"theta": 1.0}, ("'theta'", "()")),
         ({"theta": LINE[:, None]}, ("'theta'", "(21, 1)")),
         ({"theta": "line"}, ("'theta'", "'line'")),
-        ({}, ("none",)),
-        ("target.csv", ("str",)),
-        ({"theta": LINE[:1]}, ("2", "got 1")),
+        ({}, ("dict",)),
+        ("target.csv", ("dict", "'target.csv'")),
+        ({"theta": LINE[:1]}, ("2", "1")),
     ],
 )
 def test_columns_that_are_no_target_change_no_file(w, columns, facts):

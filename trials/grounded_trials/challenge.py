@@ -22,12 +22,14 @@ from typing import Any
 import numpy as np
 
 from grounded.challenge import Case, judge, of_crude, oracle, sealed, task_of
+from grounded.checks import refused, wrong
 from grounded.diagnosis.parts import Verdict
 from grounded.diagnosis.report import Diagnosis
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded.experiments.jobs import Job, Progress, run_jobs
 from grounded.findings import found
+from grounded_trials.plain_file import unreadable
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, made_folder, write_atomically
@@ -61,9 +63,9 @@ def write_cases(
             inside it.
     """
     if (folder / MANIFEST).exists():
-        raise GroundedError(f"{folder} already holds a challenge: name another folder")
+        raise refused("file.exists", folder / MANIFEST)
     if labels.resolve().is_relative_to(folder.resolve()):
-        raise GroundedError(f"the labels ({labels}) must lie outside {folder}, to keep it blind")
+        raise wrong("folder of the labels", got=str(labels), must="outside")
     for place in (folder, labels):
         made_folder(place)
     entries: dict[str, Any] = {}
@@ -85,10 +87,7 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     hashes = [hashlib.sha256(data).hexdigest() for data in files]
     stored = [entry.digest for entry in store.list()]
     if stored != [digest[:DIGITS] for digest in hashes[: len(stored)]]:
-        raise GroundedError(
-            f"{folder} holds trials of another challenge: repeat the command that made it, or name "
-            "another folder"
-        )
+        raise refused("file.exists", folder / "trials")
     made_folder(folder)
     task, names = task_of(case), case.model.state_names
     columns = {name: case.target[:, i] for i, name in enumerate(names)}
@@ -111,20 +110,18 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         GroundedError: if there is no manifest, or it can't be read.
     """
-    path, advice = folder / MANIFEST, "name the folder that `challenge make` wrote"
+    path = folder / MANIFEST
     if not folder.is_dir():
-        raise GroundedError(f"there is no folder {folder}: {advice}")
+        raise refused("file.missing", folder)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         return dict(document["cases"])
     except FileNotFoundError:
-        raise GroundedError(
-            f"{folder} holds no challenge: it has no {MANIFEST}; {advice}"
-        ) from None
+        raise refused("file.missing", path) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}; {advice}") from None
+        raise unreadable(path, error) from None
     except (ValueError, KeyError, TypeError):
-        raise GroundedError(f"{path} is not the list of a challenge's cases: {advice}") from None
+        raise refused("file.not_own", path, kind="challenge") from None
 
 
 def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
@@ -137,17 +134,11 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        there = f"{labels} holds no {path.name}" if labels.is_dir() else f"there is no {labels}"
-        raise GroundedError(
-            f"{there}: expected the folder with the label of every case, written by "
-            f"`challenge make`; look for {path.name}"
-        ) from None
+        raise refused("file.missing", path) from None
     except OSError as error:
-        raise GroundedError(
-            f"{path}, the case's label, can't be read: {error.strerror}; make it readable"
-        ) from None
+        raise unreadable(path, error) from None
     if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
-        raise GroundedError(f"{path} was changed: its hash differs from the one in the manifest")
+        raise refused("file.changed", path, what="manifest")
     return dict(json.loads(data))
 
 
@@ -162,14 +153,13 @@ def score_case(
     workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
-        raise GroundedError(f"{workspace.folder}: its trials differ from those in the manifest")
+        raise refused("file.changed", workspace.folder / "trials", what="manifest")
     path = workspace.reports / "diagnosis.json"
     try:
         diagnosis = read_document(path)
     except FileNotFoundError:
-        raise GroundedError(
-            f"{workspace.folder} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
-        ) from None
+        then = NextCommand("challenge", ("run", str(folder)))
+        raise refused("search.undiagnosed", workspace.folder, then=then) from None
     task = workspace.task
     label = of_crude(open_label(Path(labels), name, entry), task.model)
     latency = np.zeros(task.model.m) if task.latency is None else task.latency

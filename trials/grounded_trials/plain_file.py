@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from grounded.errors import GroundedError, type_of
+from grounded.checks import of_type, refused
+from grounded.errors import GroundedError
 
 # What a system lacks does no harm there: Windows has no pipes in its folders.
 BINARY = getattr(os, "O_BINARY", 0)
@@ -30,7 +31,7 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
         OSError: as `open`.
     """
     if not follow and path.is_symlink():
-        raise GroundedError(f"{path} is a link, expected a regular file: links are not followed")
+        raise refused("file.special", path, what="link")
     descriptor = os.open(path, os.O_RDONLY | PLAIN | (0 if follow else NO_LINKS))
     try:
         mode = os.fstat(descriptor).st_mode
@@ -38,7 +39,8 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
             raise IsADirectoryError(21, "Is a directory", str(path))
         if not stat.S_ISREG(mode):
             what = "a pipe" if stat.S_ISFIFO(mode) else "a device"
-            raise GroundedError(f"{path} is {what}, not a file: save its contents to a file first")
+            what = "pipe" if stat.S_ISFIFO(mode) else "device"
+            raise refused("file.special", path, what=what)
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -55,11 +57,11 @@ def read_file(path: Path, limit: int, *, follow: bool = True) -> bytes:
         with open_file(path, follow=follow) as stream:
             data = stream.read(limit + 1)
     except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist") from None
+        raise refused("file.missing", path) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     if len(data) > limit:
-        raise GroundedError(f"{path} is larger than {limit} bytes, the limit for such a file")
+        raise refused("file.large", path, limit=limit)
     return data
 
 
@@ -69,6 +71,20 @@ def path_of(given: object) -> Path:
     Raises:
         GroundedError: if it is not a text or a path.
     """
-    if not isinstance(given, str | Path):
-        raise GroundedError(f"expected the path of a file, got a {type_of(given)}")
-    return Path(given)
+    named: Any = given
+    return Path(of_type("the path of a file", named, str, Path))
+
+
+def unreadable(path: object, why: object, **facts: Any) -> GroundedError:
+    """Return the error of a file that can't be read, for an error of the system or other reason."""
+    return refused("file.unreadable", path, why=_reason(why), **facts)
+
+
+def unwritable(path: object, why: object, **facts: Any) -> GroundedError:
+    """Return the error of a file that can't be written."""
+    return refused("file.unwritable", path, why=_reason(why), **facts)
+
+
+def _reason(why: object) -> str:
+    told = getattr(why, "finding", None)
+    return str(told.clause if told else getattr(why, "strerror", None) or why)

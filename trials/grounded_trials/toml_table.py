@@ -12,7 +12,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import near, refused
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.plain_file import open_file
 
@@ -49,8 +50,8 @@ class Table:
 
     def unknown(self, key: str, valid: Iterable[str], value: str = "") -> GroundedError:
         """Return an error about a key, or the value of a key, that is none of the valid ones."""
-        name, hint = self._full(key), nearest(value or key, valid)
-        return GroundedError(found("file.key", self.file.name, key=name, value=value, hint=hint))
+        facts = {"key": self._full(key), "value": value, **near(value or key, valid)}
+        return refused("file.key", self.file.name, **facts)
 
     def expect(self, *names: str) -> None:
         """Raise an error for a key that is not among `names`; called before any key is taken."""

@@ -33,7 +33,9 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
+from grounded.checks import wrong
 from grounded.errors import GroundedError
+from grounded_trials.plain_file import unreadable
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -110,7 +112,7 @@ def within(
         try:
             child = (_Copy if FORKS else _Other)(order)
         except OSError as error:
-            raise GroundedError(f"{name} can't be read: no process can start: {error}") from None
+            raise unreadable(name, error) from None
         try:
             done, value = _answer(child, limits)
         finally:  # also of Ctrl-C
@@ -307,5 +309,5 @@ def _setting(name: str) -> float:
     except ValueError:
         value = -1.0
     if not value > 0:
-        raise GroundedError(f"{name} is '{text[:40]}'; expected a positive number")
+        raise wrong(name, text[:40], must="positive")
     return value

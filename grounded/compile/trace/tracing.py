@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.checks import refused
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
 from grounded.compile.trace.derivative import jacobian
@@ -121,10 +122,7 @@ def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
         found = f"{raised_at(error, signature.function)}: it unrolls to {error} (a long loop?)"
         if signature.kind == "step":  # a simulator of one's own runs as it is
             return found
-        raise GroundedError(
-            f"{found}; write it with fewer steps, or give the model as step=, which is run as it "
-            "is, on finite differences"
-        ) from None
+        raise refused("model.untraced", why=found, long=1) from None
     except NotTraceable as error:
         return f"{raised_at(error, signature.function)}: {error}"
     except Exception as error:  # the plain call will tell whether this is the user's mistake

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from grounded.checks import refused, same_dt, same_names
 from grounded.diagnosis.likelihood.groups import Group, Signals, folds
 from grounded.diagnosis.likelihood.memories import memories, recalled
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Scales, scales_of
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import dynamic, true_values
@@ -209,11 +210,8 @@ def prepare(
     used = [(trial, trial.known_steps) for trial in trials]
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
-        raise GroundedError(
-            "nothing can be learnt: no trial has two steps with finite values; verify the stored "
-            "files, or ingest a trial that ran",
-            then=NextCommand("verify"),
-        )
+        then = NextCommand("verify")
+        raise refused("given.short", what="diagnosis", needs=2, then=then)
     dt, m = used[0][0].dt, model.m
     lengths = np.array([T for _, T in used])
     commands = np.empty((len(used), int(lengths.max()), m))
@@ -309,22 +307,14 @@ def _before(model: Model, trial: Trial, steps: int) -> Array:
 
 def _check(model: Model, trials: Sequence[Trial]) -> None:
     if not trials:
-        raise GroundedError("no trials to diagnose: run or ingest one first")
+        raise refused("search.no_trial")
     for trial in trials:
-        for what, found, known in (
+        for what, names, known in (
             ("states", trial.state_names, model.state_names),
             ("inputs", trial.input_names, model.input_names),
         ):
-            if tuple(found) != tuple(known):
-                raise GroundedError(
-                    f"trial '{trial.id or '?'}' has the {what} {', '.join(found)}; the model "
-                    f"'{model.name}' has {', '.join(known)}"
-                )
-        if abs(trial.dt - trials[0].dt) > 1e-9 * trials[0].dt:
-            raise GroundedError(
-                f"trials have different time steps ({trials[0].dt:g} s and {trial.dt:g} s): "
-                "diagnose them separately"
-            )
+            same_names(f"trial '{trial.id or '?'}'", what, names, known)
+        same_dt(f"trial '{trial.id or '?'}'", trial.dt, trials[0].dt)
 
 
 def _cut(lengths: Any, longest: int) -> tuple[Any, Any, Array, Any]:

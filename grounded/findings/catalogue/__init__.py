@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 
-AREAS = ("file", "gap", "log", "model", "plan", "run", "search", "start", "target")
+AREAS = ("file", "gap", "given", "log", "model", "plan", "run", "search", "start", "target")
 
 
 @dataclass(frozen=True)

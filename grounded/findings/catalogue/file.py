@@ -9,8 +9,8 @@ ENTRIES: dict[str, Entry] = {
     # definitions and messages
     "schema": Entry(
         "refuse",
-        "its definition {what:damaged=is damaged at,lacks=does not define,refused=can't be read at,"
-        "unexpected=is none at,nested=is nested too deep at,long=has too many items:} '{at}'",
+        "its definition {what:damaged=is damaged at,lacks=does not define,refused=can't be read "
+        "at,unexpected=is none at,nested=is nested too deep at,long=has too many items:} '{at}'",
     ),
     "schema_language": Entry(
         "refuse",
@@ -33,7 +33,9 @@ ENTRIES: dict[str, Entry] = {
     # message paths
     "path": Entry("refuse", "message path '{path}'[[, character {at}]]: expected {expected}"),
     "path_field": Entry(
-        "refuse", "{type} has no field '{name}'[[: {hint}]][[; {read} {read:is/are} read already]]"
+        "refuse",
+        "{type} has no field '{name}'[[: did you mean '{near}'?]][[: there are {known}]][[; "
+        "{read} {read:is/are} read already]]",
     ),
     "path_list": Entry("refuse", "'{name}' follows a list: select an item first, as in [0] or [:]"),
     "path_step": Entry("refuse", "{step} needs {needs}, found a {type}"),
@@ -50,15 +52,15 @@ ENTRIES: dict[str, Entry] = {
     "defined_again": Entry("refuse", "{what} is '{first}' and defined again as '{second}'"),
     "mcap": Entry(
         "refuse",
-        "{about}: {where} {what:cut=is cut off: the file ends inside it,record=is damaged,checksum="
-        "has a checksum that does not match its content,time=is from after the year 2262}"
-        "[[: {why}]] (at byte {byte})",
+        "{about}: {where} {what:cut=is cut off: the file ends inside it,record=is damaged,"
+        "checksum=has a checksum that does not match its content,time=is from after the year "
+        "2262}[[: {why}]] (at byte {byte})",
         "`recover` saves what can be saved",
     ),
     "mcap_lost": Entry(
         "refuse",
-        "{about} holds no message: {what:cut=the file ends inside,empty=it is empty in,"
-        "other=it is no MCAP file by} {where}",
+        "{about} holds no message: {what:cut=the file ends inside,empty=it is empty in,other=it "
+        "is no MCAP file by} {where}",
         "did the recorder, or the program that it recorded, stop at once? Record again",
     ),
     "no_bag": Entry("refuse", "{about} is an SQLite file without the tables of a ROS 2 bag"),
@@ -82,8 +84,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "times": Entry(
         "refuse",
-        "{about}: '{name}'[[ is not a number in {lost:row}]][[ goes up to {top:g}, out of range in "
-        "{unit}]]",
+        "{about}: '{name}'[[ is not a number in {lost:row}]][[ goes up to {top:g}, out of range "
+        "in {unit}]]",
         f"delete such rows, or name the times: {_STAMPS}",
     ),
     "no_time": Entry(
@@ -105,8 +107,8 @@ ENTRIES: dict[str, Entry] = {
     "row": Entry(
         "refuse",
         "{about}, line {line} has {has} cells, but line {head} names {names} columns",
-        "[[export it with a point as decimal sign, or with semicolons or tabs between the columns"
-        "{comma:1=}]]",
+        "[[export it with a point as decimal sign, or with semicolons or tabs between the "
+        "columns{comma:1=}]]",
     ),
     "names_moved": Entry(
         "refuse",
@@ -125,19 +127,65 @@ ENTRIES: dict[str, Entry] = {
     # files and folders
     "missing": Entry(
         "refuse",
-        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]]"
-        "[[: the newest of the {logs} logs in its folder {newest:is/are} {newest}]]",
+        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]][[: "
+        "the newest of the {logs} logs in its folder {newest:is/are} {newest}]]",
     ),
     "unreadable": Entry(
         "refuse",
         "{about} can't be read[[ as a {kind}]]: {why}",
-        "[[{kind:ROS 2 bag=`sqlite3 FILE .recover` saves what can be saved,ROS 1 bag="
-        "`rosbag reindex` repairs it if it was not closed,PX4 log=,NumPy archive=,MCAP log=,"
-        "parquet table=,LeRobot data set=,MATLAB file=,ArduPilot log=,"
-        "table=,bag=,zstd file=,TOML file=,CSV=,candidate=,trial=}]]",
+        "[[{kind:ROS 2 bag=`sqlite3 FILE .recover` saves what can be saved,ROS 1 bag=`rosbag "
+        "reindex` repairs it if it was not closed}]][[{mend:diagnosis=diagnose again,"
+        "delete=delete it: what it kept can then not be undone,candidate=delete it: a trial that "
+        "ran it holds a copy,module=install its package here, or give file = 'model.py'}]]",
     ),
     "unwritable": Entry(
-        "refuse", "{about} can't be written[[: {why}]][[: the folder {folder} does not exist]]"
+        "refuse",
+        "{about} can't be written[[: {why}]][[: the folder {folder} does not exist]]",
+        "[[{mend:space=free disk space,permission=get write permission,lock=move the workspace to "
+        "a local disk, since this file system has no locks,recover=`recover` restores what the "
+        "file already holds}]]",
+    ),
+    "special": Entry(
+        "refuse",
+        "{about} is a {what:link=link, and links are not followed,pipe=pipe,device=device}[[: it "
+        "leads to {to}]]",
+        "give a file with its contents",
+    ),
+    "large": Entry("refuse", "{about} is larger than {limit} bytes, the limit for such a file"),
+    "changed": Entry(
+        "refuse",
+        "{about} was changed or damaged: {what:checksum=its checksum does not match,none=it has "
+        "no checksum,hash=its contents do not match the hash in its name,manifest=it is not as "
+        "the manifest has it,candidate=it was rewritten since it was proposed,policy=it is not "
+        "the policy that ran,name=it holds another candidate,gone=what it was made from is "
+        "gone}[[: {lost}]]",
+        "{what:checksum=make it again,none=make it again,hash=restore it from a backup, or ingest "
+        "the original log again,manifest=restore it,candidate=delete it; a new one is made,"
+        "policy=delete it; the trial holds the one that ran,name=rename it, or delete it if the "
+        "file of that candidate exists,gone=bring that back from a copy, or ingest the original "
+        "logs again}",
+    ),
+    "not_own": Entry(
+        "refuse", "{about} is not a {kind} file of grounded[[: its format is '{has}']]"
+    ),
+    "rows": Entry(
+        "refuse",
+        "{about} has {rows} rows below its header, expected {needs} or more",
+        "[[!horizon? draw the manoeuvre, or write a row per control step with t and the "
+        "states]][[add rows, or set [task] horizon = {horizon}]]",
+    ),
+    "no_mapping": Entry(
+        "refuse",
+        "{about} is no trial of grounded, and grounded.toml has no [log] table to map it",
+        "`inspect` prints one",
+    ),
+    "grid": Entry(
+        "refuse",
+        "{about} has [[sample {sample} at {at:.4f} s instead of {expected:.4f} s]][[a sample "
+        "every {every:.4g} s]], dt is {dt:.6g} s",
+        "[[set [task] dt = {each:.6g}, the time in s from one command to the next]][[resample? , "
+        "or resample the rows]][[robot? samples are missing or late: run it again]][[append each "
+        "at {unit} times its stamp: it is in another unit]]",
     ),
     "exists": Entry("refuse", "{about} exists already", "name another, or remove it first"),
     "folder": Entry("refuse", "{about} is a folder", "name a file in it"),
@@ -176,7 +224,8 @@ ENTRIES: dict[str, Entry] = {
     # tables of TOML
     "key": Entry(
         "refuse",
-        "{about}: {key}: [['{value}' ]]is not known here: {hint}",
+        "{about}: {key}: [['{value}' ]]is not known here[[: did you mean '{near}'?]][[: there are "
+        "{known}]]",
     ),
     "value": Entry(
         "refuse",
@@ -199,7 +248,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "no_topic": Entry(
         "refuse",
-        "{about} {about:is/are} read from {topic}, but the log has no topic '{topic}': {hint}",
+        "{about} {about:is/are} read from {topic}, but the log has no topic '{topic}'[[: did you "
+        "mean '{near}'?]][[: there are {known}]]",
         "if it was renamed, edit the path in [log] of grounded.toml",
     ),
     "misfit": Entry(
@@ -267,8 +317,7 @@ ENTRIES: dict[str, Entry] = {
     "steps": Entry(
         "refuse",
         "the trial would have {steps} steps of {dt:g} s, from {start:.3f} s to {stop:.3f} s[[; "
-        "samples come every {every:.3g} s: are the times in another unit than their column "
-        "says?]]",
+        "samples come every {every:.3g} s: are the times in another unit than their column says?]]",
         "see [log.span]",
     ),
     # what is odd in a log
@@ -292,9 +341,9 @@ ENTRIES: dict[str, Entry] = {
     "late_start": Entry("warn", "the trial starts {late:.3f} s late, when all states are known"),
     "odd_values": Entry(
         "warn",
-        "{about}:[[ {lost} of {samples} values are not finite numbers]][[ {bridged:value} bridged, "
-        "the largest gap is {gap}]][[ {stamps:stamp} out of order, repeated or "
-        "0]][[ held from a single sample{single:1=}]]",
+        "{about}:[[ {lost} of {samples} values are not finite numbers]][[ {bridged:value} bridged,"
+        " the largest gap is {gap}]][[ {stamps:stamp} out of order, repeated or 0]][[ held from a "
+        "single sample{single:1=}]]",
     ),
     "clocks_apart": Entry("warn", "the clocks of {about} differ by {apart:.3f} s"),
     "topic": Entry("warn", "{about} ({type}) can't be read: {why}"),
@@ -313,18 +362,25 @@ ENTRIES: dict[str, Entry] = {
     ),
     "cut_at": Entry(
         "warn",
-        "the file is cut off at byte {byte}: what came after that is lost[[, only its index"
-        "{index:1=}]]",
+        "the file is cut off at byte {byte}: what came after that is lost[[, only its "
+        "index{index:1=}]]",
     ),
     "lost": Entry(
         "warn",
-        "not saved:[[ {bytes} bytes]][[ {part}]][[ {messages:message} of unknown topics or times]]"
-        "[[ {more} more losses of these kinds]][[ second {span} of the log]][[, at byte {byte}]]"
-        "[[: {why}]]",
+        "not saved:[[ {bytes} bytes]][[ {part}]][[ {messages:message} of unknown topics or "
+        "times]][[ {more} more losses of these kinds]][[ second {span} of the log]][[, at byte "
+        "{byte}]][[: {why}]]",
     ),
     "unverified": Entry(
         "warn",
         "the checksum of the file does not match: some number in [[{messages:message}]] may be "
         "wrong, and it can't be located",
+    ),
+    "untrusted": Entry(
+        "refuse",
+        "{about} {by:owner=belongs to another user,all=is writable by everybody,group=is writable "
+        "by its group}[[ ({id})]], so another user may have changed its code; nothing in {folder} "
+        "is executed",
+        "if it is yours: chown -R $USER and chmod -R go-w, or name the folder in {trust}",
     ),
 }

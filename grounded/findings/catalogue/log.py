@@ -307,4 +307,37 @@ ENTRIES: dict[str, Entry] = {
         "it is probably a copy,False=the system is treated as deterministic and no candidate is "
         "run a second time from now on}",
     ),
+    "stored": Entry(
+        "refuse",
+        "{about} is stored already, as {trial}[[ ({used})]][[part?, a part of it]][[other?, read "
+        "in another way (another [log], [estimate] or [task] dt)]]",
+        "[[pass the log of the run of {waits}]][[wanted? if it is {wanted} all the same, discard "
+        "{trial} and ingest it again]][[part? discard that and ingest this]][[other? discard "
+        "{trial} and ingest it again]]",
+    ),
+    "foreign_run": Entry(
+        "refuse",
+        "{about} ran {ran}, {what:unknown=which this workspace never proposed,policy=but not with "
+        "the policy of this workspace}",
+        "ingest it with --data for fit and diagnose",
+    ),
+    "stored_units": Entry(
+        "refuse",
+        "{about} has other units than the model: {units}",
+        "write its signals in the model's units, or ingest them as a CSV with a scale in [log]",
+    ),
+    "not_estimated": Entry(
+        "refuse",
+        "the smoother finds no finite states for this log ({why})",
+        "the model is too far off to estimate what was not measured: check its units and [log]",
+    ),
+    "no_signal": Entry(
+        "refuse",
+        "[log] maps no '{about}'{what:any=, nor any other state,estimated=, but [estimate] lists "
+        "it as measured}",
+        "{what:input=every input must be logged: map it,any=map what is measured,estimated=map "
+        "it, or remove it there,state=map it, or let a smoother estimate it}[[ ({path} has "
+        "{numbers})]][[, with the noise of each measured state under [estimate]: measured = "
+        "{measured}]]",
+    ),
 }

@@ -165,4 +165,57 @@ ENTRIES: dict[str, Entry] = {
         "{file} can't be written: the model comes from {source}, which stays as it is",
         "name another file with the same ending",
     ),
+    # what can't be adopted, or undone
+    "not_adoptable": Entry(
+        "refuse",
+        "{about} can't be adopted: {why:adopted=it stands in [model] effects already,alike=it has "
+        "no values of its own: it only looks like,rival=it was fitted instead of what is claimed, "
+        "not with it,worse=it does not predict trials better that it was not fitted to,together="
+        "it was fitted together with,unvalued=the diagnosis lacks its value}[[ {effect}]][[, of "
+        "whose signal it reproduces {share:%}]]",
+        "{why:rival=adopt the claimed, or one alone,worse=run more trials and diagnose again,"
+        "together=adopt them together}",
+    ),
+    "delayed_twice": Entry(
+        "refuse",
+        "[log.state.{state}] delay_s = {delay} removes the delay {about} from every log already",
+        "remove delay_s, so that plans allow for the delay; or keep it, and let the robot's "
+        "program predict the state ahead by as much",
+    ),
+    "no_adoption": Entry(
+        "refuse",
+        "no adoption is left to undo; [model] effects in {about}: {effects}",
+        "remove there what was written by hand",
+    ),
+    "edited": Entry(
+        "refuse",
+        "[model] in {about} was changed after {adopted} was adopted, which undoing would lose",
+        "edit it by hand; before the adoption it had {had}",
+    ),
+    # its file
+    "fails": Entry("refuse", "{about}[[ line {line}]]: {why}"),
+    "undefined": Entry(
+        "refuse",
+        "{about} does not define `model = Model(...)`",
+        "[[rename '{other}' to 'model']][[!other? see the README for an example]]",
+    ),
+    "assigned": Entry(
+        "refuse", "{about}: a {what} can't be assigned to", "use a local variable for '{name}'"
+    ),
+    "name_only": Entry(
+        "refuse",
+        "{about}: '{name}' names one of the {what}s and is not its value",
+        "write s.{name} for a function f(s, ...), or unpack s.values()",
+    ),
+    "returns": Entry(
+        "refuse",
+        "{about}: the model must return a dict of all states[[ ({states}), not a {type}]][[; "
+        "missing: {missing}]]",
+    ),
+    "untraced": Entry(
+        "refuse",
+        "{why}",
+        "[[long? write it with fewer steps, or give the model as step=, which is run as it is]]"
+        "[[!long? use np.where: that holds for these parameters only]]",
+    ),
 }

@@ -7,6 +7,7 @@ from grounded.findings.catalogue import Entry
 STOP = "be ready to stop the robot"
 
 ENTRIES: dict[str, Entry] = {
+    "unsafe": Entry("refuse", "{about} is not safe to run: {why}"),
     # there is no candidate
     "no_weight": Entry(
         "refuse",

@@ -224,4 +224,24 @@ ENTRIES: dict[str, Entry] = {
         "runner sends {held}, which does not hold it there[[ ({would} would)]]",
         "hold it with another controller as soon as `runner.done(t)` is true",
     ),
+    # the command of [system]
+    "by_hand": Entry(
+        "refuse",
+        "grounded.toml has no [system] to run {about} with",
+        "run it on your robot by hand and ingest its log, or give [system] command, such as "
+        "{example}",
+    ),
+    "command": Entry(
+        "refuse",
+        "[system] command {about}[[ ended with exit code {exit}]][[ can't be run: {why}]][[ wrote "
+        "no trial to {missing}]]",
+        "[[what it wrote is kept in {kept}]]",
+    ),
+    # its errors
+    "off_target": Entry(
+        "note",
+        "{about}[[ {rms:size} rms, {most:size} at most (at {at:.4g} s)]][[rms?,]]"
+        "[[ {end:size} at the end]][[there?  none at the end]][[ at the end within its noise of "
+        "{noise:size}]][[ (+- {std:size} by {runs:run})]]",
+    ),
 }

@@ -168,6 +168,14 @@ ENTRIES: dict[str, Entry] = {
         "there is no trial to learn from",
         "ingest runs of candidates, or other logs with --data",
     ),
+    "none_waits": Entry(
+        "refuse",
+        "[[{log} does not say which candidate it ran, and ]]no candidate is waiting for a trial",
+        "[[log? name it with --candidate ID, or use --data for a log that ran none]][[!log? make "
+        "the next one, or name the candidate that is run]]",
+    ),
+    "no_best": Entry("refuse", "no run of this task is stored, so no candidate is the best"),
+    "undiagnosed": Entry("refuse", "there is no diagnosis[[ of {about}]] yet", "diagnose first"),
     "no_log_file": Entry(
         "refuse",
         "{about} is a trial or a candidate, expected the file of a log[[: its own is {path}]]",

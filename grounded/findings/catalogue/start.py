@@ -38,8 +38,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "pose": Entry(
         "note",
-        "measured independently of the wheels, from whose speed the pose of {about} is most likely "
-        "integrated",
+        "measured independently of the wheels, from whose speed the pose of {about} is most "
+        "likely integrated",
     ),
     "still": Entry("note", "{about} never changes in this log"),
     "alone": Entry(
@@ -70,6 +70,38 @@ ENTRIES: dict[str, Entry] = {
     "degrees": Entry(
         "note",
         "{about} is in rad by the model, but goes from {low} to {high}",
-        "if in degrees, set scale = {scale:.8g} in [log], of its rate too; [limits] are in rad",
+        "[[target? its course shows degrees: multiply it by {scale:.8g}]][[!target? if in degrees,"
+        " set scale = {scale:.8g} in [log], of its rate too; [limits] are in rad]]",
+    ),
+    "no_start": Entry(
+        "refuse",
+        "{about} can't begin a workspace: {why:own=grounded wrote it,text=it holds no numbers,"
+        "still=nothing changes in it}[[ ({names})]]",
+        "give a log in which the robot moves, with its states and commands as numbers",
+    ),
+    "damaged": Entry("refuse", "{why}"),
+    # the drawing of a target
+    "no_position": Entry(
+        "refuse",
+        "model '{about}' has no role 'position' of two states, which a {shape} needs",
+        "add {roles} to model.py; line and step with --to STATE=VALUE need no role",
+    ),
+    "sideways": Entry(
+        "refuse",
+        "the role 'speed' of model '{about}' is {speed}, which moves it across its heading",
+        'write "speed": "{ahead}" in model.py',
+    ),
+    "follows_path": Entry(
+        "refuse",
+        "--to {about}={asked} can't be chosen: {why:path=the shape sets it,ends=the path ends "
+        "with another,rest=the line ends at rest,swing=it would be held during the swing}[[, "
+        "{end}]]",
+        "omit it, or ask for 0 (--to {about}=0)[[; --hold 1 lets the path end at rest and stay "
+        "there{hold:1=}]]",
+    ),
+    "no_way": Entry(
+        "refuse",
+        "the line ends where it starts, at {to}",
+        "change --to[[: it ends at rest, so say where, such as --to {goes}=1.0]]",
     ),
 }

@@ -39,8 +39,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
-from grounded.frozen import whole_number
+from grounded.checks import one_of, whole_number, wrong
 from grounded.result import figure
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 
@@ -133,24 +132,17 @@ class SearchOptions:
 
     def __post_init__(self) -> None:
         for name, valid in (("method", METHODS), ("step", STEPS)):
-            if (given := getattr(self, name)) not in valid:
-                raise GroundedError(
-                    f"[search] {name}: {given!r} is not one of the choices: "
-                    + nearest(str(given), valid)
-                )
+            one_of(f"[search] {name}", getattr(self, name), valid)
         for name in ("refit", "match_inputs", "slopes_by_step", "rerun_incumbent"):
             if not isinstance(given := getattr(self, name), bool | np.bool_):
-                raise GroundedError(f"[search] {name} must be True or False, got {given!r:.60}")
+                raise wrong(f"[search] {name}", given, must="bool")
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
         for name, (low, high) in bounds.items():
             whole_number(f"[search] {name}", getattr(self, name), low, high)
-        if self.repeats > self.max_trials:
-            raise GroundedError(
-                f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
-            )
+        whole_number("[search] repeats", self.repeats, 1, self.max_trials)
         tolerance: Any = self.tolerance
         if not isinstance(tolerance, int | float | np.number) or not 0 <= tolerance < 1:
-            raise GroundedError(f"[search] tolerance must be in [0, 1), got {tolerance!r:.60}")
+            raise wrong("[search] tolerance", tolerance, low=0, below=1)
 
     @property
     def damps(self) -> bool:

@@ -60,5 +60,5 @@ def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
     found = ingest_log(doubtful, doubtful.unnamed)
     assert (found.candidate, found.verdict) == ("c0001", "run again")
     write_trial(doubtful.unnamed, replace(doubtful.best, states=moved + 1e-6, candidate=""), {})
-    with pytest.raises(GroundedError, match="none is waiting"):  # one run was asked for
+    with pytest.raises(GroundedError, match="no candidate is waiting"):  # one run was asked for
         ingest_log(doubtful, doubtful.unnamed)

@@ -170,7 +170,7 @@ def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tm
     wrong = [("c0001", "a.xyz"), ("c0001", "a.mcap"), ("t0001", "a.foo"), ("t0001", "a.json")]
     for name, file in wrong:
         done = grounded("-C", w.folder, "export", name, "-o", tmp_path / file)
-        assert done.code == 1 and ".csv" in done.err and ".npz" in done.err, done.err
+        assert done.code == 1 and "csv" in done.err and "npz" in done.err, done.err
         assert not (tmp_path / file).exists()
     for options in (["t0001"], ["c0001", "--format", "bag"]):
         done = grounded("-C", w.folder, "export", *options, "--runner", "-o", tmp_path / "b")

@@ -164,7 +164,7 @@ def test_a_target_says_what_it_leaves_free(plane):
     edit(plane.folder, state="{ x = 2, z = 3 }")
     drawn(plane, "line", "--to", "x=2")
     refused = grounded("-C", plane.folder, "propose")
-    assert refused.code == 1 and "'z'" in refused.err
+    assert refused.code == 1 and "weighs z" in refused.err
 
 
 def test_a_line_keeps_the_rest_of_a_position_where_it_starts(plane):

@@ -129,20 +129,20 @@ file = "model.py" | file = "../other.py" | ../other.py
 [task] | smoothing = -1\n[task] | [model] smoothing
 dt = 0.05 |  | [task] dt
 dt = 0.05 | dt = 0 | [task] dt
-dt = 0.05 | dt = 0.06 | [task] dt = 0.06
+dt = 0.05 | dt = 0.06 | 0.06 s, [task] dt = 0.05
 dt = 0.05 | DT = 0.05 | [task] DT, 'dt'
 horizon = 40 | horizon = 0 | [task] horizon
 horizon = 40 | horizon = 50 | target.csv
 target = "target.csv" | target = "t.csv" | t.csv, [task] target
-target = "target.csv" | target = "/etc/passwd" | outside the workspace
+target = "target.csv" | target = "/etc/passwd" | inside the workspace
 horizon = 40 | horizon = 40\nfeedback = 1 | [task] feedback
 horizon = 40 | horizon = 40\nstart = { vv = 0 } | [task] start, 'v'
 horizon = 40 | horizon = 40\nlatency = { forc = 0.1 } | [task] latency, 'force'
 horizon = 40 | horizon = 40\nlatency = { force = 9 } | [task] latency of force
 state = { x = 10.0 } | state = { y = 10.0 } | [reward.state] y
-state = { x = 10.0 } | state = { v = 1 } | weighs state 'v'
+state = { x = 10.0 } | state = { v = 1 } | [reward], v
 state = { x = 10.0 } | state = { x = -1 } | [reward] state
-state = { x = 10.0 } | state = { x = 0 } | [reward]
+state = { x = 10.0 } | state = { x = 0 } | reward
 force = [-5.0, 5.0] | forc = [-5, 5] | [limits] forc, 'force'
 force = [-5.0, 5.0] | force = [5, -5] | [limits] force
 [search] | [safety]\nz = [0, 1]\n[search] | [safety] z
@@ -152,7 +152,7 @@ max_trials = 12 | max_halvings = 99 | [search] max_halvings
 model = "real.py" | model = "reel.py" | reel.py, [system]
 model = "real.py" | model = "real.py"\ncommand = "x" | [system] command
 model = "real.py" | model = "real.py"\nseed = -1 | [system] seed
-model = "real.py" | model = "real.py"\nnoise = { start = { xx = 1 } } | [system.noise.start] xx, 'x'
+model = "real.py" | model = "real.py"\nnoise = { start = { xx = 1 } } | [system.noise.start], 'x'
 model = "real.py" | model = "real.py"\nnoise = { start = { x = -1 } } | [system.noise.start] x
 clock = "header" | clock = "haeder" | [log] clock, 'header'
 [log.state.x] | [log.state.xx] | [log.state] xx, 'x'
@@ -292,7 +292,7 @@ def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
         ('"delay:force"', ("'d'",)),
         ('"delay:force", d = 0.02, dd = 3.0', ("'dd'", "'d'")),
         ('"delay:force", d = -0.02', ("-0.02", "0")),
-        ('"delay:force", d = nan', ("d", "number")),
+        ('"delay:force", d = nan', ("d", "finite")),
         ('"input_gain:force", g = 9.0', ("9", "-3", "5")),
     ],
 )

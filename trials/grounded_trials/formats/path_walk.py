@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import nearest, type_of
+from grounded.checks import near
+from grounded.errors import type_of
 from grounded.units import in_another_unit
 from grounded_trials.formats.bad import BadMessage, BadPath
 from grounded_trials.formats.message_path import (
@@ -132,9 +133,9 @@ class NoField(BadPath):
         self.type, self.name = type, name
         left = [one for one in type.by_name if one not in taken and one != "header"]
         alike = in_another_unit(name, left)
-        hint = f"did you mean '{alike[0]}'?" if alike else nearest(name, left) if left else ""
+        others = {"near": alike[0]} if alike else near(name, left)
         read = tuple(one for one in type.by_name if one in taken)
-        super().__init__("path_field", type=str(type), name=name, hint=hint, read=read)
+        super().__init__("path_field", type=str(type), name=name, read=read, **others)
 
     def beside(self, taken: Collection[str]) -> NoField:
         """Return it without a suggestion of fields that other signals are read from."""

@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import near, refused
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
-from grounded.result import listed
 from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
@@ -130,9 +130,9 @@ def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
     topic, known = first.path.topic, sorted(first.topics)
     names = tuple(name for name, one in missing.items() if one.path.topic == topic)
     few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
-    hint = f"it has {listed(known)}" if few else nearest(topic, known)
+    others = {"known": tuple(known)} if few else near(topic, known)
     then = NextCommand("inspect", (file,))
-    raise GroundedError(found("file.no_topic", *names, topic=topic, hint=hint, then=then))
+    raise refused("file.no_topic", *names, topic=topic, then=then, **others)
 
 
 class _Log:

@@ -26,14 +26,12 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
-from grounded_trials.report.settled import Settled, lines_since, told_since
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import outlook
 from grounded_trials.workspace.off_target import (
     UNSURE,
-    WITHIN,
     by_runs,
     rates_among,
     reaches,
@@ -42,6 +40,7 @@ from grounded_trials.workspace.off_target import (
     tracking_error,
     weighed_groups,
 )
+from grounded_trials.workspace.settled import Settled, lines_since, told_since
 
 if TYPE_CHECKING:
     from grounded.diagnosis.telling import Told
@@ -297,7 +296,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
             lost = words.startswith(AT_END) and missed[-1] < noise
             if lost:  # a single sample can't show a smaller error
                 before, missed[-1] = max(before, noise), noise
-                paid = f"; the best is {WITHIN} {measured_alike([noise], unit)[0]}"
+                paid = f"; the best is within its noise of {measured_alike([noise], unit)[0]}"
             elif words.startswith(AT_END):
                 paid = _at_end_told(findings, parts, missed, states, unit) + paid
             one = Improved(words + note + paid, unit, before, missed[-1])

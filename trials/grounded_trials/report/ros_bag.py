@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import one_of, refused
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
@@ -33,7 +33,7 @@ from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.candidates.exporting import Exported, format_of
 from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.unknown_id import unknown_trial
+from grounded_trials.workspace.unknown_id import unknown_candidate, unknown_trial
 
 FRAME, BODY = "map", "robot"
 BAGS = ("bag", "db3", "mcap")  # endings of a bag's folder
@@ -47,7 +47,7 @@ def _write_bag(
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     if path.exists():
-        raise GroundedError(f"{path} exists already: name another folder, or remove it first")
+        raise refused("file.exists", path)
     storage = StoragePlugin.MCAP if "mcap" in path.name else StoragePlugin.SQLITE3
     store = standard_types()
     with tempfile.TemporaryDirectory(prefix=".bag-", dir=made_folder(path.parent)) as room:
@@ -174,14 +174,10 @@ def export_run(
 ) -> Exported:
     """Write a trial, or a candidate's predicted run, see `Workspace.export`."""
     if runner:
-        raise GroundedError(
-            "the runner runs a candidate, expected one without --format bag: not a trial, nor the "
-            "predicted run of a candidate"
-        )
+        raise unknown_candidate(workspace, identity)
     form = form or format_of(path, ("csv", "npz", *BAGS), "bag")
     form = "bag" if form in BAGS else form
-    if form not in ("bag", "csv", "npz"):
-        raise GroundedError(f"a run can be exported as bag, csv or npz, not {form}")
+    one_of("the format of a run", form, ("bag", "csv", "npz"))
     states, inputs, dt = _run_of(workspace, identity)
     path = path or Path(f"{identity}.{form}" if form != "bag" else f"{identity}_bag")
     model = workspace.base_model

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import known
 from grounded.experiments.car import PAPER, CarResult, CarRun
 from grounded.experiments.figure8 import DT
 from grounded.experiments.flight import FIGURE_STEP, FlightResult
@@ -260,7 +260,6 @@ def draw_study(name: str, result: Any, path: Path) -> None:
     Raises:
         GroundedError: if the name is unknown or the file can't be written.
     """
-    if name not in PICTURES:
-        raise GroundedError(f"there is no picture of '{name}', only of {', '.join(PICTURES)}")
+    known("picture", [name], PICTURES)
     made_folder(path.parent)
     write_atomically(path, png(PICTURES[name](result)))

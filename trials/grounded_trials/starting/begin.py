@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import known, refused
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -46,7 +47,6 @@ from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.starting.pushed import with_gain
 from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
-from grounded_trials.wording import count
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
@@ -156,14 +156,10 @@ def begin(
         GroundedError: if the log can't be read or was written by grounded, if the folder already
             holds a workspace, or if a name is unknown.
     """
-    if kind is not None and kind not in KINDS:
-        raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
+    if kind is not None:
+        known("kind", [kind], KINDS)
     if inputs and (model is not None or kind not in (None, "generic")):
-        raise GroundedError(
-            "--inputs needs a skeleton of kind generic: others know their inputs, and a car or a "
-            "rover takes the motor command that the log has: leave --inputs out, or set --kind "
-            "generic"
-        )
+        raise refused("given.either", "--kind generic", "--inputs", how="first")
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
     options = {"--model": model, "--kind": kind, "--dt": dt, "--inputs": ",".join(inputs)}
@@ -188,23 +184,16 @@ def _begin(
 ) -> Begun:
     files = log_files(log)
     if kind_of(files[0]):
-        raise GroundedError(f"{log} was written by grounded: init needs a log of your robot")
+        raise refused("start.no_start", log, why="own")
     report = inspect_log(log, layout)
     if report.damage:
-        raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
+        raise refused("start.damaged", why=report.damage, then=NextCommand("recover", (str(log),)))
     if all(field.low is None for field in report.numbers):
         there = [field.path for field in report.numbers]
-        words = f"only text in {listed(there[:NAMED])}" if there else "no column but the times"
-        raise GroundedError(
-            f"{log} holds no numbers, {words}: init needs a log with the robot's states and "
-            "commands as numbers"
-        )
+        raise refused("start.no_start", log, why="text", names=tuple(there[:NAMED]))
     numbers = [field for field in report.numbers if field.low is not None]
     if all(field.low == field.high for field in numbers):
-        raise GroundedError(
-            f"nothing changes in {log}: each of its {count(len(numbers), 'number')} is the same in "
-            "every row. Was the robot switched off? init needs a log in which it moves"
-        )
+        raise refused("start.no_start", log, why="still")
     report, notes = _one_run(report)
     joints, plain = joint_names(report), None
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
@@ -407,7 +396,7 @@ def _recorded(
     mapping = log_mapping(here.config.log, model.state_names, model.input_names)
     try:
         if mapping is None or not measured:
-            raise GroundedError("no signal of the log matches a state")
+            raise refused("given.no_input", "the log", what="state")
         found = read_log(
             files,
             mapping,

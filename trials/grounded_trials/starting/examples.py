@@ -12,7 +12,7 @@ from types import ModuleType
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known, refused
 from grounded.task import Task
 from grounded_trials.store.store import made_folder, sweep, write_atomically
 from grounded_trials.toml_table import key
@@ -114,8 +114,7 @@ def example(name: str) -> Example:
     Raises:
         GroundedError: if there is none.
     """
-    if name not in EXAMPLES:
-        raise GroundedError(f"there is no example '{name}': {nearest(name, EXAMPLES)}")
+    known("example", [name], EXAMPLES)
     return EXAMPLES[name]
 
 
@@ -156,7 +155,7 @@ def refuse_existing(folder: Path, names: Iterable[str]) -> None:
     """
     for path in (folder / name for name in names):
         if path.exists():
-            raise GroundedError(f"{path} exists already: name another folder, or remove it first")
+            raise refused("file.exists", path)
 
 
 def _holds(path: Path, text: str) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import refused, unknown
 from grounded.findings import found as found_
 from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
@@ -111,11 +111,8 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         if name not in found:
             same = [one for one in log.numbers if _word(one.path) == name]
             if same:
-                raise GroundedError(
-                    f"'{name}' is constant ({same[0].low:g}) in this log, so it can't be an input "
-                    "of a skeleton: record a log in which it changes"
-                )
-            raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
+                raise refused("start.still", name)
+            raise unknown("number", name, found, "the log")
     names = list(reversed(found))
     called = [n for n in names if called_input(n, found[n].path)]
     followers = _followers(found, list(inputs) or called)

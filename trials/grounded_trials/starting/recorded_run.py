@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import refused, unknown
+from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files
@@ -40,7 +41,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         path = stored.get(file.lower(), path)
     if not path.exists():
         refuse_ids(workspace, file, "target")
-        raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
+        raise unknown("file or shape", file, shapes)
     if path.is_file() and kind_of(path) == TRIAL:
         trial, _, _ = read_trial(path)
         trial = trial.until(max(trial.finite_steps, 0))
@@ -51,10 +52,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         names, values = read_target(path, free=model.input_names)
         return _sampled(workspace, file, values[:, 0] - values[0, 0], names[1:], values[:, 1:])
     if mapping is None:
-        raise GroundedError(
-            f"grounded.toml has no [log] table, which reading {file} needs: `inspect` prints one",
-            NextCommand("inspect", (file,)),
-        )
+        raise refused("file.no_mapping", file, then=NextCommand("inspect", (file,)))
     found = read_log(log_files(file), mapping, workspace.config.task.dt, angles=model.angles)
     return dict(zip(mapping.states, found.states.T, strict=True))
 
@@ -66,10 +64,7 @@ def _sampled(
     dt, states = workspace.config.task.dt, workspace.base_model.states
     known = [name for name in names if name in states]
     if not known:
-        raise GroundedError(
-            f"{file} has no column named after a state ({', '.join(states)}): it has t and "
-            + ", ".join(names)
-        )
+        raise refused("given.fit", file, what="columns", theirs=tuple(names), own=tuple(states))
     rows = in_steps(times[-1], dt, np.floor((times[-1] + 1e-9) / dt)) + 1
     t = dt * np.arange(rows)
     return {name: np.interp(t, times, values[:, names.index(name)]) for name in known}

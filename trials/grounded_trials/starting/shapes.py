@@ -14,12 +14,11 @@ from types import MappingProxyType
 import numpy as np
 
 from grounded import places
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known, positive, refused, wrong
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.places import velocities as velocities_of
-from grounded.result import listed
 from grounded.task import MAX_HORIZON
 from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.workspace.off_target import position_names
@@ -72,18 +71,10 @@ def path_target(
     """
     position = model.roles.get("position", ())
     if len(position) < 2:
-        raise GroundedError(
-            f"model '{model.name}' has no role 'position' of two states, which a {shape} needs: "
-            f"add {_roles(model)} to model.py. `target line --to STATE=VALUE` and `target step "
-            "--to STATE=VALUE` need no role"
-        )
+        raise refused("start.no_position", model.name, shape=shape, roles=_roles(model))
     ahead, across = places.body_velocity(model) or ("", "")
     if across and model.roles.get("speed") == across:
-        raise GroundedError(
-            f"model '{model.name}' has the role 'speed' for {across}, which moves it across its "
-            f'heading by its equations; {ahead} moves it ahead: write "speed": "{ahead}" in '
-            "model.py"
-        )
+        raise refused("start.sideways", model.name, speed=across, ahead=ahead)
     _check(drive)
     along, x, y, heading = _path(shape, drive)
     curvature = np.abs(np.gradient(heading, along))
@@ -146,15 +137,12 @@ def _kept(
     held, speeds = dict(to), velocities_of(model)
     for name in to:
         if name in drawn and name not in speeds:
-            raise GroundedError(f"the {shape} itself sets '{name}': omit --to {name}")
+            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="path")
     for name in [n for n in to if n in drawn]:
         _check_end(shape, name, held.pop(name), drawn[name][-1], model)
     for height in model.roles["position"][2:]:
         if height not in {**start, **to}:
-            raise GroundedError(
-                f"the {shape} needs a value of {height}, which would be free otherwise: add "
-                f"--to {height}=1.5, in {model.states[height]}"
-            )
+            raise wrong(f"--to {height}", must="given", like=f"--to {height}=1.5")
         held.setdefault(height, start.get(height, 0.0))
     rows = len(next(iter(drawn.values())))
     columns = {name: np.full(rows, value) for name, value in held.items()}
@@ -168,11 +156,8 @@ def _check_end(shape: str, name: str, asked: float, end: float, model: Model) ->
     """Raise if a path ends with another velocity than --to asks for."""
     if abs(end - asked) > NEAR * max(abs(asked), 1.0):
         unit = model.states[name]
-        rest = "--hold 1 lets it end at rest and stay there" if asked == 0 else "it can't be chosen"
-        raise GroundedError(
-            f"--to {name}={asked:g}: the {shape} moves the robot, so {name} follows from the path, "
-            f"which ends at {end:.3g} {unit}. Omit --to {name}; {rest}"
-        )
+        facts = {"end": f"{end:.3g} {unit}", "hold": int(asked == 0)}
+        raise refused("start.follows_path", name, asked=f"{asked:g}", why="ends", **facts)
 
 
 def _carrying(
@@ -219,7 +204,7 @@ def _carrying(
 def _check(drive: Drive) -> None:
     for name, value in vars(drive).items():
         if not (0 < value < np.inf or (name == "hold" and value == 0)):
-            raise GroundedError(f"--{name} must be positive, found {value:g}")
+            raise wrong(f"--{name}", value, must="positive")
 
 
 def _grid(seconds: float, dt: float) -> Array:
@@ -235,11 +220,8 @@ def in_steps(seconds: float, dt: float, steps: float) -> int:
     """
     if FEWEST <= steps <= MAX_HORIZON:
         return int(steps)
-    raise GroundedError(
-        f"a target of {seconds:.4g} s has {steps:.4g} control steps of [task] dt = {dt:g} s, "
-        f"expected {FEWEST} to {MAX_HORIZON}: check dt in grounded.toml, the time in seconds from "
-        "one command to the next, and how long the manoeuvre lasts"
-    )
+    what = f"number of control steps (dt = {dt:g} s) in {seconds:.4g} s"
+    raise wrong(what, got=f"{steps:.4g}", low=FEWEST, high=MAX_HORIZON)
 
 
 def line_target(
@@ -280,8 +262,7 @@ def line_target(
         there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
         still = {*to} <= {*velocities_of(model)}
         goes = next((q for q in (*position_names(model), *velocities(model)) if q not in to), "")
-        more = f"it ends at rest; say where, such as --to {goes}=1.0" if still and goes else ""
-        raise GroundedError(f"the line ends where it starts, at {there}: {more or 'change --to'}")
+        raise refused("start.no_way", to=there, goes=goes if still and goes else None)
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
         _grid(seconds + drive.hold, dt)
@@ -300,32 +281,21 @@ def line_target(
     carrying = _carrying(model, columns, moved, [*to]) if moved else {}
     for name in carrying:
         if to[name]:
-            raise GroundedError(
-                f"--to {name}={to[name]:g}: the line brings {listed([*moved])} to rest at its end, "
-                f"where {name} is 0: `--to {name}=0` gives it that column"
-            )
+            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="rest")
     return columns | carrying
 
 
 def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
     """Return the slowest and gentlest drive that covers a line in `seconds`, see `line_target`."""
-    if not 0 < seconds < np.inf:
-        raise GroundedError(f"--seconds must be positive, found {seconds:g}")
+    positive("--seconds", seconds)
     least = 4 * length / seconds**2  # accelerates to the middle, then decelerates
     if kept == "speed":
         if drive.speed * seconds <= length:
-            raise GroundedError(
-                f"{length:g} in {seconds:g} s is faster than --speed {drive.speed:g}: allow "
-                f"more than {length / drive.speed:.3g} s, or omit --speed"
-            )
+            raise wrong("--seconds", seconds, low=f"{length / drive.speed:.3g} (at --speed)")
         accel = drive.speed**2 / (drive.speed * seconds - length)
         return replace(drive, accel=accel if drive.speed * seconds < 2 * length else least)
     if kept == "accel" and drive.accel < least * (1 - 1e-9):
-        raise GroundedError(
-            f"{length:g} in {seconds:g} s from rest to rest needs at least --accel {least:.3g}, "
-            f"found {drive.accel:g}, with which it takes "
-            f"{2 * np.sqrt(length / drive.accel):.3g} s"
-        )
+        raise wrong("--accel", drive.accel, low=f"{least:.3g} (for --seconds)")
     accel = max(drive.accel, least)
     root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
     return replace(drive, accel=accel, speed=float(accel * seconds - root) / 2)
@@ -342,10 +312,7 @@ def _axis(model: Model) -> str:
     moved = (named,) if isinstance(named, str) else named
     if len(moved) == 1:
         return moved[0]
-    raise GroundedError(
-        f"model '{model.name}' has {'several axes' if moved else 'no axis'} for a line: name a "
-        f"state and its end, such as --to {next(iter(moved or model.states))}=1.0"
-    )
+    raise wrong("--to", must="given", like=f"--to {next(iter(moved or model.states))}=1.0")
 
 
 def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
@@ -388,7 +355,7 @@ def step_target(
         GroundedError: for an unknown state, without a state, or for an unusable number of steps.
     """
     if not to:
-        raise GroundedError("name a state and its value, such as --to x=1.0")
+        raise wrong("--to", must="given", like="--to x=1.0")
     rows = in_steps(seconds, dt, np.round(seconds / dt)) + 1
     _check_states(to, model)
     first = np.arange(rows) < 1
@@ -397,8 +364,7 @@ def step_target(
 
 def _check_states(to: Mapping[str, float], model: Model) -> None:
     for name in to:
-        if name not in model.states:
-            raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
+        known("state", [name], model.states, "the model")
 
 
 @dataclass(frozen=True)
@@ -480,18 +446,13 @@ def swing_up(
     hung = hinges(model, start)
     chosen = [one for one in hung if one.angle in to] or hung[:1]
     if not chosen and not any(model.states.get(name) == "rad" for name in to):
-        raise GroundedError(
-            f"no angle of model '{model.name}' hangs under its weight, so none can swing up; name "
-            "the angle and its value, such as --to q=3.1416"
-        )
+        raise wrong("--to", must="hinge", like="--to q=3.1416")
     first = np.arange(in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
     columns, rates = {}, velocities(model)
     for one in chosen:
         if (rate := rates.get(one.angle, "")) in to:
-            raise GroundedError(
-                f"--to {rate}={to[rate]:g} would hold {rate} there during the swing: omit it, "
-                f"since {one.angle} that stays upright is at rest"
-            )
+            facts = {"asked": f"{to[rate]:g}", "why": "swing"}
+            raise refused("start.follows_path", rate, **facts)
         hangs = start.get(one.angle, one.hangs)
         columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
     others = {name: value for name, value in to.items() if name not in columns}

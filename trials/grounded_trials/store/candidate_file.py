@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.checks import of_shape, refused, wrong
+from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
@@ -61,8 +62,7 @@ def encoded_candidate(
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
     states, inputs = np.asarray(predicted_states, float), np.asarray(predicted_inputs, float)
     for array, shape in ((states, (H + 1, n)), (inputs, (H, m))):
-        if array.shape != shape:
-            raise GroundedError(f"expected an array of shape {shape}, got {array.shape}")
+        of_shape("prediction", array, shape)
     table = stated(
         CANDIDATE,
         policy.dt,
@@ -126,10 +126,8 @@ def read_candidate(
     _refuse_faulty(policy, own.name)
     x, u = own.doubles("/predicted_state", states), own.doubles("/predicted_input", inputs)
     if (len(x), H, len(u)) != (steps + 1, steps, steps):
-        raise GroundedError(
-            f"{own.name}: a policy of {steps} steps needs {steps} messages of it, {steps + 1} "
-            f"predicted states and {steps} inputs; found {H}, {len(x)} and {len(u)}"
-        )
+        sizes, wants = (H, len(x), len(u)), (steps, steps + 1, steps)
+        raise wrong(f"{own.name}: policy, states and inputs", sizes, shape=str(wants))
     for topic in ("/policy", "/predicted_state", "/predicted_input"):
         own.check_grid(topic, 0, policy.dt)
     _refuse_rewritten(own, [*_controls(policy), x, u])
@@ -174,17 +172,12 @@ def _hash(table: Meta, arrays: Iterable[Array]) -> str:
 def _refuse_rewritten(own: OwnFile, arrays: Iterable[Array]) -> None:
     stated, found = own.meta.get("sha256"), _hash(own.meta, arrays)
     if stated not in (None, found):
-        raise GroundedError(
-            f"{own.name} is not the candidate that was proposed, it was rewritten: the SHA-256 of "
-            f"its contents is {found[:12]}..., its metadata states '{stated[:12]}...'. Delete the "
-            "file and propose again",
-            NextCommand("propose"),
-        )
+        raise refused("file.changed", own.name, what="candidate", then=NextCommand("propose"))
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
     if not all(d.is_integer() and 0 <= d <= WIDTH for d in depths.tolist()):
-        raise own.bad("policy.depths", f"must be integers from 0 to {WIDTH}")
+        raise own.bad("policy.depths", depths.tolist(), must="whole", low=0, high=WIDTH)
     return tuple(int(d) for d in depths)
 
 
@@ -201,4 +194,4 @@ def _policy_table(policy: Policy) -> dict[str, Any]:
 
 def _refuse_faulty(policy: Policy, name: str = "candidate") -> None:
     if wrong := fault(policy):
-        raise GroundedError(f"{name}: {wrong}; such a policy is not safe to run and is not written")
+        raise refused("plan.unsafe", name, why=wrong)

@@ -23,8 +23,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded_trials.plain_file import open_file
+from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 
 Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
@@ -62,7 +63,7 @@ def read_document(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     return proven(data, path)
 
 
@@ -70,9 +71,9 @@ def proven(data: bytes, path: Path) -> dict[str, Any]:
     """Read a document from the bytes of a file, as `read_document`; `path` is for messages."""
     found = _SEALED.fullmatch(data)
     if found is None:
-        raise GroundedError(f"{path} has no checksum: it is damaged, or from an older version")
+        raise refused("file.changed", path, what="none")
     if hashlib.sha256(found[2]).hexdigest() != found[1].decode():
-        raise GroundedError(f"{path} was changed or damaged: its checksum does not match")
+        raise refused("file.changed", path, what="checksum")
     document: dict[str, Any] = json.loads(b"{" + found[2])
     return document
 

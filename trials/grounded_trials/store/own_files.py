@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded_trials.formats.bad import BadMessage, BadSchema
@@ -41,7 +42,7 @@ from grounded_trials.formats.protobuf import (
     uniform_doubles,
 )
 from grounded_trials.formats.schemas import struct_of
-from grounded_trials.plain_file import read_file
+from grounded_trials.plain_file import read_file, unreadable
 from grounded_trials.within import within
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
@@ -74,14 +75,14 @@ class OwnFile:
         """The hash of the whole file."""
         return hashlib.sha256(self.data).hexdigest()
 
-    def bad(self, key: str, found: str) -> GroundedError:
-        """Return an error about an entry of the metadata."""
-        return GroundedError(f"{self.name}: its metadata '{key}' {found}")
+    def bad(self, key: str, given: object, **expected: Any) -> GroundedError:
+        """Return an error about an entry of the metadata; `expected` as of `checks.wrong`."""
+        return wrong(f"{self.name}: metadata '{key}'", given, **expected)
 
     def entry(self, key: str) -> str:
         """Return an entry of the metadata, which must exist."""
         if key not in self.meta:
-            raise GroundedError(f"{self.name}: its metadata has no '{key}'")
+            raise unknown("metadata", key, self.meta, self.name)
         return self.meta[key]
 
     def number(self, key: str) -> float:
@@ -92,7 +93,7 @@ class OwnFile:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) and value > 0):
-            raise self.bad(key, f"is '{text[:40]}', not a positive number")
+            raise self.bad(key, text, must="positive")
         return value
 
     def integer(self, key: str, *, signed: bool = False) -> int:
@@ -100,7 +101,7 @@ class OwnFile:
         text = self.entry(key)
         digits = text[1:] if signed and text.startswith("-") else text
         if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
-            raise self.bad(key, f"is '{text[:40]}', not an integer")
+            raise self.bad(key, text, must="whole")
         return int(text)
 
     def json(self, key: str, kind: type[list[Any] | dict[str, Any]]) -> Any:
@@ -108,16 +109,16 @@ class OwnFile:
         try:
             value = json.loads(self.entry(key))
         except (ValueError, RecursionError):
-            raise self.bad(key, "is not JSON") from None
+            raise self.bad(key, self.meta[key], type="JSON") from None
         if not isinstance(value, kind) or len(value) > NAME_LIMIT:
-            raise self.bad(key, f"is not a {kind.__name__}")
+            raise self.bad(key, value, type=kind.__name__)
         return value
 
     def names(self, key: str) -> list[str]:
         """Return the names of a JSON object of the metadata, in order."""
         table = self.json(key, dict)
         if not table or not all(isinstance(unit, str) for unit in table.values()):
-            raise self.bad(key, "must give each name a unit")
+            raise self.bad(key, table, must="units")
         return list(table)
 
     def floats(self, value: Any, what: str, size: int, null: float | None = None) -> Array:
@@ -126,7 +127,7 @@ class OwnFile:
             numbers = [null if item is None else item for item in value]
             if all(isinstance(item, int | float) for item in numbers):
                 return np.array(numbers, dtype=np.float64)
-        raise self.bad(what, f"must be a list of {size} numbers")
+        raise self.bad(what, value, shape=f"({size},)")
 
     def doubles(self, topic: str, names: list[str]) -> Array:
         """Return the numbers of a topic's messages, (N, len(names))."""
@@ -165,9 +166,8 @@ class OwnFile:
             counts = np.concatenate([count for _, count in parts] or [np.zeros(0, int)])
             if counts.any() and (counts != size).any():
                 k = int(np.argmax(counts != size))
-                raise GroundedError(
-                    f"{self.name}: {topic} message {k} has {counts[k]} numbers in '{name}', "
-                    f"not {size}"
+                raise wrong(
+                    f"{self.name}: {topic}[{k}].{name}", (int(counts[k]),), shape=f"({size},)"
                 )
             values = np.concatenate([v for v, _ in parts] or [np.zeros(0)])
             found.append(values.reshape(-1, size))
@@ -184,30 +184,23 @@ class OwnFile:
         apart = float(np.median(np.diff(times, prepend=times[0] - dt)))
         for factor in (1e3, 1e-3):
             if abs(apart / (dt * factor) - 1) < 0.1:
-                raise GroundedError(
-                    f"{self.name}: {topic} has a sample every {apart:.4g} s by its stamps, but dt "
-                    f"is {dt} s: they are in another unit (milliseconds, not seconds). Append each "
-                    f"at {1 / factor:g} times its stamp"
-                )
+                facts = {"unit": f"{1 / factor:g}", "every": apart, "dt": dt}
+                raise refused("file.grid", f"{self.name}: {topic}", **facts)
         k = int(np.argmax(off))
-        raise GroundedError(
-            f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, expected {k * dt:.4f} s "
-            f"for dt = {dt} s: samples are missing, or came late. A trial needs one at every "
-            "step: run it again"
-        )
+        facts = {"sample": str(k), "at": times[k], "expected": k * dt, "dt": dt, "robot": 1}
+        raise refused("file.grid", f"{self.name}: {topic}", **facts)
 
     def _topic(
         self, topic: str, names: Iterable[str], *, listed: bool
     ) -> tuple[Struct, list[Messages]]:
         """Return a topic's messages and their type, after checking that it has these fields."""
         if topic not in self.types:
-            raise GroundedError(f"{self.name}: it has no channel {topic}")
+            raise unknown("channel", topic, self.types, self.name)
         fields = self.types[topic].by_name
         for name in names:
             kind = fields[name].type if name in fields else None
             if not (kind == DOUBLES if listed else isinstance(kind, Number)):
-                what = f"list '{name}' of doubles" if listed else f"number '{name}'"
-                raise GroundedError(f"{self.name}: {topic} has no {what}")
+                raise unknown("list" if listed else "number", name, fields, f"{self.name}: {topic}")
         return self.types[topic], self.messages.get(topic, [])
 
     def _values(self, type: Struct, batch: Messages, name: str) -> tuple[Array, Counts]:
@@ -257,12 +250,11 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
                 messages.setdefault(topic, []).append(own)
                 counts[topic] += len(own)
                 if counts[topic] > STEP_LIMIT:
-                    raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
+                    raise unreadable(name, f"> {STEP_LIMIT} messages")
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "record", "its end", "no checksum")
     if meta is None or meta.get("format") != kind:
-        stated = f"its format is '{meta.get('format', '')}'" if meta else "it has no such metadata"
-        raise GroundedError(f"{name} is not a '{kind}' file: {stated}")
+        raise refused("file.not_own", name, kind=kind, has=meta and meta.get("format"))
     types = {c.topic: _type(c, schemas, name) for c in channels.values()}
     return OwnFile(name, source, meta, attachments, types, messages)
 
@@ -280,11 +272,11 @@ def _sorted(
 def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
     schema = schemas.get(channel.schema_id)
     if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
-        raise GroundedError(f"{name}: {channel.topic} is not protobuf")
+        raise unreadable(f"{name}: {channel.topic}", channel.encoding)
     try:
         return struct_of(schema)
     except BadSchema as error:
-        raise GroundedError(f"{name}: {channel.topic}: {error}") from None
+        raise unreadable(f"{name}: {channel.topic}", error) from None
 
 
 def stated(
@@ -305,7 +297,7 @@ def stated(
     """
     for key in meta:
         if key in RESERVED:
-            raise GroundedError(f"metadata '{key}' is written by grounded itself; use another name")
+            raise wrong("metadata", key, must="free")
     always = {"format": kind, "dt": repr(float(dt))}
     always |= {"states": json.dumps(dict(states)), "inputs": json.dumps(dict(inputs))}
     return always | more | {key: str(value) for key, value in meta.items()}

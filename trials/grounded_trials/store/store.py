@@ -25,8 +25,9 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
+from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
-from grounded_trials.plain_file import BINARY, open_file
+from grounded_trials.plain_file import BINARY, open_file, unreadable, unwritable
 
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
@@ -89,7 +90,7 @@ class Store:
         except FileNotFoundError:
             return ()
         except OSError as error:
-            raise GroundedError(f"{self.folder} can't be read: {error.strerror}") from None
+            raise unreadable(self.folder, error) from None
         if names == self._listed[0]:
             return self._listed[1]
         for name in names:
@@ -117,11 +118,9 @@ class Store:
         if len(hits) == 1:
             return hits[0]
         if not hits:
-            entries = self.list()
-            last = f"the last is {entries[-1].id}" if entries else "it is empty"
-            raise GroundedError(f"{self.folder} has no file '{key}'; {last}")
+            raise unknown("file", key, [entry.id for entry in self.list()], str(self.folder))
         names = ", ".join(s.path.name for s in hits)
-        raise GroundedError(f"'{key}' matches {names}; give more digits of the hash")
+        raise wrong(f"'{key}'", got=names, must="unique")
 
     def matching(self, key: str) -> tuple[Stored, ...]:
         """Return the files that `find` chooses from."""
@@ -142,12 +141,9 @@ class Store:
             with open_file(entry.path, follow=False) as stream:
                 data = stream.read()
         except OSError as error:
-            raise GroundedError(f"{entry.path} can't be read: {error.strerror}") from None
+            raise unreadable(entry.path, error) from None
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
-            raise GroundedError(
-                f"{entry.path} is damaged: its contents do not match the hash in its name; "
-                "restore it from a backup, or ingest the original log again to replace it"
-            )
+            raise refused("file.changed", entry.path, what="hash")
         return data
 
     def add(
@@ -255,10 +251,7 @@ class Store:
         except (ImportError, NotImplementedError, OSError) as error:
             if isinstance(error, OSError) and error.errno not in (errno.ENOSYS, errno.ENOTSUP):
                 raise self._unwritable(error) from None
-            raise GroundedError(
-                f"{self.folder} can't be locked, as its file system has no file locks: move the "
-                "workspace to a local disk"
-            ) from None
+            raise unwritable(self.folder, error, mend="lock") from None
         try:
             yield
         finally:
@@ -267,11 +260,7 @@ class Store:
 
     def _unwritable(self, error: OSError) -> GroundedError:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        mend = "Free disk space" if full else "Get write permission"
-        return GroundedError(
-            f"{self.folder} can't be written: {error.strerror}; the file is not stored. {mend}, "
-            "and add it again"
-        )
+        return unwritable(self.folder, error, mend="space" if full else "permission")
 
 
 def made_folder(folder: Path) -> Path:
@@ -283,7 +272,7 @@ def made_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise GroundedError(f"{folder} can't be created: {error.strerror}") from None
+        raise unwritable(folder, error) from None
     return folder
 
 
@@ -294,7 +283,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         GroundedError: if it can't be written.
     """
     if path.is_dir():
-        raise GroundedError(f"{path} is a folder, expected a file: name a file in it")
+        raise refused("file.folder", path)
     # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
@@ -303,12 +292,9 @@ def write_atomically(path: Path, data: bytes) -> None:
         temporary.replace(path)
         sync_folder(path.parent)
     except FileNotFoundError:
-        raise GroundedError(
-            f"{path} can't be written: the folder {path.parent} does not exist; create it, or name "
-            "another folder"
-        ) from None
+        raise refused("file.unwritable", path, folder=str(path.parent)) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
     finally:
         _remove(temporary)
 
@@ -363,7 +349,7 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
             while block := stream.read(_BLOCK):
                 yield block
     except OSError as error:
-        raise GroundedError(f"{source} can't be read: {error.strerror}") from None
+        raise unreadable(source, error) from None
 
 
 def hash_file(path: Path) -> str:

@@ -15,10 +15,11 @@ from typing import IO, TypedDict, Unpack
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import of_shape, refused, wrong
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter, encode_doubles
+from grounded_trials.plain_file import unwritable
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically
 
@@ -133,10 +134,7 @@ class TrialWriter:
         try:
             yield
         except OSError as error:
-            raise GroundedError(
-                f"the trial can't be written: {error.strerror}; `recover` restores what the file "
-                "already holds"
-            ) from None
+            raise unwritable("the trial", error, mend="recover") from None
 
     def __enter__(self) -> TrialWriter:
         return self
@@ -216,13 +214,11 @@ def read_trial(
     dt = own.number("dt")
     x, u = own.doubles("/state", states), own.doubles("/input", inputs)
     if len(x) == 0:
-        raise GroundedError(
-            f"{own.name}: the trial has no states; it ended before its first sample"
-        )
+        raise wrong(f"{own.name}: states", x.shape, shape=f"(T + 1, {len(states)})")
     if len(u) == len(x):  # interrupted after the last input, before the resulting state
         u = u[:-1]
     if len(u) != len(x) - 1:
-        raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
+        raise wrong(f"{own.name}: inputs", u.shape, shape=f"({len(x) - 1}, {len(inputs)})")
     for topic in ("/state", "/input"):
         own.check_grid(topic, max(own.integer("start_ns", signed=True), 0), dt)
     held = None
@@ -246,8 +242,7 @@ def read_trial(
 
 def _row(values: Array, size: int) -> Array:
     row = np.asarray(values, dtype=np.float64)
-    if row.shape != (size,):
-        raise GroundedError(f"expected {size} numbers, got an array of shape {row.shape}")
+    of_shape("a row of a trial", row, (size,))
     return row
 
 
@@ -255,6 +250,6 @@ def _create(path: Path) -> IO[bytes]:
     try:
         return path.open("xb")
     except FileExistsError:
-        raise GroundedError(f"{path} exists already: trials are never overwritten") from None
+        raise refused("file.exists", path) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+        raise unwritable(path, error) from None

@@ -12,5 +12,5 @@ One module per further verb: `new_target.py`, `inspecting.py`, `looping.py` (lea
 `grounded_trials.door` makes them the methods of one class. `next_step.py` chooses the command to
 suggest next, after what `last_diagnosis.py` reads and `adoptable.py` finds in it. `adopted.py`
 plans with adopted effects, `where_to_mend.py` says where to correct a finding about a sensor, and
-`off_target.py` measures errors of a run in units.
+`off_target.py` measures errors of a run in units. `settled.py` says what was adopted.
 """

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import percent
+from grounded.checks import refused, unknown
+from grounded.errors import GroundedError, NextCommand
+from grounded_trials.plain_file import unreadable
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.last_diagnosis import made_from, newer_alone
 from grounded_trials.workspace.where_to_mend import in_time_now
@@ -39,11 +40,7 @@ def check_adoptable(
         GroundedError: if not, or if [log] already corrects the delay that it describes.
     """
     if found.changed and not set(names) <= {*found.late_sensors}:
-        raise GroundedError(
-            "the last diagnosis compared two groups of trials between which the robot changed: no "
-            "value of both is right for either",
-            newer_alone(found),
-        )
+        raise refused("gap.next.changed", then=newer_alone(found))
     known = [row.effect for row in found.ranking] + _curves(found) + [*found.late_sensors]
     effects = [str(effect["name"]) for effect in workspace.config.model.effects]
     adopted = [name for name in effects if name not in before or name not in known]
@@ -52,21 +49,12 @@ def check_adoptable(
         if name not in known and name not in adopted:
             _check_alike(name, found)
             family = [one for one in known if one.startswith(f"{name}:")]
-            there = f"did you mean '{family[0]}'?" if family else nearest(name, known)
-            raise GroundedError(f"'{name}' is not among the effects of the last diagnosis: {there}")
+            raise unknown("effect", name, family[:1] or known, "the last diagnosis")
         if name in in_log:
             _, _, state = name.partition(":")
-            raise GroundedError(
-                f"'{name}': [log.state.{state}] delay_s = {in_log[name]:g} already removes that "
-                "delay from every log that is read, so the model must not have it as well. Either "
-                "remove delay_s again, as it was for the diagnosed trials, so that plans allow for "
-                "the delay that the robot's program sees; or keep delay_s and let that program "
-                "predict the state ahead by as much"
-            )
+            raise refused("model.delayed_twice", name, state=state, delay=f"{in_log[name]:g}")
         if name in adopted:
-            raise GroundedError(
-                f"'{name}' is adopted already; see [model] effects in grounded.toml"
-            )
+            raise refused("model.not_adoptable", name, why="adopted")
 
 
 def _check_alike(name: str, found: Diagnosis) -> None:
@@ -76,15 +64,10 @@ def _check_alike(name: str, found: Diagnosis) -> None:
         return
     family = alike.effect.partition(":")[0]
     then = NextCommand("diagnose", ("--without", family))
-    what = f"a diagnosis without {family} would fit it"
     if family == name.partition(":")[0]:
-        then, what = NextCommand("adopt", found.effects), "adopt that one"
-    raise GroundedError(
-        f"'{name}' was not fitted in its own right and has no values: the last diagnosis lists it "
-        f"because it reproduces {percent(alike.share)} of the signal of {alike.effect}, which was "
-        f"fitted; {what} instead",
-        then=then,
-    )
+        then = NextCommand("adopt", found.effects)
+    facts = {"why": "alike", "share": alike.share, "effect": alike.effect}
+    raise refused("model.not_adoptable", name, then=then, **facts)
 
 
 def claims_all(found: Diagnosis, names: Sequence[str]) -> bool:
@@ -95,18 +78,11 @@ def claims_all(found: Diagnosis, names: Sequence[str]) -> bool:
             fitted as alternatives to others.
     """
     if found.no_cause:
-        raise GroundedError(
-            f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
-            "it, then diagnose again"
-        )
+        raise refused("gap.too_few", then=AGAIN)
     rivals = [name for name in names if name not in (*found.effects, *_curves(found))]
     if rivals and len(names) > 1:
-        own = f"those that it claims ({', '.join(found.effects)}), or " * bool(found.effects)
-        raise GroundedError(
-            f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
-            f"instead of another, not together; adopt {own}one alone",
-            then=NextCommand("adopt", found.effects or (rivals[0],)),
-        )
+        then = NextCommand("adopt", found.effects or (rivals[0],))
+        raise refused("model.not_adoptable", *rivals, why="rival", then=then)
     return not rivals
 
 
@@ -123,16 +99,12 @@ def with_curves(found: Diagnosis, names: list[str]) -> list[str]:
     ):
         return names
     if not found.correction.adoptable:
-        raise GroundedError(
-            f"'{asked[0]}' is not adoptable: it does not predict trials better that it was not "
-            "fitted to; run more trials and diagnose again"
-        )
+        raise refused("model.not_adoptable", asked[0], why="worse")
     missing = [name for name in found.effects if name not in names]
     if missing:
-        raise GroundedError(
-            f"'{asked[0]}' was fitted together with {', '.join(missing)}: adopt them together",
-            then=NextCommand("adopt", (*missing, asked[0])),
-        )
+        then = NextCommand("adopt", (*missing, asked[0]))
+        facts = {"why": "together", "effect": tuple(missing)}
+        raise refused("model.not_adoptable", asked[0], then=then, **facts)
     return [name for name in names if name not in asked] + curves
 
 
@@ -197,18 +169,14 @@ def nominal_values(found: Diagnosis, workspace: Folder, names: Iterable[str]) ->
     nominal = {}
     for name in (n.removeprefix("parameter:") for n in names if n.startswith("parameter:")):
         if name not in made.nominal and name not in base:
-            raise GroundedError(
-                f"the last diagnosis does not state the value of '{name}' that it started from: "
-                "diagnose again",
-                then=AGAIN,
-            )
+            raise refused("model.not_adoptable", name, why="unvalued", then=AGAIN)
         nominal[name] = made.nominal[name] if name in made.nominal else float(base[name].value)
     return nominal
 
 
 def _rounded(value: float) -> float:
     if not math.isfinite(value):
-        raise GroundedError("the last diagnosis lacks a value: diagnose again", then=AGAIN)
+        raise refused("model.not_adoptable", "it", why="unvalued", then=AGAIN)
     return float(f"{float(value):.8g}")
 
 
@@ -270,9 +238,7 @@ def adoptions(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
     except FileNotFoundError:
         return [], []
     except (ValueError, KeyError, TypeError, RecursionError, GroundedError) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): delete it; earlier adoptions can't be undone then"
-        ) from None
+        raise unreadable(path, error, mend="delete") from None
 
 
 def diagnosed_again(workspace: Folder) -> None:

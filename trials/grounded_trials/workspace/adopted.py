@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from grounded.checks import of_type, wrong
 from grounded.effects import param_name
 from grounded.effects.family import (
     Effect,
@@ -29,6 +30,7 @@ from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
+from grounded_trials.plain_file import unreadable
 
 if TYPE_CHECKING:
     pass
@@ -53,13 +55,10 @@ def installed_effects() -> Library:
         try:
             loaded = point.load()
         except Exception as error:
-            raise GroundedError(
-                f"the effects of package '{point.value}' can't be loaded: {error}; fix or "
-                "uninstall it"
-            ) from None
+            raise unreadable(point.value, error, kind="package") from None
         families = [loaded] if isinstance(loaded, Family) else list(loaded)
-        if not all(isinstance(family, Family) for family in families):
-            raise GroundedError(f"'{point.value}' must be an effect family or a sequence of them")
+        for family in families:
+            of_type(point.value, family, Family)
         found += families
     return Library().with_families(found)
 
@@ -150,20 +149,15 @@ def _checked(effect: Effect, values: Mapping[str, Any]) -> Mapping[str, float]:
     for key, value in values.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not math.isfinite(value):
-            raise GroundedError(f"{where}: {key} must be a number, found {value!r}")
+            raise wrong(f"{where}: {key}", value, must="finite")
     try:
         whole = effect.complete(values)
     except GroundedError as error:
-        raise GroundedError(f"grounded.toml: [model] effects: {error}") from None
+        raise error.at("grounded.toml: [model] effects") from None
     for name, (low, high) in _bounds(effect).items():
         room = 1e-6 * abs(whole[name])
         if not low - room <= whole[name] <= high + room:
-            at_most = f" and at most {high:g}" * math.isfinite(high)
-            at_least = f"at least {low:g}" if math.isfinite(low) else "a number"
-            raise GroundedError(
-                f"{where}: {name} = {whole[name]:g} is out of bounds: expected {at_least}{at_most};"
-                " correct it, or remove the effect"
-            )
+            raise wrong(f"{where}: {name}", whole[name], must="bounded", low=low, high=high)
     return whole
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from grounded.checks import refused
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
@@ -124,7 +125,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
 
     found = read_diagnosis(workspace.reports)
     if found is None:
-        raise GroundedError("nothing was diagnosed yet: run a diagnosis first", then=AGAIN)
+        raise refused("search.undiagnosed", then=AGAIN)
     asked = names = with_curves(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
     check_adoptable(names, found, workspace, before)
@@ -375,20 +376,13 @@ def undo_adoption(workspace: Folder) -> Undone:
     file, model = workspace.config.file, workspace.config.model
     if not kept:
         has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
-        raise GroundedError(
-            f"no adoption is left to undo; [model] effects in {file}: {has}. Remove effects that "
-            "were written by hand there"
-        )
+        raise refused("model.no_adoption", file, effects=has)
     *earlier, last = kept
     names, before = [str(name) for name in last["names"]], last["before"]
     if _written(model) != last["after"]:
         was = as_toml(before["params"], before["effects"])
         had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
-        raise GroundedError(
-            f"[model] in {file} was changed after {', '.join(names)} was adopted, by `fit --apply` "
-            f"or by hand, and undoing would lose that. Edit [model] by hand instead; before the "
-            f"adoption it had {had}"
-        )
+        raise refused("model.edited", file, adopted=tuple(names), had=had)
     set_in_model(file, params=before["params"], effects=before["effects"])
     write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
     return Undone(

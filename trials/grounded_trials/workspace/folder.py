@@ -18,12 +18,13 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from grounded.checks import known, refused
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.plain_file import open_file
+from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.documents import Notes
 from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
@@ -41,7 +42,7 @@ from grounded_trials.workspace.identity import (
 )
 from grounded_trials.workspace.unknown_id import unknown_candidate
 from grounded_trials.workspace.user_files.config import Config, read_config
-from grounded_trials.workspace.user_files.model_file import check_names, load_module, model_in
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
 from grounded_trials.workspace.user_files.task_file import build_task, read_target
 
 if TYPE_CHECKING:
@@ -100,18 +101,14 @@ class Folder:
         for name in ("trials", "candidates", "runs", "reports"):
             place = self.folder / name
             if place.is_symlink() and not place.resolve().is_relative_to(self.folder.resolve()):
-                raise GroundedError(
-                    f"{place} is a link to {place.resolve()}, outside the workspace: expected a "
-                    "folder of its own, since commands write there. Delete the link, and move the "
-                    "files here if they belong to this workspace"
-                )
+                raise refused("file.special", place, what="link", to=str(place.resolve()))
         return read_config(self.folder)
 
     @cached_property
     def base_model(self) -> Model:
         """The crude model of model.py with [model] params, without adopted effects."""
         params, model = self.config.model.params, self._written
-        check_names(params, list(model.params), "grounded.toml: [model] params: parameter")
+        known("parameter", params, model.params, "the model", "grounded.toml: [model] params")
         return model.with_values(params)
 
     @property
@@ -385,11 +382,8 @@ class Folder:
                     found = self._proven(identity, place, read)
                     trial, known = ran.get(identity, ("", ""))
                     if known and found.sha256 != known:
-                        raise GroundedError(
-                            f"candidates/{identity}.mcap is not the policy that {trial} ran: it "
-                            "was rewritten, or comes from another workspace; delete the file, the "
-                            "trial carries the one that was run"
-                        )
+                        name = f"candidates/{identity}.mcap"
+                        raise refused("file.changed", name, what="policy", lost=trial)
                 except GroundedError as error:
                     if lost is None:
                         raise
@@ -400,7 +394,7 @@ class Folder:
                 break
             else:
                 if lost is None:
-                    raise GroundedError(f"candidates/{identity}.mcap can't be read: {why}")
+                    raise unreadable(f"candidates/{identity}.mcap", why)
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
     def _proven(

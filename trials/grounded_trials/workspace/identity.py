@@ -18,12 +18,14 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.checks import refused
+from grounded.errors import NextCommand
 from grounded.result import listed, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_walk import DamagedFile
+from grounded_trials.plain_file import unreadable
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Damaged, Store, Stored
 
@@ -297,23 +299,13 @@ def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     try:
         policy, states, inputs, meta = read_candidate(data, name)
     except DamagedFile as error:
-        raise GroundedError(
-            f"{error}. Or delete it: a trial that "
-            "ran it carries a copy, and one that was not run is made again",
-            NextCommand("propose"),
-        ) from None
+        raise unreadable(name, error, mend="candidate", then=NextCommand("propose")) from None
     try:
         about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
     except (KeyError, ValueError) as error:
-        raise GroundedError(
-            f"{name}: its metadata has a missing or invalid field, {error}; it was not written by "
-            "`propose`"
-        ) from None
+        raise unreadable(name, error, mend="candidate", then=NextCommand("propose")) from None
     if about["id"] != identity:
-        raise GroundedError(
-            f"{name} holds the candidate '{about['id'][:40]}', but a file must have the name of "
-            "its candidate. Rename it, or delete it if the candidate's own file exists"
-        )
+        raise refused("file.changed", name, what="name", lost=about["id"][:40])
     about["units"] = json.loads(meta["states"]) | json.loads(meta["inputs"])
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.share import Share, share_of
+from grounded_trials.plain_file import unreadable
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.read_before import changed_since
@@ -57,9 +58,7 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     except FileNotFoundError:
         return None
     except (ValueError, RecursionError, GroundedError) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
-        ) from None
+        raise unreadable(path, error, mend="diagnosis", then=NextCommand("diagnose")) from None
 
 
 def readable_diagnosis(folder: Path) -> Diagnosis | None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from grounded.checks import whole_number
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found as said
-from grounded.frozen import whole_number
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase

@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.table import DEGREES
-from grounded.errors import GroundedError, nearest, type_of
-from grounded.frozen import Array, numbers
+from grounded.checks import numbers, refused, unknown, wrong
+from grounded.errors import GroundedError
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import role
 from grounded.task import MAX_HORIZON
+from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.user_files.config import Config, set_target
 from grounded_trials.workspace.user_files.task_file import (
@@ -68,7 +70,7 @@ def replace_target(
         try:
             old = path.read_bytes()
         except OSError as error:
-            raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+            raise unreadable(path, error) from None
         with suppress(GroundedError, ValueError):  # an unreadable target is replaced
             names, values = read_target(path)
             given = dict(zip(names[1:], values.T[1:], strict=True))
@@ -105,43 +107,31 @@ def checked(columns: Any, model: Model) -> dict[str, Array]:
             finite numbers, columns of different lengths, or too few or too many rows.
     """
     if not isinstance(columns, Mapping) or not columns:
-        got = "none" if isinstance(columns, Mapping) else f"a {type_of(columns)}"
-        first = model.state_names[0]
-        raise GroundedError(
-            f"a target needs the desired values of at least one state, got {got}: pass columns "
-            f"such as {{'{first}': numpy.linspace(0, 1, 101)}}"
-        )
+        like = f"{{'{model.state_names[0]}': numpy.linspace(0, 1, 101)}}"
+        raise wrong("the columns of a target", columns, must="dict", like=like)
     found: dict[str, Array] = {}
     for name, given in columns.items():
         if name not in model.states:
-            an_input = name in model.inputs
-            raise GroundedError(
-                f"target: '{name}' is {'an input' if an_input else 'not a state'} of the model: "
-                + nearest(str(name), model.state_names)
-            )
+            raise unknown("state", name, model.state_names, "the model, for the target,")
         values = numbers(given, f"target: column '{name}'")
         if values.ndim != 1:
-            raise GroundedError(
-                f"target: column '{name}' must be a list of values, one for each control step and "
-                f"one for the end, got an array of shape {values.shape}"
-            )
+            raise wrong(f"target: column '{name}'", values.shape, shape="(H + 1,)", do="rows")
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
-            raise GroundedError(
-                f"target: column '{name}' is {values[row]:g} in row {row}; every tracked value "
-                "must be finite; omit the column if the state is free"
+            raise wrong(
+                f"target: column '{name}'",
+                got=f"{values[row]:g} in row {row}",
+                must="finite",
+                do="omit",
             )
         found[str(name)] = values
     rows = {name: len(values) for name, values in found.items()}
     if len({*rows.values()}) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in rows.items())
-        raise GroundedError(f"target: all columns must have the same number of rows, got {told}")
+        raise wrong("the columns of a target", rows, must="even")
     count = next(iter(rows.values()))
     if not 2 <= count <= MAX_HORIZON + 1:
-        raise GroundedError(
-            f"a target needs 2 to {MAX_HORIZON + 1} rows, one for each control step and one for "
-            f"the end, got {count}"
-        )
+        rows_at_most = MAX_HORIZON + 1
+        raise wrong("the rows of a target", count, low=2, high=rows_at_most, do="rows")
     return found
 
 
@@ -177,11 +167,8 @@ def refuse_degrees(columns: Mapping[str, Array], model: Model) -> None:
     if _nearest(course, heading / DEGREES) > FITS * turned:
         return
     most = float(np.abs(columns[name]).max())
-    raise GroundedError(
-        f"the target's {name} goes to {most:.4g} rad, which does not fit the course of its "
-        f"positions ({', '.join(position)}); divided by 57.3 it does, so it is in degrees: "
-        f"multiply it by pi / 180 = {1 / DEGREES:.8g}"
-    )
+    facts = {"low": f"{-most:.4g}", "high": f"{most:.4g}", "scale": 1 / DEGREES}
+    raise refused("start.degrees", name, target=1, **facts)
 
 
 def _nearest(course: Array, heading: Array) -> float:

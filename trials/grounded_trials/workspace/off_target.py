@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import Document, measured_alike, or_zero
+from grounded.result import Document, or_zero
 from grounded.search.difference import began_apart
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
@@ -38,7 +39,6 @@ STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
-WITHIN = "within its noise of"  # of an error at the end that a single sample can't show
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
 
@@ -70,21 +70,25 @@ class OffTarget(Document):
     end_std: float = 0.0
     runs: int = 1
 
-    def summary(self) -> str:
-        """Return a text such as `position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
-        told = []
-        at_end = 0.0 if self.end < EXACT * self.most else self.end  # of a plan
-        least = max(at_end, self.noise)
-        rms, most, end = measured_alike([self.rms, self.most, least], self.unit)
+    @property
+    def finding(self) -> Finding:
+        """The errors as `run.off_target`; an end on target, or within noise, says so."""
+        size, told = partial(Quantity, unit=self.unit), dict[str, Any]()
         if np.isfinite(self.rms):
-            told += [f"{rms} rms", f"{most} at most (at {self.at_s:.4g} s)"]
+            told |= {"rms": size(self.rms), "most": size(self.most), "at": self.at_s}
         if np.isfinite(self.end):
-            told.append(f"{end} at the end" if at_end == least else f"at the end {WITHIN} {end}")
-            if at_end == least and self.end_std > UNSURE * at_end:
-                told[-1] += (
-                    f" (+- {measured_alike([self.end_std], self.unit)[0]} {by_runs(self.runs)})"
-                )
-        return f"{self.what} {', '.join(told)}"
+            at_end = 0.0 if self.end < EXACT * self.most else self.end  # of a plan
+            if at_end < self.noise:
+                told |= {"noise": size(self.noise)}
+            else:
+                told |= {"end": size(at_end)} if at_end else {"there": 1}
+                unsure = self.end_std > UNSURE * at_end
+                told |= {"std": size(self.end_std), "runs": self.runs} if unsure else {}
+        return found("run.off_target", self.what, **told)
+
+    def summary(self) -> str:
+        """Return the errors in words."""
+        return self.finding.what
 
 
 def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from grounded.errors import GroundedError, NextCommand, list_of
+from grounded.checks import list_of, refused, wrong
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.wording import ranges
 
@@ -72,14 +73,14 @@ def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str])
         GroundedError: if nothing can be used, or a name is no usable trial.
     """
     if isinstance(names, str):
-        raise GroundedError(f"trials must be a list of names, such as ['{names}'], got '{names}'")
+        raise wrong("trials", names, must="names", like=f"['{names}']")
     given = list_of(names, str, "trials")
     if not usable:
-        raise GroundedError(found("search.no_trial"))
+        raise refused("search.no_trial")
     stored = {one.id for one in workspace.store.list()} - {*workspace.discarded()}
     for name in given:
         if name.lower() in stored.difference(usable):
-            raise GroundedError(found("search.unusable", name.lower(), usable=ranges(usable)))
+            raise refused("search.unusable", name.lower(), usable=ranges(usable))
         if name.lower() not in usable:
             raise unknown_trial(workspace, name)
     return tuple(name.lower() for name in given)
@@ -99,4 +100,4 @@ def refuse_ids(workspace: Folder, log: str | Path, verb: str) -> None:
     paths = {one.id: str(one.path) for one in workspace.store.list()}
     if given in paths or given in workspace.candidate_ids():
         path = None if verb == "ingest" else paths.get(given)
-        raise GroundedError(found("search.no_log_file", str(log), path=path))
+        raise refused("search.no_log_file", str(log), path=path)

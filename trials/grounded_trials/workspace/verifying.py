@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded.result import Result, listed
+from grounded.result import Result
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
@@ -75,14 +76,9 @@ def _candidates(
             data = read_file(path, FILE_LIMIT, follow=False)
             lost = sorted({*intact(data, name)[0].seen} - stored)
             if lost:
-                raise GroundedError(
-                    f"{path} was made from {listed(lost)}, which trials/ does not have any more: "
-                    "bring the files back from a copy, or ingest the original logs again"
-                )
+                raise refused("file.changed", path, what="gone", lost=tuple(lost))
             if handed and sha256(data) not in handed:
-                raise GroundedError(
-                    f"{path} is not the file that was handed out as {name}: it was rewritten"
-                )
+                raise refused("file.changed", path, what="candidate")
 
         yield path, check
 

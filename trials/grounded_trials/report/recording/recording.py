@@ -25,12 +25,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, needs
+from grounded.errors import needs
 from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import Bars, Figure, rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
+from grounded_trials.plain_file import unwritable
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.calmed import averaged, window_of
 from grounded_trials.report.figures.gap import forecast_run
@@ -74,7 +75,7 @@ def write_recording(findings: Findings, path: Path) -> None:
         stream.disconnect()
         temporary.replace(path)
     except (OSError, RuntimeError) as error:
-        raise GroundedError(f"{path} can't be written: {error}") from None
+        raise unwritable(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from grounded import onboard
-from grounded.errors import GroundedError, nearest
+from grounded.checks import known as among
+from grounded.checks import one_of, refused
+from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.result import Result
 from grounded.search.standing import Ending, Phase, Standing
@@ -85,10 +87,9 @@ def export_candidate(
     known = encoders()
     form = form or format_of(path, tuple(known), "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
-    if form not in known:
-        raise GroundedError(f"there is no format '{form}': {nearest(form, known)}")
-    if runner and form != "npz":
-        raise GroundedError(f"the runner reads npz, not {form}: omit the format, or choose npz")
+    among("format", [form], known)
+    if runner:
+        one_of("format of the runner", form, ["npz"])
     now = standing_in(workspace) if identity == "best" else None
     identity = candidate_named(workspace, identity, now)
     handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
@@ -97,7 +98,7 @@ def export_candidate(
         try:
             onboard.check_limits(identity, handed.candidate.policy)
         except ValueError as error:
-            raise GroundedError(str(error)) from None
+            raise refused("plan.unsafe", identity, why=str(error)) from None
     write_atomically(path, known[form](handed.candidate.policy, units_of(workspace), about))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
@@ -128,10 +129,7 @@ def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:
     if ending in formats:
         return ending
     if ending:
-        raise GroundedError(
-            f"{path} ends in .{ending}, which is not a format here: expected "
-            f".{', .'.join(formats[:-1])} or .{formats[-1]}, or the format named with --format"
-        )
+        one_of(f"the ending of {path}", ending, formats)
     return default
 
 

@@ -27,6 +27,7 @@ from grounded_trials.workspace.candidates.handover import (
     unmapped,
 )
 from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
+from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
@@ -52,8 +53,8 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
-    from grounded_trials.workspace.candidates.trust import Extent
     from grounded_trials.workspace.identity import StoredTrial
+    from grounded_trials.workspace.settled import Settled
 
 PROPOSE = NextCommand("propose")
 
@@ -126,6 +127,8 @@ class Status(Result):
     off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
     diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
     since: Since | None = None  # what changed since the diagnosis
+    settled: Settled | None = None  # what was adopted, and what it gained; None if nothing was
+    noise: float | None = None  # how much of the best's cost is sensor noise, if it is much
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -403,7 +406,18 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         off_target_of(workspace.task, best.trials if best else ()),
         last,
         since,
+        _settled(workspace, last, since),
+        much_noise(best.noise_cost, best.utility) if best else None,
     )
+
+
+def _settled(workspace: Folder, last: Diagnosis | None, since: Since | None) -> Settled | None:
+    """Return what was adopted; None, and without slow imports, if nothing was."""
+    if not (workspace.config.model.effects or workspace.config.model.params):
+        return None
+    from grounded_trials.workspace.settled import settled_in
+
+    return settled_in(workspace, last, since or Since())
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import known, refused, wrong
+from grounded.errors import NextCommand
 from grounded.findings import Finding, found
 from grounded.plant import Noise, Plant
 from grounded.result import Result
@@ -36,6 +37,7 @@ from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
 TRIALS = 30  # limit of the search for the optimum
+EXAMPLE = "python drive.py {candidate} {trial}"  # a command of [system]
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,12 +87,8 @@ def run_candidate(
     elif system.model:
         _simulate(workspace, handed, path)
     else:
-        raise GroundedError(
-            "grounded.toml has no [system]: run the candidate "
-            f"{workspace.candidate_path(identity)} on your robot by hand and ingest its log, or "
-            'give [system] command = "python drive.py {candidate} {trial}"',
-            to_run(workspace, identity, *(() if candidate is None else (candidate,))),
-        )
+        then = to_run(workspace, identity, *(() if candidate is None else (candidate,)))
+        raise refused("run.by_hand", workspace.candidate_path(identity), example=EXAMPLE, then=then)
     return Ran(identity, path, handed.findings, handed.overridden)
 
 
@@ -105,19 +103,15 @@ def simulated_plant(workspace: Folder) -> Plant:
     model = model_in(module)
     for kind, values in system.noise.items():
         for name in values:
-            if name not in model.states:
-                raise GroundedError(
-                    f"grounded.toml: [system.noise.{kind}] {name}: {system.model} has no such "
-                    "state: " + nearest(name, model.states)
-                )
+            where = f"grounded.toml: [system.noise.{kind}]"
+            known("state", [name], model.states, system.model, where)
     noise = Noise(**{kind: dict(values) for kind, values in system.noise.items()})
     try:
         latency = {str(k): float(v) for k, v in dict(getattr(module, "latency", {})).items()}
         substeps = int(getattr(module, "substeps", 5))
     except (TypeError, ValueError) as error:
-        raise GroundedError(
-            f"{system.model}: latency must be {{input: seconds}} and substeps a whole number: "
-            f"{error}"
+        raise wrong(
+            f"latency and substeps in {system.model}", got=str(error), must="plant"
         ) from None
     return Plant(model=model, latency=latency, noise=noise, substeps=substeps)
 
@@ -138,29 +132,23 @@ def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     }
     for name in words:
         if "{" + name + "}" not in command:
-            raise GroundedError(f"[system] command must contain {{{name}}}, found: {command}")
+            raise wrong("[system] command", command, must="words", like=EXAMPLE)
     try:
         parts = shlex.split(command)
     except ValueError as error:
-        raise GroundedError(
-            f"[system] command can't be split into words ({error}): {command}"
-        ) from None
+        raise wrong("[system] command", got=f"{command} ({error})", must="words") from None
     for name, text in words.items():
         parts = [part.replace("{" + name + "}", text) for part in parts]
     try:
         done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
     except OSError as error:
-        raise GroundedError(
-            f"[system] command '{parts[0]}' can't be run: {error.strerror}; expected a program on "
-            f"the PATH, or a path from the workspace: {command}"
-        ) from None
+        why = f"{parts[0]}: {error.strerror}"
+        raise refused("run.command", command, why=why) from None
     if done.returncode != 0:
-        hint = f"; what it wrote is kept in {path}" if path.exists() else ""
-        raise GroundedError(
-            f"[system] command ended with exit code {done.returncode}: {shlex.join(parts)}{hint}"
-        )
+        kept = str(path) if path.exists() else None
+        raise refused("run.command", shlex.join(parts), exit=str(done.returncode), kept=kept)
     if not path.exists():
-        raise GroundedError(f"[system] command succeeded but wrote no trial to {{trial}} = {path}")
+        raise refused("run.command", shlex.join(parts), missing=str(path))
 
 
 def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:

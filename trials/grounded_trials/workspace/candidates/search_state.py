@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import grounded
+from grounded.checks import refused
 from grounded.compile.run.jit import store, stored
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
@@ -164,18 +165,14 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     if name is None:
         waiting = standing_in(workspace).outstanding
         if waiting is None:
-            raise GroundedError(
-                "no candidate is waiting to be run: make the next one with `propose`, or name a "
-                "candidate to run it again",
-                NextCommand("propose"),
-            )
+            raise refused("search.none_waits", then=NextCommand("propose"))
         return waiting.id
     if (name := name.lower()) != "best":
         workspace.candidate_bytes(name)  # raises if there is none
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:
-        raise GroundedError("no run of this task was ingested yet, so no candidate is the best")
+        raise refused("search.no_best")
     return best.candidate.id
 
 

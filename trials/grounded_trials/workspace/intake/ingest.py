@@ -16,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import Result
@@ -143,9 +144,9 @@ def ingest_log(
     candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
-        raise GroundedError(f"{path} is a candidate, the policy to run, not the trial of its run")
+        raise refused("file.exported", path, candidate=path.stem)
     if candidate is not None and data:
-        raise GroundedError("--data is for a log that ran no candidate; omit it or --candidate")
+        raise refused("given.either", "--data", "--candidate", how="one")
     if kind == TRIAL:
         read = read_own_trial(workspace, path, candidate, data)
     else:

@@ -158,7 +158,7 @@ def _search(table: Table) -> SearchOptions:
     try:
         return SearchOptions(**values)
     except GroundedError as error:
-        raise GroundedError(f"{table.file.name}: {error}") from None
+        raise error.at(table.file.name) from None
 
 
 def _system(table: Table) -> SystemTable:

@@ -15,7 +15,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from grounded.adapters.beside import beside
-from grounded.errors import GroundedError, nearest
+from grounded.checks import of_type, refused, unknown, wrong
+from grounded.errors import GroundedError
 from grounded.foreign import contained
 from grounded.model import Model
 from grounded.trusted import check_own
@@ -46,11 +47,9 @@ def load_module(
         return _installed(module)
     path = (folder / file).resolve()
     if not path.is_relative_to(folder.resolve()):
-        raise GroundedError(
-            f"grounded.toml: {key} = '{file}' lies outside the workspace {folder}; copy it inside"
-        )
+        raise wrong(f"grounded.toml: {key}", file, must="inside")
     if not path.is_file():
-        raise GroundedError(f"grounded.toml: {key} = '{file}': {path} does not exist")
+        raise refused("file.missing", path, where=f"grounded.toml: {key}")
     between = [place for place in path.parents if place.is_relative_to(folder.resolve())]
     check_own(folder, [folder / FILE, path, path.parent / "__pycache__", *between])
     spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
@@ -65,9 +64,9 @@ def load_module(
         with contextlib.redirect_stdout(sys.stderr), beside(path.parent), contained():
             spec.loader.exec_module(found)
     except GroundedError as error:
-        raise GroundedError(f"{path}: {error}") from None
+        raise error.at(str(path)) from None
     except Exception as error:
-        raise GroundedError(_where(error, str(path))) from None
+        raise _failed(error, str(path)) from None
     finally:
         sys.dont_write_bytecode = writes
         sys.path.remove(str(folder))
@@ -91,13 +90,10 @@ def _installed(name: str) -> ModuleType:
             return found
         with contained():
             return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise GroundedError(
-            f"[model] module = '{name}' can't be imported: {error}; install its package in this "
-            f"environment, give file = 'model.py', or name one of {', '.join(sorted(registered))}"
-        ) from None
+    except ModuleNotFoundError:
+        raise unknown("module", name, registered, where="grounded.toml: [model] module") from None
     except Exception as error:
-        raise GroundedError(_where(error, name)) from None
+        raise _failed(error, name) from None
 
 
 def _importable(name: str) -> bool:
@@ -127,23 +123,15 @@ def model_in(module: ModuleType) -> Model:
     name = module.__file__ or module.__name__
     if found is None:
         names = [key for key, value in vars(module).items() if isinstance(value, Model)]
-        hint = f"; rename '{names[0]}' to 'model'" if names else "; see the README for an example"
-        raise GroundedError(f"{name} does not define `model = Model(...)`{hint}")
-    raise GroundedError(f"{name}: `model` must be a grounded.Model, found {type(found).__name__}")
+        raise refused("model.undefined", name, other=names[0] if names else None)
+    of_type(f"{name}: `model`", found, Model)
+    raise AssertionError(name)
 
 
-def _where(error: BaseException, name: str) -> str:
-    """Describe an error with the user's own line that failed."""
+def _failed(error: BaseException, name: str) -> GroundedError:
+    """Return an error of the user's code, with the line of it that failed."""
     if isinstance(error, SyntaxError):
-        line = f" line {error.lineno}" if error.lineno else ""
-        return f"{error.filename or name}{line}: {error.msg}"
+        return refused("model.fails", error.filename or name, line=error.lineno, why=error.msg)
     frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name in name]
-    line = f" line {frames[-1].lineno}" if frames else ""
-    return f"{name}{line}: {type(error).__name__}: {error}"
-
-
-def check_names(names: dict[str, Any] | Any, valid: list[str], what: str) -> None:
-    """Raise a GroundedError for the first name that is not valid."""
-    for name in names:
-        if name not in valid:
-            raise GroundedError(f"{what} '{name}' is not in the model: {nearest(name, valid)}")
+    line = frames[-1].lineno if frames else None
+    return refused("model.fails", name, line=line, why=f"{type(error).__name__}: {error}")

@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.checks import known, one_of, refused, unknown, wrong
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import MAX_HORIZON, Task
 from grounded.utility import Reward
-from grounded_trials.plain_file import open_file
+from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.user_files.config import Config
-from grounded_trials.workspace.user_files.model_file import check_names
 
 Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
 
@@ -43,9 +43,7 @@ def build_task(config: Config, model: Model, folder: Path, read: Reader | None =
     try:
         return _build(config, model, folder, read or read_target)
     except GroundedError as error:
-        named = str(error).startswith((config.file.name, str(folder), config.task.target))
-        where = "" if named else f"{config.file.name}: "
-        raise GroundedError(f"{where}{error}", error.then) from None
+        raise error.at(config.file.name, unless="file") from None
 
 
 def check_tables(config: Config, model: Model, rows: int) -> None:
@@ -66,11 +64,11 @@ def check_tables(config: Config, model: Model, rows: int) -> None:
 def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     states, inputs = list(model.state_names), list(model.input_names)
     table = config.task
-    check_names(table.start, [*states, *inputs], "[task] start: state")
-    check_names(table.latency, inputs, "[task] latency: input")
+    known("state or input", table.start, [*states, *inputs], "the model", "[task] start")
+    known("input", table.latency, inputs, "the model", "[task] latency")
     path = folder / table.target
     if not path.resolve().is_relative_to(folder.resolve()):
-        raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
+        raise wrong("[task] target", table.target, must="inside")
     if table.target:
         target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon, read)
     else:
@@ -127,14 +125,10 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
         none = np.zeros(len(states))
         return replace(reward, state=none, terminal=none)
     if not (reward.state.any() or reward.terminal.any()):
-        raise GroundedError(
-            "[reward] weighs no state, so there is nothing to follow; add for example "
-            f"state = {{ {states[0]} = 1.0 }}"
-        )
+        raise refused("plan.no_weight", state=states[0])
     return reward
 
 
-DRAW = ": draw the manoeuvre, or write one row per control step, with columns t and states"
 SHAPE = NextCommand("target", ("SHAPE",))
 ROW_LIMIT = MAX_HORIZON + 2  # of target.csv; a longer one is not read to its end
 LEAST = 0.1  # smallest range of a target column used for its weight
@@ -164,12 +158,12 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
             if not names:
-                raise GroundedError(f"{path.name} is empty{DRAW}", SHAPE)
+                raise refused("file.rows", path.name, rows="no", needs=2, then=SHAPE)
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
                 if len(rows) > ROW_LIMIT:
-                    raise GroundedError(f"{path.name} has more than {ROW_LIMIT} rows")
+                    raise unreadable(path.name, f"> {ROW_LIMIT} rows")
                 try:
                     values = [*map(float, row)]
                 except ValueError:
@@ -180,46 +174,35 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
                     values = _numbers(path, line, names, row, free)
                 rows.append(values)
     except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist, but [task] target names it") from None
+        raise refused("file.missing", path, where="[task] target") from None
     except IsADirectoryError:
-        raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
+        raise refused("file.folder", path, where="[task] target") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise GroundedError(f"{path} can't be read as CSV: {error}") from None
+        raise unreadable(path, error, kind="CSV") from None
     return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
 
 
 def _check_header(path: Path, names: list[str]) -> None:
-    if names[0] != "t":
-        raise GroundedError(
-            f"{path.name}: the first column must be 't', found '{names[0]}'; columns are separated "
-            "by commas"
-        )
+    one_of(f"the first column of {path.name}", names[0], ["t"])
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise GroundedError(f"{path.name}: there are two columns named '{twice[0]}'")
+        raise refused("given.twice", path.name, name=twice[0])
 
 
 def _numbers(
     path: Path, line: int, names: list[str], row: list[str], free: Collection[str]
 ) -> list[float]:
     if len(row) != len(names):
-        raise GroundedError(
-            f"{path.name} line {line}: {len(row)} values for {len(names)} columns "
-            f"({', '.join(names)})"
-        )
+        sizes = {"line": line, "has": len(row), "head": 1, "names": len(names)}
+        raise refused("file.row", path.name, **sizes)
     values = []
     for name, cell in zip(names, row, strict=True):
         try:
             value = float(cell)
         except ValueError:
-            raise GroundedError(
-                f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
-            ) from None
+            raise wrong(f"{path.name} line {line}: '{name}'", cell, must="number") from None
         if not math.isfinite(value) and name not in free:
-            raise GroundedError(
-                f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
-                "must be finite; omit the column if the state is free"
-            )
+            raise wrong(f"{path.name} line {line}: '{name}'", cell, must="finite", do="omit")
         values.append(value)
     return values
 
@@ -248,28 +231,21 @@ def target_arrays(
     names, values = (read or read_target)(path)
     for name in names[1:]:
         if name not in states and name not in inputs:
-            raise GroundedError(
-                f"{path.name}: column '{name}' is neither a state nor an input of the model: "
-                + nearest(name, [*states, *inputs])
-            )
+            there = [*states, *inputs]
+            raise unknown("state or input", name, there, "the model", where=path.name)
     if len(values) < 2:
-        rows = "one row" if len(values) else "no row"
-        raise GroundedError(f"{path.name} has {rows} below its header{DRAW}", SHAPE)
+        raise refused("file.rows", path.name, rows=str(len(values)), needs=2, then=SHAPE)
     if len(values) < horizon + 1:
-        raise GroundedError(
-            f"{path.name} has {len(values)} rows, but a horizon of {horizon} steps needs "
-            f"{horizon + 1}: add rows or set [task] horizon = {max(len(values) - 1, 0)}"
-        )
+        sizes = {"rows": str(len(values)), "needs": horizon + 1, "horizon": len(values) - 1}
+        raise refused("file.rows", path.name, **sizes)
     t = values[: horizon + 1, 0]
     off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
     if off.max() > 0.01 * dt:
         _check_interval(path, values[:, 0], dt)
         i = int(np.argmax(off > 0.01 * dt))
-        raise GroundedError(
-            f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
-            f"[task] dt = {dt:g} s apart; resample them with the command below",
-            NextCommand("target", (str(path),)),
-        )
+        facts = {"sample": f"of line {i + 2}", "at": t[i], "expected": t[0] + i * dt, "dt": dt}
+        then = NextCommand("target", (str(path),))
+        raise refused("file.grid", path.name, resample=1, then=then, **facts)
     target = np.full((horizon + 1, len(states)), np.nan)
     given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
     for i, name in enumerate(states):
@@ -290,17 +266,10 @@ def _check_interval(path: Path, t: Array, dt: float) -> None:
     each = lasts / (len(t) - 1)
     if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
         return
-    rows = f"[task] dt = {dt:g} s, but the rows of {path.name} are {each:.6g} s apart"
     if dt < lasts:
-        raise GroundedError(
-            f"{rows}: set dt = {each:.6g}, or resample the target with the command below",
-            NextCommand("target", (str(path),)),
-        )
-    unit = f" (in seconds: {dt:g} ms is {dt / 1000:g})" if dt / 1000 < lasts else ""
-    raise GroundedError(
-        f"{rows} and last {lasts:.4g} s in all: dt is the time from one command to the next{unit}; "
-        f"set dt = {each:.6g}"
-    )
+        then = NextCommand("target", (str(path),))
+        raise refused("file.grid", path.name, every=each, dt=dt, each=each, resample=1, then=then)
+    raise refused("file.grid", path.name, every=each, dt=dt, each=each)
 
 
 def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.estimate.record import Record
 from grounded.findings import found
@@ -255,11 +256,7 @@ def _smoothed(
     kept = [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]
     states = np.concatenate(kept)
     if not np.isfinite(states).all():
-        raise GroundedError(
-            f"the smoother finds no finite states for this log ({smooth[0].status}): the "
-            "model is too far off to estimate what was not measured; check its units and the "
-            "[log] mapping"
-        )
+        raise refused("log.not_estimated", why=str(smooth[0].status))
     return np.concatenate([one.times[core] for one, core in parts]), states
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
@@ -25,7 +26,6 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signa
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
-from grounded_trials.wording import count
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, StoredTrial
@@ -244,20 +244,13 @@ def mapping_of(workspace: Folder, path: Path) -> LogMapping:
     if mapping is not None:
         return mapping
     if (path / FILE).is_file():
-        raise GroundedError(f"{path} is a workspace: name the log in it, or the log's folder")
+        raise refused("file.no_log_inside", path, own=1)
     own = [file for file in files if kind_of(file)] if path.is_dir() else []
     if own:
-        raise GroundedError(
-            f"{path} is a folder with {count(len(own), 'file')} that grounded wrote: ingest the "
-            "file of a run",
-            NextCommand("ingest", (str(max(own, key=lambda file: file.stat().st_mtime)),)),
-        )
+        newest = str(max(own, key=lambda file: file.stat().st_mtime))
+        raise refused("file.no_log_inside", path, own=1, then=NextCommand("ingest", (newest,)))
     read_apart(files, _first_records)
-    raise GroundedError(
-        f"{path} is not a trial written by grounded, and grounded.toml has no [log] table to map "
-        "it: `inspect` prints one",
-        NextCommand("inspect", (str(path),)),
-    )
+    raise refused("file.no_mapping", path, then=NextCommand("inspect", (str(path),)))
 
 
 def _first_records(files: tuple[Path, ...]) -> None:
@@ -295,32 +288,16 @@ def _unmapped(
     model: Model, mapping: LogMapping, name: str, path: Path, *, estimated: bool
 ) -> GroundedError:
     """Return the error for a state or an input that [log] does not map."""
+    numbers = inspect_log(path, mapping.layout).moving
+    few = {"path": path.name, "numbers": tuple(numbers) if len(numbers) <= FEW else None}
     if name in model.input_names:
-        return GroundedError(
-            f"[log] maps no '{name}': every input must be logged, map it{_numbers(path, mapping)}"
-        )
+        return refused("log.no_signal", name, what="input", **few)
     if estimated:
-        return GroundedError(
-            f"[log] maps no '{name}', but [estimate] lists it in measured: map it, or remove it "
-            "there"
-        )
+        return refused("log.no_signal", name, what="estimated")
     known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
     if not known:
-        return GroundedError(
-            f"[log] maps no '{name}', nor any other state: map what is measured"
-            f"{_numbers(path, mapping)}"
-        )
-    return GroundedError(
-        f"[log] maps no '{name}': map it. If no sensor measures it, a smoother can estimate it "
-        "from the others: add to grounded.toml, each with its own noise (standard deviation, in "
-        f"the state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
-    )
-
-
-def _numbers(path: Path, mapping: LogMapping) -> str:
-    """List the numbers in a log that change, if they are few; else ""."""
-    found = inspect_log(path, mapping.layout).moving
-    return f". {path.name} has {', '.join(found)}" if 0 < len(found) <= FEW else ""
+        return refused("log.no_signal", name, what="any", **few)
+    return refused("log.no_signal", name, what="state", measured="{ " + ", ".join(known) + " }")
 
 
 def rates_of(model: Model) -> tuple[str, ...]:

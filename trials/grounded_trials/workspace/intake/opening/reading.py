@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.trial import Trial
@@ -115,21 +116,10 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         ("states", trial.state_names, model.state_names),
         ("inputs", trial.input_names, model.input_names),
     ):
-        if theirs != own:
-            raise GroundedError(
-                f"{path} has the {what} {', '.join(theirs)}, but this workspace's model has "
-                f"{', '.join(own)}: it is a trial of another robot"
-            )
+        same_names(str(path), what, theirs, own)
     if other := list(_other_units(workspace, meta)):
-        raise GroundedError(
-            f"{path}: {'; '.join(other)}. A trial is stored unchanged: write its signals in the "
-            "model's units and name those, or ingest them as a CSV with a scale in [log]"
-        )
-    if abs(trial.dt - dt) > 1e-9:
-        raise GroundedError(
-            f"{path} was recorded every {trial.dt:g} s, but this workspace's [task] dt is {dt:g} "
-            "s: it belongs to another task"
-        )
+        raise refused("log.stored_units", path, units=tuple(other))
+    same_dt(str(path), trial.dt, dt)
     if data:
         if not trial.candidate:
             return Read(trial, content)
@@ -140,7 +130,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         trial = replace(trial, candidate="")
         return Read(trial, _encode(workspace, trial, about), some)
     if candidate is not None and trial.candidate not in ("", candidate):
-        raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
+        raise refused("log.another", log=str(path), ran=candidate, other=trial.candidate)
     if trial.candidate:
         _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
         return Read(trial, content, bare=policy is None)
@@ -155,7 +145,7 @@ def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
     for kind, own in (("states", model.states), ("inputs", model.inputs)):
         for name, unit in json.loads(meta[kind]).items():
             if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
-                yield f"{name} is in {unit}, but the model has it in {own[name]}"
+                yield f"{name} [{unit}, not {own[name]}]"
 
 
 def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[Finding, ...]:
@@ -175,23 +165,14 @@ def _check_candidate(
         GroundedError: if not.
     """
     if candidate not in workspace.candidate_ids():
-        raise GroundedError(
-            f"{path} ran {candidate}, which this workspace never proposed; ingest it with --data "
-            "to use it for fitting and diagnosis"
-        )
+        raise refused("log.foreign_run", path, ran=candidate, what="unknown")
     own = workspace.task.hash
     made, meta = workspace.candidate(candidate)
     if meta.get("task") != own or task not in ("", own):
-        raise GroundedError(
-            f"{path} ran {candidate} for another task ({other_task(workspace.task, made)}); its "
-            "utility can't be compared. Ingest it with --data to use it for fitting and diagnosis; "
-            "or change the task back, then ingest it"
-        )
+        was = other_task(workspace.task, made)
+        raise refused("log.earlier", log=str(path), ran=candidate, was=was)
     if policy is not None and policy != workspace.candidate_bytes(candidate):
-        raise GroundedError(
-            f"{path} contains a policy that is not the {candidate} of this workspace: it comes "
-            "from another one, or the candidate was made again since. Ingest it with --data"
-        )
+        raise refused("log.foreign_run", path, ran=candidate, what="policy")
 
 
 def read_log_file(
@@ -276,11 +257,8 @@ class NoneWaits(GroundedError):
     """Raised if no candidate is waiting for a trial; `best` may have been run again."""
 
     def __init__(self, path: Path, best: str) -> None:
-        super().__init__(
-            f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
-            "with --candidate ID, or use --data for a log that ran none",
-            NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
-        )
+        then = NextCommand("ingest", (str(path), "--candidate", best)) if best else None
+        super().__init__(refused("search.none_waits", log=str(path), then=then).finding)
         self.best = best
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, found
 from grounded.trial import Trial, scattered
@@ -50,11 +51,9 @@ def refuse_as_another(
     refuse_known_data(
         workspace, path, stored, wanted
     )  # the wrong file, most likely; a diagnosis may rest on it
-    raise GroundedError(
-        f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
-        f"use it as {_what(wanted)} instead, discard {identity} first",
-        NextCommand("discard", (identity,)),
-    )
+    facts = {"used": as_run or "data", "wanted": wanted or "data"}
+    then = NextCommand("discard", (identity,))
+    raise refused("log.stored", path, trial=identity, then=then, **facts)
 
 
 def refuse_known_data(
@@ -70,17 +69,13 @@ def refuse_known_data(
     if not stored or stored[-1].trial.candidate:
         return
     identity, now = stored[-1].stored.id, standing_in(workspace)
-    known = f"{path} is stored already, as {identity}, data for fit and diagnose"
     waits = now.outstanding.id if now.outstanding and now.phase == "await-trial" else ""
     then = to_run(workspace, waits) if waits else NextCommand("status")
     if wanted:
-        wrong = f"if it really is a run of {wanted}, discard {identity} and ingest it again"
-        raise GroundedError(f"{known}: pass the log of that run; {wrong}", then)
-    raise GroundedError(known + (f": pass the log of the run of {waits}" if waits else ""), then)
-
-
-def _what(candidate: str | None) -> str:
-    return f"a run of {candidate}" if candidate else "data"
+        facts = {"used": "data", "wanted": wanted, "waits": waits or wanted}
+        raise refused("log.stored", path, trial=identity, then=then, **facts)
+    facts = {"used": "data", "waits": waits}
+    raise refused("log.stored", path, trial=identity, then=then, **facts)
 
 
 @dataclass(frozen=True)
@@ -156,12 +151,7 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[Finding, ..
 
 
 def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
-    which = names[0] if len(names) == 1 else "them"
-    return GroundedError(
-        f"{path}: the same recording is stored as {', '.join(names)}, read in another way "
-        f"(another [log], [estimate] or [task] dt): discard {which}, then ingest it again",
-        NextCommand("discard", names),
-    )
+    return refused("log.stored", path, trial=names, other=1, then=NextCommand("discard", names))
 
 
 def same_recording(
@@ -204,11 +194,8 @@ def same_recording(
         if alike == "some":
             raise _read_otherwise(path, (one.stored.id,))
         if here.finite_steps > one.measured.finite_steps:
-            raise GroundedError(
-                f"{path}: {one.stored.id} is a part of the same recording, which is longer here: "
-                f"discard {one.stored.id}, then ingest it again",
-                NextCommand("discard", (one.stored.id,)),
-            )
+            then = NextCommand("discard", (one.stored.id,))
+            raise refused("log.stored", path, trial=one.stored.id, part=1, then=then)
         lasted = one.meta.get(LASTED)
         cut = lasted is not None and log is not None and lasted != log.source[LASTED]
         if stamped or cut or here.finite_steps < one.measured.finite_steps:

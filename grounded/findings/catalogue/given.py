@@ -1,0 +1,76 @@
+"""Findings on what a user gives: values, names, shapes, and things that do not fit together."""
+
+from __future__ import annotations
+
+from grounded.findings.catalogue import Entry
+
+ENTRIES: dict[str, Entry] = {
+    "value": Entry(
+        "refuse",
+        "{about} must be[[ {must:given=given,real=one real number,named=read by name,hinge=given, "
+        "since no angle hangs under its weight,level=those of a level flight,inside=inside the "
+        "workspace,even=equally long,plant=a dict input -> seconds and a whole number,words=a "
+        "program with the words for both files,number=a number,units=names with a unit each,"
+        "free=another name: grounded writes this one,outside=outside the folder of the cases,"
+        "unique=one file: give more digits of its hash,finite=finite,positive=a positive number,"
+        "whole=a whole number,numbers=an array of numbers,names=a list of names,above=above 0,"
+        "weights=finite and not negative,place=one state along an axis, two in a plane "
+        "(horizontal first) or three,bool=True or False,dict=a dict by name,ascending=in "
+        "ascending order,name=a valid Python name,trial=the gr.Trial of the run,policy=read from "
+        "the policy of the candidate (c.policy),call=a function of a candidate that returns the "
+        "Trial of its run,bounded=inside its bounds:}]][[ a {type}]][[ of shape {shape}]][[ from "
+        "{low}]][[ to {high}]][[ below {below}]][[: {known}]][[, such as {like}]][[, not "
+        "{given}]][[: did you mean '{near}'?]]",
+        "[[{do:omit=omit the column if the state is free,turned=transpose it,column=make it a "
+        "column, inputs[:, None],last=leave out the last row, since the last state has no input,"
+        "rows=give one row for each control step and one for the end,free=infinite for no limit,"
+        "widen=correct it, or widen the bounds of its Param,"
+        "read=`grounded_trials.store.trial_file.read_trial` reads a file,load=read a file with "
+        "`load(path)`,hold=hold a value inside ([task] start; in Python past), or widen the "
+        "limits}]]",
+    ),
+    "name": Entry(
+        "refuse",
+        "[[{of} has]][[!of? there is]] no {kind} '{about}'[[: did you mean '{near}'?]][[: there "
+        "are {known}]]",
+    ),
+    "twice": Entry("refuse", "the name '{name}' stands twice in {about}", "rename one"),
+    "either": Entry(
+        "refuse",
+        "{about}: expected {how:one=exactly one of them,both=both or none,first=the second only "
+        "with the first}",
+    ),
+    "order": Entry("refuse", "{about}: the lower bound {low} must be below the upper, {high}"),
+    "fit": Entry(
+        "refuse", "{about} has the {what} {theirs}, expected {own}[[ in this order{order:1=}]]"
+    ),
+    "large": Entry(
+        "refuse",
+        "{about} has {states} states and {inputs} inputs, more than the {most} for which a "
+        "{what:plan=plan,fit=fit,diagnosis=diagnosis} is made",
+        "take a model of the part that matters here",
+    ),
+    "short": Entry(
+        "refuse",
+        "a {what:bias=bias,fit=fit,noise=noise estimate,estimate=state estimate,"
+        "diagnosis=diagnosis} needs a trial of {needs} finite steps or more[[, got {has}]]",
+        "`verify` the stored files, or ingest a trial that ran",
+    ),
+    "unweighed": Entry(
+        "refuse",
+        "[reward] weighs {about}, but the target has no value for it at step {step}",
+        "add the column to the target (for a line: `--to {about}=0`; if only `terminal` weighs it,"
+        " only the last value counts), or drop the weight",
+    ),
+    "no_input": Entry(
+        "refuse",
+        "{about} has no {what}",
+        "[[{what:state=,input=for a free motion, add the force that nobody applied, and to the "
+        "log a column of zeros}]]",
+    ),
+    "constant": Entry(
+        "refuse",
+        "{about} has no uncertain parameter[[ '{name}']] to fit",
+        "give bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)",
+    ),
+}

@@ -1,0 +1,410 @@
+"""The JSON documents of all commands as types, and the schema that is generated from them.
+
+A result whose document is its fields (`grounded.result.Document`) is its own type; those that are
+put together have a TypedDict here. `python -m grounded_trials.documents` prints the schema, kept as
+docs/schema.json; a test compares the two, and holds the document of every command to it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Any,
+    NotRequired,
+    TypedDict,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
+
+from grounded.accounts.finding import Finding as Fault
+from grounded.diagnosis.report import Diagnosis
+from grounded.findings import Finding, Quantity
+from grounded_trials.workspace.off_target import OffTarget
+
+By = Mapping[str, float]
+
+
+class Command(TypedDict):
+    """The command to run next."""
+
+    command: str
+    arguments: list[str]
+
+
+class FindingJson(TypedDict):
+    """What a command tells."""
+
+    code: str
+    weight: str
+    about: list[str]
+    facts: dict[str, Any]
+    nats: float
+    sentence: str
+    then: Command | None
+
+
+class QuantityJson(TypedDict):
+    """A fact with a unit."""
+
+    value: float
+    std: float
+    unit: str
+
+
+class TriedJson(TypedDict):
+    """A candidate in the history of a search."""
+
+    candidate: str
+    iteration: int
+    alpha: float
+    damping: float | None
+    base: str | None
+    predicted_utility: float
+    utility: float
+    standard_error: float
+    probability: float
+    noise_cost: float
+    trials: list[str]
+    accepted: bool
+    verdict: str
+
+
+class BestJson(TypedDict):
+    """The best candidate so far."""
+
+    candidate: str
+    utility: float
+    lead_doubt: str | None
+    off_target: list[OffTarget]
+
+
+class StatusJson(TypedDict):
+    """`status`, `learn`."""
+
+    phase: str
+    iteration: int
+    best: BestJson | None
+    utilities: list[float]
+    trials: int
+    outstanding: str | None
+    missing: int
+    sentence: str
+    ending: str | None
+    certainty: str
+    findings: list[Finding]
+    history: list[TriedJson]
+    discarded: dict[str, str]
+
+
+class FromStartsJson(TypedDict):
+    """What the starts of the runs are worth."""
+
+    utility_change: float
+    std: float
+    runs: int
+
+
+class ProposeJson(TypedDict):
+    """`propose`."""
+
+    candidate: str | None
+    file: str | None
+    iteration: int
+    alpha: float | None
+    damping: float | None
+    predicted_utility: float | None
+    phase: str
+    sentence: str
+    ending: str | None
+    notes: list[str]
+    findings: list[Finding]
+    best_utility: NotRequired[float | None]
+    new: NotRequired[bool]
+    noise_cost: float | None
+    off_target: list[OffTarget]
+    sample_age_s: float | None
+    from_usual_starts: FromStartsJson | None
+
+
+class IngestedJson(TypedDict):
+    """A log of `ingest`."""
+
+    trial: str
+    sha256: str
+    known: bool
+    candidate: str | None
+    utility: float | None
+    failed: bool
+    accepted: bool | None
+    verdict: str | None
+    crashed: list[str]
+    off_target: list[OffTarget]
+    findings: list[Finding]
+    warnings: list[str]
+    faults: list[str]
+    notes: list[str]
+    signals: list[dict[str, Any]]
+
+
+class IngestJson(TypedDict):
+    """`ingest`."""
+
+    trials: list[IngestedJson]
+
+
+class ErrorsJson(TypedDict):
+    """Prediction errors of a fit."""
+
+    horizon_s: float
+    one_step: By
+    ahead: By
+
+
+class FitJson(TypedDict):
+    """`fit`."""
+
+    params: dict[str, Any]
+    status: str
+    sentence: str
+    findings: list[Finding]
+    samples: int
+    at_bounds: list[str]
+    applied: bool
+    prediction_error_before: NotRequired[ErrorsJson]
+    prediction_error_after: NotRequired[ErrorsJson]
+    trials: list[str]
+    not_fitted: list[str]
+    rows_s: float
+    interpolated_s: float
+    preflight: list[Fault]
+
+
+class MeasuresJson(TypedDict):
+    """Errors of a run, by state."""
+
+    candidate: str
+    utility: float
+    tracking_error: By
+    prediction_error: By
+    bias_rate: By
+
+
+class VerdictJson(TypedDict):
+    """The verdict of the last diagnosis."""
+
+    kind: str
+    effects: list[str]
+    sentence: str
+
+
+class LostJson(TypedDict):
+    """A file that is damaged."""
+
+    file: str
+    reason: str
+
+
+class AdoptedJson(TypedDict):
+    """What was adopted."""
+
+    clauses: list[str]
+    gained: str | None
+    left: str | None
+
+
+class ReportJson(TypedDict):
+    """`report`."""
+
+    paths: dict[str, str | list[str]]
+    utilities: list[float]
+    phase: str
+    sentence: str
+    ending: str | None
+    optimum: float | None
+    lost: list[LostJson]
+    next: str
+    model_policy: MeasuresJson | None
+    best: MeasuresJson | None
+    verdict: NotRequired[VerdictJson]
+    outdated: NotRequired[str | None]
+    findings: NotRequired[list[Finding]]
+    adopted: AdoptedJson | None
+
+
+class InspectJson(TypedDict):
+    """`inspect`."""
+
+    files: list[str]
+    format: str | None
+    library: str
+    duration_s: float
+    messages: int
+    topics: list[dict[str, Any]]
+    remarks: list[str]
+    findings: list[Finding]
+    damage: str
+    log_table: str
+
+
+class AdoptJson(TypedDict):
+    """`adopt`."""
+
+    effects: list[dict[str, Any]]
+    params: By
+    claimed: bool
+    beside: list[str]
+    jointly: list[str]
+    along: list[str]
+    left: By
+    findings: list[Finding]
+
+
+class DiscardJson(TypedDict):
+    """`discard`, `restore`."""
+
+    trials: list[str]
+    unchanged: list[str]
+    discarded: dict[str, str]
+
+
+class ExportJson(TypedDict):
+    """`export`."""
+
+    file: str
+    candidate: str
+    format: str
+    search_ended: bool
+    runner: NotRequired[str]
+
+
+class TakenHomeJson(TypedDict):
+    """`export --model`."""
+
+    file: str
+    source: str
+    date: str
+    values: dict[str, dict[str, Any]]
+    others: list[str]
+    findings: list[Finding]
+
+
+class ExciteJson(TypedDict):
+    """`excite`."""
+
+    candidate: str
+    file: str
+    seconds: float
+    pattern: str
+    frequencies_hz: list[float]
+    size: float
+    feedback: bool
+    parameters: dict[str, dict[str, Any]]
+    findings: list[Finding]
+
+
+class VerifyJson(TypedDict):
+    """`verify`."""
+
+    checked: int
+    damaged: list[LostJson]
+
+
+class RunJson(TypedDict):
+    """`run`."""
+
+    trial_file: str
+    candidate: str
+
+
+DOCUMENTS: dict[str, Any] = {
+    "adopt": AdoptJson,
+    "diagnose": Diagnosis,
+    "discard": DiscardJson,
+    "excite": ExciteJson,
+    "export": ExportJson | TakenHomeJson,
+    "fit": FitJson,
+    "ingest": IngestJson,
+    "inspect": InspectJson,
+    "propose": ProposeJson,
+    "report": ReportJson,
+    "run": RunJson,
+    "status": StatusJson,
+    "verify": VerifyJson,
+}
+_AS = {Finding: FindingJson, Quantity: QuantityJson}  # types that are written in another form
+_MORE: dict[str, dict[str, Any]] = {  # what a document has beside its fields
+    "Diagnosis": {"next_trial": str, "unknowable": list[str]},
+    "Verdict": {"sentence": str},
+}
+_PLAIN = {str: "string", Path: "string", bool: "boolean", int: "integer", NoneType: "null"}
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of all documents, each under its command."""
+    known: dict[str, Any] = {}
+    commands = {name: _of(kind, known) for name, kind in DOCUMENTS.items()}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "What grounded COMMAND --json prints, by command",
+        "properties": commands,
+        "$defs": dict(sorted(known.items())),
+    }
+
+
+def _of(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema of a type; those of objects are added to `known` and referred to."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return {}
+    if origin in (Union, UnionType):
+        return {"anyOf": [_of(one, known) for one in args]}
+    if origin in (list, tuple):
+        return {"type": "array", "items": _of(args[0], known)}
+    if origin in (dict, Mapping):
+        return {"type": "object", "additionalProperties": _of(args[1], known)}
+    if kind is float:  # null where it is not known or not finite
+        return {"type": ["number", "null"]}
+    if kind in _PLAIN:
+        return {"type": _PLAIN[kind]}
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return {"type": "string"}
+    kind = _AS.get(kind, kind)
+    name = "Fault" if kind is Fault else kind.__name__
+    if name not in known:
+        known[name] = {}
+        known[name] |= _object(kind, known)
+    return {"$ref": f"#/$defs/{name}"}
+
+
+def _object(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
+    hints, needed = get_type_hints(kind, include_extras=True), list[str]()
+    if is_typeddict(kind):
+        needed = [name for name, hint in hints.items() if get_origin(hint) is not NotRequired]
+        found = {name: _of(_bare(hint), known) for name, hint in hints.items()}
+    else:
+        assert is_dataclass(kind)
+        found = {}
+        for one in fields(kind):
+            if key := one.metadata.get("key", one.name):
+                found[key] = _of(hints[one.name], known)
+                needed += [] if one.metadata.get("brief") else [key]
+        for key, more in _MORE.get(str(getattr(kind, "__name__", "")), {}).items():
+            found[key] = _of(more, known)
+            needed.append(key)
+    return {"type": "object", "properties": found, "required": needed}
+
+
+def _bare(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is NotRequired else hint
+
+
+if __name__ == "__main__":
+    print(json.dumps(schema(), indent=1))
