@@ -34,7 +34,7 @@ def test_what_is_recovered_of_a_truncated_trial_is_right() -> None:
 
 @pytest.mark.slow
 def test_what_is_recovered_of_a_flipped_trial_is_right() -> None:
-    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 148))
+    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 149))
 
 
 def test_verify_finds_every_flipped_bit() -> None:

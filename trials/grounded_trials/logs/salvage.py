@@ -80,7 +80,7 @@ class Salvage:
     def records(self) -> Iterator[Record]:
         """Yield what can be saved, in file order."""
         pos = self._first()
-        dropped_chunk = False
+        dropped_chunk, before = False, 0  # the record before, 0 after a gap
         while pos is not None and pos < self.size - len(MAGIC):
             end = plausible(self.stream, self.size, pos)
             if end is None:
@@ -91,10 +91,12 @@ class Salvage:
                     yield from self._cut(pos)
                     return
                 self.losses.append(found("file.lost", bytes=after - pos, byte=pos))
-                pos = after
+                pos, before = after, 0
                 continue
             opcode, content = self._read(pos, end)
-            if opcode == MESSAGE:
+            if opcode == MESSAGE and before in (CHUNK, MESSAGE_INDEX):  # in a file with chunks
+                self.losses.append(found("file.lost", part=_NAMES[MESSAGE], byte=pos))
+            elif opcode == MESSAGE:
                 yield from self._message(content)
             else:
                 yield from self._flush()
@@ -107,6 +109,7 @@ class Salvage:
                 yield from self._record(opcode, content, pos)
                 dropped_chunk = opcode == MESSAGE_INDEX and dropped_chunk
                 dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
+                before = opcode
             pos = end
         yield from self._flush()
         self.losses.append(self._ends_early())
