@@ -28,7 +28,7 @@ from grounded.accounts.kinematics import (
     turned,
 )
 from grounded.accounts.motion import Ahead, Fit, horizon_of, plainly_missed
-from grounded.accounts.table import Account, Told, of_motion, of_rows, versions
+from grounded.accounts.table import Account, Term, Told, accounts, versions
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
@@ -146,7 +146,6 @@ def _by_rows(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Told]:
     """Return the fewest accounts after which all rows agree, of trials with the same bad rows."""
-    plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
     each = [gaps(model, trial, rows) for trial in trials]
     groups = dict[frozenset[Row], list[int]]()
     for k, one in enumerate(each):
@@ -155,6 +154,10 @@ def _by_rows(
     usual = None
     if sound:
         usual = np.median([_spread(trial, range(model.n)) for trial in sound], axis=0)
+    if not groups:
+        return []
+    plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
+    table = _table(model, trials, rows, shown, plane)
     found = dict[Account, list[tuple[int, Account, float, tuple[Account, ...]]]]()
     queue = list(groups.values())
     while queue:
@@ -162,7 +165,7 @@ def _by_rows(
         some, before = [trials[k] for k in group], _pooled([each[k] for k in group])
         story = list[tuple[Account, float, tuple[Account, ...]]]()
         while bad := _bad(before):
-            best = _best(model, some, rows, before, plane, shown, usual)
+            best = _best(model, some, rows, before, plane, shown, usual, table)
             if best is None or len(story) > len(bad) + len(rows):
                 break
             story.append(best)
@@ -203,12 +206,13 @@ def _best(
     plane: Turned | None,
     shown: Sequence[int],
     usual: Array | None,
+    table: Sequence[Account],
 ) -> tuple[Account, float, tuple[Account, ...]] | None:
     """Return the account that best mends the rows of trials, its gain and those as good."""
     bad = _bad(before)
     some = frozenset(k for row in bad for k in row.states)
     cost = dict[Account, float]()
-    for account in [*_of_bad(model, some, rows, plane), *_paces(model, bad, before)]:
+    for account in [*_of_bad(table, some, model.n), *_paces(model, bad, before)]:
         account, mended = _fitted(model, trials, account, rows, plane)
         if account.fitted and abs(account.offset) < TURNED_AWAY:
             continue
@@ -236,17 +240,31 @@ def _best(
     return near[0], -least, others
 
 
-def _of_bad(
-    model: Model, some: frozenset[int], rows: Sequence[Row], plane: Turned | None
-) -> Iterator[Account]:
+def _table(
+    model: Model,
+    trials: Sequence[Trial],
+    rows: Sequence[Row],
+    shown: Sequence[int],
+    plane: Turned | None,
+) -> list[Account]:
+    """Return the accounts of these trials, of columns that rows relate as well."""
     columns: tuple[int, ...] = ()
-    if plane is not None and {plane.i, plane.j} & some:
+    if plane is not None:
         rate = next((row.by[0] for row in rows if row.i == plane.k and len(row.by) == 1), -1)
         units = list(model.states.values())
         own = {k for row in rows if row.i in (plane.i, plane.j) for k in row.by}
-        speeds = [k for k in sorted(own) if units[k] == "m/s"]
-        columns = (plane.i, plane.j, plane.k, rate, *speeds)
-    return of_rows(model, some, frozenset(k for row in rows for k in row.states), columns)
+        columns = (plane.k, rate, *(k for k in sorted(own) if units[k] == "m/s"))
+    related = sorted({k for row in rows for k in row.states})
+    return list(accounts(model, shown, related, columns, [t.inputs for t in trials]))
+
+
+def _of_bad(table: Sequence[Account], some: frozenset[int], n: int) -> Iterator[Account]:
+    """Yield the accounts that rows can show and that concern states of rows that disagree."""
+    for account in table:
+        states = frozenset(k for k in account.touched if k < n)
+        asked = states & some if len(account.columns) > 1 else states <= some
+        if Term.ROWS in account.terms and asked:
+            yield account
 
 
 def _paces(model: Model, bad: Sequence[Row], before: Mapping[Row, Gap]) -> Iterator[Account]:
@@ -349,7 +367,11 @@ def _by_motion(
     """Yield the account that predictions of some trials show and none contradicts, if any."""
     some = _examined(trials, shown)
     found = dict[Account, dict[int, tuple[Fit, Fit, float]]]()
-    table = list(of_motion(model, shown, [trials[k] for k in some]))
+    table = [
+        one
+        for one in accounts(model, shown, inputs=[trials[k].inputs for k in some])
+        if Term.MOTION in one.terms
+    ]
     examined = {k: _Seen(model, trials[k], rows, shown, table) for k in some}
     for k, one in examined.items():
         for account, fits in one.better():

@@ -8,8 +8,9 @@ small, a velocity's sign before its position's, a unit before an exchange.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Flag, auto
 from itertools import combinations
 
 import numpy as np
@@ -45,6 +46,14 @@ OPENED, OVER = 0.05, 1.03  # share of full scale that the largest command of a l
 PREFIXES = ("m", "k", "c", "u", "M")
 
 
+class Term(Flag):
+    """What can show an account: kinematic rows, the motion given the model, commands."""
+
+    ROWS = auto()
+    MOTION = auto()
+    COMMANDS = auto()
+
+
 @dataclass(frozen=True)
 class Account:
     """One story of how a log came about.
@@ -58,6 +67,7 @@ class Account:
         unit: in which the columns are, or "".
         price: what it costs before any log is seen [nats].
         fitted: the heading whose offset is to be estimated.
+        terms: what can show it.
     """
 
     kind: str
@@ -68,6 +78,7 @@ class Account:
     unit: str = ""
     price: float = 0.0
     fitted: bool = False
+    terms: Term = field(default=Term(0), compare=False)
 
     @property
     def touched(self) -> frozenset[int]:
@@ -142,7 +153,8 @@ class Told:
         if self.account.kind == "dead":
             return not self.whole
         if self.by_motion:
-            return self.account.unit == "deg" or (self.account.kind == "unit" and not self.whole)
+            degrees = self.account.unit.startswith("deg")
+            return degrees or (self.account.kind == "unit" and not self.whole)
         return self.account.certain
 
 
@@ -184,107 +196,113 @@ def unit_named(units: Iterable[str], factor: float) -> str:
     return WORDS.get(name, name) if alike else ""
 
 
-def of_rows(
-    model: Model, some: frozenset[int], every: frozenset[int], plane: Sequence[int]
+def accounts(
+    model: Model,
+    shown: Sequence[int] | None = None,
+    related: Collection[int] = (),
+    plane: Sequence[int] = (),
+    inputs: Sequence[Array] = (),
 ) -> Iterator[Account]:
-    """Yield the accounts of states that kinematic rows relate.
+    """Yield every story of columns that are not what their names say: the table.
 
     Args:
         model: with the units.
-        some: the states in rows that disagree.
-        every: the states in rows.
-        plane: x, y, the heading, its rate if it is one of the states, and the speeds in m/s of a
-            plane; empty without.
+        shown: indices of the states with a sensor; None: all.
+        related: those that kinematic rows relate.
+        plane: the heading, its rate (-1 if it is no state), and the speeds in m/s of a plane.
+        inputs: commands of logs (T, m), whose largest suggest the unit of a part of 1.
     """
-    units = list(model.states.values())
-    fast = {k for k in some if units[k].endswith("/s")}
-    for k in sorted(some):
-        yield Account("sign", (k,), -1.0, price=0.0 if k in fast else 0.3)
-        for unit, f in units_of(units[k]).items():
-            yield from _either(Account("unit", (k,), f, unit=unit), model.n)
-    for name in dict.fromkeys(units):
-        same = tuple(k for k in sorted(every) if units[k] == name)
-        if len(same) > 1 and name in ("m", "m/s") and some & {*same}:
-            for unit, f in units_of(name).items():
-                yield from _either(Account("unit", same, f, unit=unit, price=0.5), model.n)
-    for pair in combinations(sorted(some), 2):
-        yield Account("exchange", pairs=(pair,), price=1.0)
-    for k in sorted(some):
-        for j in range(model.n, model.n + model.m):
-            yield Account("exchange", pairs=((k, j),), price=1.5)
-    if len(plane) >= 3:
-        psi, rate, *speeds = plane[2:] if len(plane) > 3 else (plane[2], -1)
-        turning = (psi, rate) if rate >= 0 else (psi,)
-        yield Account("offset", (psi,), fitted=True, price=0.5)
-        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True)  # a compass
-        if rate >= 0:
-            yield Account("sign", turning, -1.0, price=0.5)
-            yield Account("sign", turning, -1.0, price=1.0, fitted=True)
-        if len(speeds) == 2:
-            yield Account("axes", (psi, *speeds), price=0.5)
-
-
-def _either(account: Account, states: int = 0) -> Iterator[Account]:
-    """Yield a unit's account, and that of the opposite mistake, where powers of ten may be both."""
-    yield account
-    if account.factor in (1e3, 1e2, DEGREES):
-        yield replace(account, factor=1 / account.factor, unit="", price=account.price + 0.5)
-    if account.factor == 1e3 and account.columns[0] < states:
-        yield replace(account, factor=1e6, unit="", price=account.price + 1.0)
-        yield replace(account, factor=1e-6, unit="", price=account.price + 1.5)
-
-
-def of_motion(model: Model, shown: Sequence[int], trials: Sequence[Trial]) -> Iterator[Account]:
-    """Yield the accounts that kinematics may not show: of whole groups, of commands.
-
-    Args:
-        model: with the units.
-        shown: indices of the states with a sensor.
-        trials: whose largest commands suggest the unit of a part of 1.
-    """
-    n, units, sent = model.n, list(model.states.values()), list(model.inputs.values())
-    pairs = [(r.i, r.j) for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
+    n, units = model.n, [*model.states.values(), *model.inputs.values()]
+    shown, sent = range(n) if shown is None else shown, range(n, n + model.m)
+    exact = [one for one in integrals(model) if one.exact and {one.i, one.j} <= {*shown}]
+    pairs = [(one.i, one.j) for one in exact]
     alone = [(k,) for k in shown if not any(k in pair for pair in pairs)]
-    # states in another unit, all of a kind together or one that no other relates
-    turning = tuple(k for k in shown if units[k] in ("rad", "rad/s"))
-    angles = tuple(k for k in turning if units[k] == "rad")
-    also = tuple(n + j for j, unit in enumerate(sent) if unit == "rad")
-    lengths = tuple(k for k in shown if units[k].partition("/")[0] == "m")
-    single = [(k,) for k in turning if (k,) in alone or units[k] == "rad"]
-    for group in dict.fromkeys(g for g in (turning, angles, *single, angles + also) if g):
-        yield Account("unit", group, DEGREES, unit="deg", price=0.1 * len(group))
-    for group in (one for one in single if units[one[0]] == "rad/s"):
-        yield Account("unit", group, RPM, unit="rpm", price=0.1)
-    if not any(unit.partition("/")[0] == "m" for unit in sent):
-        single = [(k,) for k in lengths if (k,) in alone and units[k] == "m"]
-        for group in dict.fromkeys(g for g in (lengths, *single) if g):
-            for f in (1e3, 1e2, 1e-2, 1e-3):
-                unit = {1e3: "mm", 1e2: "cm", 1e-3: "km"}.get(f, "")
-                yield Account("unit", group, f, unit=unit, price=0.5 * (f < 1))
-    # inputs in another unit: all that share theirs, or one
-    for name in dict.fromkeys(sent):
-        same = tuple(n + j for j, unit in enumerate(sent) if unit == name)
-        most = max(
-            (float(np.abs(t.inputs[:, j - n]).max(initial=0.0)) for t in trials for j in same),
-            default=0,
-        )
-        for group in dict.fromkeys((same, *((j,) for j in same))):
-            for unit, f in units_of(name, most).items():
-                if name == "%" and most >= OVER:
-                    continue
-                account = Account("unit", group, f, unit=unit, price=0.3 * (group != same))
-                yield from _either(account) if f >= DEGREES and name != "1" else (account,)
-    # signs: of a position with its velocity, of a state that no other relates
+    rows, motion, commands = Term.ROWS, Term.MOTION, Term.COMMANDS
+    groups = dict[tuple[int, ...], Term]()
+
+    def add(terms: Term, *some: tuple[int, ...]) -> None:
+        for group in filter(None, some):
+            groups[group] = groups.get(group, Term(0)) | terms
+
+    def of(some: Collection[int], *wanted: str) -> tuple[int, ...]:
+        return tuple(k for k in some if units[k] in wanted)
+
+    # columns that one mistake concerns: one sensor's, all of a kind, all commands of a unit
+    add(commands, *((k,) for k in (*shown, *sent)), *pairs)
+    add(rows, *((k,) for k in related))
+    for stem in ("rad", "deg", "m"):
+        add(commands, of(shown, stem, f"{stem}/s"), of(shown, stem), of(shown, f"{stem}/s"))
+    turning, angles = of(shown, "rad", "rad/s"), of(shown, "rad")
+    add(motion, turning, angles, *((k,) for k in angles), angles + of(sent, "rad"))
+    add(motion, *(one for one in alone if one[0] in turning))
+    if not any(units[k].partition("/")[0] == "m" for k in sent):
+        add(motion, of(shown, "m", "m/s"), *(one for one in alone if units[one[0]] == "m"))
+    add(rows, *(one for unit in ("m", "m/s") if len(one := of(sorted(related), unit)) > 1))
+    add(motion | commands, *(of(sent, units[k]) for k in sent), *((k,) for k in sent))
+    for group, terms in groups.items():
+        yield from _units(units, group, terms, n, inputs)
+    # signs: what no other sensor relates, a position with its velocity, commands
+    for k in shown:
+        terms = commands | (rows if k in related else Term(0))
+        yield Account("sign", (k,), -1.0, price=0.3 * (not units[k].endswith("/s")), terms=terms)
     for group in sorted((*pairs, *alone)):
-        yield Account("sign", group, -1.0, price=0.5)
-    # exchanges: of inputs (one perhaps of the other sign), of joints, of two states
-    for a, b in combinations(range(n, n + model.m), 2):
-        yield Account("exchange", pairs=((a, b),))
+        yield Account("sign", group, -1.0, price=0.5, terms=motion | commands)
+    for group in dict.fromkeys((*((k,) for k in sent), *(of(sent, units[k]) for k in sent))):
+        yield Account("sign", group, -1.0, terms=commands)
+    # exchanges: of inputs (one perhaps of the other sign), of joints, of two columns
+    for a, b in combinations(sent, 2):
+        yield Account("exchange", pairs=((a, b),), terms=motion)
         for k in (a, b):
-            yield Account("exchange", (k,), -1.0, pairs=((a, b),), price=1.5)
-    exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
+            yield Account("exchange", (k,), -1.0, pairs=((a, b),), price=1.5, terms=motion)
     for p, q in combinations(exact, 2):
         if np.isclose(p.c, q.c):
-            yield Account("exchange", pairs=((p.i, q.i), (p.j, q.j)), price=0.5)
+            yield Account("exchange", pairs=((p.i, q.i), (p.j, q.j)), price=0.5, terms=motion)
     for pair in combinations(shown, 2):
-        yield Account("exchange", pairs=(pair,), price=1.0)
+        terms = motion | (rows if {*pair} <= {*related} else Term(0))
+        yield Account("exchange", pairs=(pair,), price=1.0, terms=terms)
+    for k in related:
+        yield from (Account("exchange", pairs=((k, j),), price=1.5, terms=rows) for j in sent)
+    # headings from another zero, or counted the other way
+    if plane:
+        psi, rate, *speeds = plane
+        yield Account("offset", (psi,), fitted=True, price=0.5, terms=rows)
+        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True, terms=rows)  # a compass
+        if rate >= 0:
+            yield Account("sign", (psi, rate), -1.0, price=0.5, terms=rows)
+            yield Account("sign", (psi, rate), -1.0, price=1.0, fitted=True, terms=rows)
+        if len(speeds) == 2:
+            yield Account("axes", (psi, *speeds), price=0.5, terms=rows)
+
+
+def _units(
+    units: Sequence[str], group: tuple[int, ...], terms: Term, n: int, inputs: Sequence[Array]
+) -> Iterator[Account]:
+    """Yield the units that a group of columns may be in, and the opposite mistakes.
+
+    Motion shows gross ones alone: a model may be wrong by a factor near 1.
+    """
+    first, name = group[0], units[group[0]]
+    each = [np.abs(u[:, k - n]).max(initial=0.0) for u in inputs for k in group if k >= n]
+    most = float(max(each, default=0.0))
+    alike = first >= n and len(group) == 1 and units[n:].count(name) > 1
+    price = 0.3 if alike else 0.02 * (len(group) - 1)
+    for unit, f in units_of(name, most).items():
+        if name == "%" and most >= OVER:
+            continue
+        small = 0.5 * (f < 1 and first < n)  # numbers that are too large are noticed less
+        shown = terms if max(f, 1 / f) >= RPM else terms & ~Term.MOTION
+        account = Account("unit", group, f, unit=unit, price=price + small, terms=shown)
+        yield account
+        if f in (1e3, 1e2, DEGREES) and name != "1":
+            yield replace(account, factor=1 / f, unit="", price=price + 0.5)
+        if f == 1e3 and Term.ROWS in terms:
+            for power, more in ((1e6, 1.0), (1e-6, 1.5)):
+                yield replace(account, factor=power, unit="", price=price + more, terms=Term.ROWS)
+
+
+def of_commands(model: Model, *inputs: Array) -> list[Account]:
+    """Return the units and signs of columns that the commands of a policy may show.
+
+    Kinematics can't: all that one wheel, one gyro or one encoder measures may be off together.
+    """
+    return [one for one in accounts(model, inputs=inputs) if Term.COMMANDS in one.terms]

@@ -13,7 +13,7 @@ from grounded.accounts.commands import answers_early, how_inputs_act
 from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.judge import contradicted, judge
 from grounded.accounts.sound_trials import sound_trials
-from grounded.accounts.table import DEGREES, Account, of_motion, units_of
+from grounded.accounts.table import DEGREES, Account, Term, accounts, units_of
 from shared_data import needs_data
 
 ROBOT = {name: make() for name, make in ROBOTS.items()}
@@ -217,7 +217,7 @@ def test_units_of_any_kind_have_others():
 
 def test_a_model_with_lengths_as_inputs_is_not_told_that_all_lengths_are_off():
     model = replace(ROBOT["car"].model, inputs={"throttle": "m/s", "steering": "rad"})
-    table = list(of_motion(model, range(4), []))
+    table = [one for one in accounts(model) if Term.MOTION in one.terms]
     assert not any(one.kind == "unit" and {0, 1, 3} <= one.touched for one in table)
 
 

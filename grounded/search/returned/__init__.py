@@ -2,7 +2,7 @@
 
 whose_run    START HERE: whose run a trial is
 who_drove    compares the logged commands with what the policy sends on these states
-other_scale  finds the scale of a state with which they agree
+stories      what the log, or a program, must have been for other commands; all scored at once
 clipped      finds commands that were cut inside their limits
 smoothed     finds the filter of a program that logs its states as measured
 told_trial   both checks as Python's `tell` and `learn` word them

@@ -10,12 +10,11 @@ the prediction, and the fault that brings it nearest is stated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from grounded.accounts.judge import contradicted
-from grounded.accounts.table import Account
+from grounded.accounts.table import Account, of_commands
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.candidate import Candidate
@@ -61,15 +60,13 @@ def like_predicted(own: Candidate, trial: Trial) -> bool:
 
 def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
     """Return a trial with some columns multiplied by a factor."""
-    states, inputs = (
-        np.array([factor if name in names else 1.0 for name in every])
-        for every in (trial.state_names, trial.input_names)
-    )
-    return replace(trial, states=trial.states * states, inputs=trial.inputs * inputs)
+    every = (*trial.state_names, *trial.input_names)
+    columns = tuple(every.index(name) for name in names)
+    return Account("unit", columns, 1 / factor).mended(trial) if columns else trial
 
 
 def odd_columns(
-    model: Model, own: Candidate, trial: Trial, factors: Sequence[tuple[Sequence[str], float]]
+    model: Model, own: Candidate, trial: Trial, logged: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], float]:
     """Return states in another unit or of the other sign that commands don't tell; (), 1 if none.
 
@@ -80,15 +77,19 @@ def odd_columns(
         model: with the states.
         own: the candidate that was run.
         trial: a run that resembles its prediction in most states.
-        factors: groups of states with the factors to try.
+        logged: the states that a column holds; None: all.
     """
     as_it_is = far(own, trial)
     if (known := np.isfinite(as_it_is)).sum() < 2:
         return (), 1.0
     best: tuple[tuple[str, ...], float] = (), 1.0
     least = apart(own, trial) - NEARER
-    for names, by in factors:
-        which = [i for i, name in enumerate(model.state_names) if name in names and known[i]]
+    shown = range(model.n) if logged is None else [model.state_names.index(n) for n in logged]
+    for account in of_commands(model):
+        if not {*account.columns} <= {*shown}:
+            continue
+        names, by = tuple(model.state_names[k] for k in account.columns), 1 / account.factor
+        which = [i for i in account.columns if known[i]]
         rest = [i for i in np.flatnonzero(known) if i not in which]
         if not which or not rest or (by != -1 and 1 / GROSS < abs(by) < GROSS):
             continue
@@ -99,5 +100,5 @@ def odd_columns(
         fault = Account("sign", tuple(which), -1.0)
         if by == -1 and not contradicted(model, mended, range(model.n), fault):
             continue
-        best, least = (tuple(names), float(by)), nearer
+        best, least = (names, by), nearer
     return best

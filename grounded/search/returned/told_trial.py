@@ -17,7 +17,7 @@ from grounded.findings import found
 from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import odd_columns
-from grounded.search.returned.other_scale import other_units, unit_by_factor, units_tried
+from grounded.search.returned.stories import Kind, stories, unit_by_factor
 from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -37,12 +37,14 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
     if whole.finite_steps < 1 and (unknown := _unknown(trial)):
         return found("log.unknown", *unknown).what
     seen = suspicion(task, whole, own, candidates)
-    names, by = ((), 1.0) if seen.other else other_units(task, whole, own, seen.ran)
+    some = [] if seen.other else stories(task, own, whole, seen.ran)
+    units = [(one.names, one.by) for one in some if one.kind is Kind.UNIT]
+    names, by = units[0] if units else ((), 1.0)
     if unit := unit_by_factor(model, names, by):  # the columns may agree with each other
         return scaled(model, names, 1 / by, unit).also(ran=own.id).what
     columns = _odd_columns(model, whole) if first else ""
     if not columns and not names and not seen.why:
-        odd, by = odd_columns(model, own, whole, list(units_tried(model)))
+        odd, by = odd_columns(model, own, whole)
         if odd:
             return scaled(model, odd, 1 / by).what
     if columns or not seen.why:

@@ -25,6 +25,7 @@ DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1
 SAME, CLEAR = 0.5, 0.01  # shares: of another difference, and of an input, that count as none
 OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
+DIGITS = 1e-5  # of an input's size: smaller differences are rounding
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 FOREIGN = 0.5  # of the squared difference of unrelated commands: from here on nothing is alike
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
@@ -148,6 +149,22 @@ def commanded(policy: Policy, trial: Trial, past: Array | None = None) -> Comman
     asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
     return Commanded(sent, asked, past, size)
+
+
+def as_sent(policy: Policy, trial: Trial) -> bool:
+    """Return whether a run's commands are its policy's on the logged states, to the last digits.
+
+    Then no other story of them is asked for.
+
+    Args:
+        policy: of its candidate.
+        trial: the run; one with gaps, or of other signals, is not.
+    """
+    names = (policy.state_names, policy.input_names)
+    if (trial.state_names, trial.input_names) != names or trial.finite_steps < LEAST:
+        return False
+    run = commanded(policy, trial)
+    return bool((np.abs(run.asked - run.sent) < DIGITS * run.size).all())
 
 
 def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from grounded.accounts.inputs import limits_of, span
 from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import Candidate
-from grounded.search.returned.misused import misused
+from grounded.search.returned.stories import Kind, stories
 from grounded.search.returned.who_drove import (
     CLEAR,
     DECISIVE,
@@ -58,8 +58,9 @@ def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candida
     if ran.alike:
         return Suspicion(ran)
     known = trial.inputs.any() and not ran.beyond  # else nothing was recorded, or another unit
-    if known and (done := misused(task, own, trial, ran)):
-        return Suspicion(ran, done[1].finding)
+    for story in stories(task, own, trial, ran) if known else ():
+        if story.kind is Kind.PROGRAM:
+            return Suspicion(ran, story.finding)
     moves = np.ptp(own.policy.feedforward, axis=0) > 0
     silent = moves & ~(trial.inputs != 0).any(axis=0)
     if silent.any():

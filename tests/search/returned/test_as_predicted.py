@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.search.returned.as_predicted import apart, like_predicted, multiplied, odd_columns
-from grounded.search.returned.other_scale import other_units, units_tried
+from grounded.search.returned.stories import Kind, stories
 from grounded.search.returned.who_drove import follows
 from recorded import waiting
 
@@ -22,13 +22,19 @@ def made(tmp_path_factory):
 
 def said(made, trial):
     task, own, _ = made
-    return odd_columns(task.model, own, trial, list(units_tried(task.model)))
+    return odd_columns(task.model, own, trial)
+
+
+def units(task, run, own, plain):
+    """The columns of a log that are in another unit, and the factor to correct them."""
+    some = stories(task, own, run, plain)
+    return next(((one.names, one.by) for one in some if one.kind is Kind.UNIT), ((), 1.0))
 
 
 def test_a_sound_run_is_near_its_prediction_and_no_column_is_odd(made):
     task, own, run = made
     assert like_predicted(own, run) and said(made, run) == ((), 1.0)
-    assert other_units(task, run, own, follows(own.policy, run, 1)) == ((), 1.0)
+    assert units(task, run, own, follows(own.policy, run, 1)) == ((), 1.0)
 
 
 @pytest.mark.parametrize("by", [1e3, 1e-3, 180 / np.pi, -1.0])
@@ -46,7 +52,7 @@ def test_a_factor_of_the_commands_is_told_where_it_explains_all_of_a_small_diffe
     task, own, _ = made
     exact = own.predicted_run
     wrong = multiplied(exact, ["force"], factor)
-    names, by = other_units(task, wrong, own, follows(own.policy, wrong, 1))
+    names, by = units(task, wrong, own, follows(own.policy, wrong, 1))
     assert names == ("force",) and by == pytest.approx(1 / factor, rel=0.01)
 
 

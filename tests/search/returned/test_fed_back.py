@@ -8,7 +8,7 @@ import pytest
 
 import grounded as gr
 from grounded.onboard import Runner
-from grounded.search.returned.other_scale import other_units, unit_by_factor
+from grounded.search.returned.stories import Kind, stories, unit_by_factor
 from grounded.search.returned.who_drove import follows, latest
 
 MODEL = gr.Model(
@@ -33,7 +33,8 @@ TASK = gr.Task(
 def found(task, candidate, trial):
     """The signals and the factor with which a trial is the candidate's run."""
     plain = follows(candidate.policy, trial, latest(task))
-    return other_units(task, trial, candidate, plain)
+    some = stories(task, candidate, trial, plain)
+    return next(((one.names, one.by) for one in some if one.kind is Kind.UNIT), ((), 1.0))
 
 
 def robot(candidate, units=1.0, noise=0.0, late=0):

@@ -8,9 +8,10 @@ import pytest
 from facts import holds, of_code
 from grounded import Model
 from grounded.accounts.reported import scaled
+from grounded.accounts.table import of_commands
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded.search.returned.other_scale import other_units, unit_by_factor, units_tried
+from grounded.search.returned.stories import Kind, stories, unit_by_factor
 from grounded.search.returned.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -100,9 +101,9 @@ def test_an_encoder_of_one_joint_the_other_way_round_is_tried(tmp_path):
         inputs={"ta": "N m", "tb": "N m", "fan": "1"},
         derivative=lambda s, a, p: {"a": s.va, "b": s.vb, "va": a.ta, "vb": a.tb - s.vb},
     )
-    tried = {(tuple(names), factor) for names, factor in units_tried(arm)}
-    assert {(("a", "va"), -1.0), (("b", "vb"), -1.0)} <= tried
-    assert {(("ta", "tb"), 1e-3), (("ta", "tb"), 1e3)} <= tried
+    tried = {(one.columns, one.factor) for one in of_commands(arm)}
+    assert {((0, 2), -1.0), ((1, 3), -1.0)} <= tried
+    assert {((4, 5), 1e-3), ((4, 5), 1e3)} <= tried
 
 
 def test_centimetres_are_tried_and_are_no_percent():
@@ -111,8 +112,8 @@ def test_centimetres_are_tried_and_are_no_percent():
         inputs={"throttle": "1"},
         derivative=lambda s, a, p: {"x": s.v, "v": a.throttle - s.v},
     )
-    tried = {(tuple(names), factor) for names, factor in units_tried(cart)}
-    assert {(("x", "v"), 1e-2), (("x",), 1e-2)} <= tried
+    tried = {(one.columns, one.factor) for one in of_commands(cart)}
+    assert {((0, 1), 1e2), ((0,), 1e2)} <= tried
     assert unit_by_factor(cart, ("x", "v"), 1e-2) == "cm"
     assert unit_by_factor(cart, ("throttle",), 1e-2) == "percent"
     assert unit_by_factor(cart, ("x", "throttle"), 1e-2) == ""
@@ -131,7 +132,8 @@ def test_other_driving_is_no_factor(driven, seed):
     odd = replace(trial, inputs=by_hand)
     plain = follows(own.policy, odd, latest(w.task))
     assert plain is not None
-    assert other_units(w.task, odd, own, plain) == ((), 1.0)
+    some = stories(w.task, own, odd, plain)
+    assert not [one for one in some if one.kind is Kind.UNIT]
 
 
 @pytest.mark.parametrize("before", [0.7])

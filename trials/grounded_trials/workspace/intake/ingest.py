@@ -21,6 +21,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Tried
+from grounded.search.returned.who_drove import as_sent
 from grounded.search.safety import COASTS
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -50,7 +51,6 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     others_differ,
     repeated,
 )
-from grounded_trials.workspace.intake.recognising.recognise import best_run_again, recognised
 from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise, swung
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
@@ -153,9 +153,14 @@ def ingest_log(
         try:
             read = read_log_file(workspace, path, candidate, data, sent_before)
         except NoneWaits as error:
+            from grounded_trials.workspace.intake.recognising.recognise import best_run_again
+
             read = best_run_again(workspace, path, error)
     read = copied(workspace, path, read, "" if data else candidate)
-    read = recognised(workspace, path, read, candidate)
+    if not _as_logged(workspace, read):
+        from grounded_trials.workspace.intake.recognising.recognise import recognised
+
+        read = recognised(workspace, path, read, candidate)
     if read.log:
         read = read.telling(*estimated_otherwise(workspace, read.log))
     if read.log and read.log.stored:
@@ -172,6 +177,15 @@ def ingest_log(
             new.enter_context(workspace.notes.adding(note, again=True))
         workspace.forget_trials()
         return _judged(workspace, read, added, before, ahead=ahead)
+
+
+def _as_logged(workspace: Folder, read: Read) -> bool:
+    """Return whether a trial is data, or its commands are its candidate's to the last digits.
+
+    No other story of it is asked for then. Of a foreign log it must be found where the run begins.
+    """
+    ran = read.trial.candidate
+    return not ran or (read.own and as_sent(workspace.candidate(ran)[0].policy, read.trial))
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:

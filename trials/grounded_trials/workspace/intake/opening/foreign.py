@@ -30,6 +30,7 @@ from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, StoredTrial
 from grounded_trials.workspace.intake.locating.run_start import Recording, recording
+from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
@@ -323,3 +324,9 @@ def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
         yield found("log.slow", *(one.name for one in slow), every=every, dt=dt)
     if grid.row_s > dt / 20:
         yield found("log.rows", every=grid.row_s, half=grid.row_s / 2)
+
+
+def misread(log: ForeignLog) -> list[Finding]:
+    """Return the signals that are read from each other's column, or angles from something else."""
+    model = log.workspace.base_model
+    return [*crossed(model, log.mapping), *no_angles(model, log.mapping)]

@@ -39,7 +39,6 @@ from grounded_trials.workspace.identity import (
     other_task,
     sha256,
 )
-from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.stored_before import (
     Aside,
     refuse_as_another,
@@ -210,7 +209,7 @@ def read_log_file(
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
     """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
-    from grounded_trials.workspace.intake.opening.foreign import begun
+    from grounded_trials.workspace.intake.opening.foreign import begun, misread
 
     trial, grid = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
@@ -245,12 +244,6 @@ def cut_short(read: Read, steps: int, fell: Finding | None = None) -> Read:
     about = _about(workspace, trial.candidate) | read.log.source
     data = _encode(workspace, trial, about, read.cut.start_ns)
     return replace(read, trial=trial, data=data).telling(*([fell] if fell else []))
-
-
-def misread(log: ForeignLog) -> list[Finding]:
-    """Return the signals that are read from each other's column, or angles from something else."""
-    model = log.workspace.base_model
-    return [*crossed(model, log.mapping), *no_angles(model, log.mapping)]
 
 
 class NoneWaits(GroundedError):

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -25,7 +25,9 @@ from grounded_trials.workspace.candidates.exported_files import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
-from grounded_trials.workspace.intake.opening.foreign import ForeignLog
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
 LEAST = 10  # rows that two recordings must share to count as the same

@@ -19,9 +19,8 @@ from grounded.result import figure, with_unit
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import Clipped, clipped
-from grounded.search.returned.misused import NEARLY_ALL, Way, likeliest, misused, ways
-from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.who_drove import Commanded, commanded, follows, latest
+from grounded.search.returned.stories import NEARLY_ALL, Kind, Story, Way, scored, ways
+from grounded.search.returned.who_drove import Commanded, commanded, follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
@@ -33,14 +32,12 @@ from grounded_trials.workspace.intake.locating.run_start import (
     Start,
     least_of,
 )
-from grounded_trials.workspace.intake.recognising.stories import Kind, Story, scored
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
 ORIGIN = 0.05  # share of the commands' difference that offsets of states may leave
 MOSTLY = 0.9  # least share of the steps in which cut commands are near what is logged
 MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
-SMOOTHED = 1.0  # [nats] that a filter costs before a log is seen
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
 
 
@@ -60,8 +57,6 @@ def misuses(log: Recording, task: Task, own: Candidate, start: Start | None) -> 
         if run := log.trial_from(log.on_step(own.policy, log.openings[0])):
             yield scored(Kind.PROGRAM, finding, rest, run, error)
     yield from cut_in(log, own, start)
-    if log.whole.inputs.any():
-        yield from misused_in(log, task, own)
     yield from other_origin(log, task.model, own)
 
 
@@ -83,28 +78,8 @@ def exactly_misused(log: Recording, task: Task, own: Candidate) -> Iterator[Stor
         if left < EXACT and run and apart(own, run) <= apart(own, way.passed(run)):
             some.append((left, way, run))  # else rather the log is wrong
     if some:
-        left, way, run = likeliest(some)
+        left, way, run = min(some, key=lambda one: (-len(one[1].names), one[0]))
         yield scored(Kind.PROGRAM, way.finding, own, run, left)
-
-
-def misused_in(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
-    """Yield how the robot's program misused its candidate, and the remedy.
-
-    Args:
-        log: a log in which no run of the candidate was found: its commands don't tell where.
-        task: the task with the control step.
-        own: the candidate.
-    """
-    acts = not np.allclose(log.whole.inputs, own.policy.past, rtol=0, atol=1e-9)
-    for begins in dict.fromkeys([log.first, *log.openings[:TRIED]]):
-        if trial := log.trial_from(begins):
-            run = trial.until(min(trial.finite_steps, task.horizon))
-            plain = follows(own.policy, run, latest(task))
-            if plain and not plain.beyond and (one := misused(task, own, run, plain, acts=acts)):
-                yield scored(Kind.PROGRAM, one[1].finding, own, run, one[0])
-            if smooth := smoothed(task.model, own, run):
-                told = smooth.finding(own)
-                yield scored(Kind.PROGRAM, told, own, run, smooth.left, price=SMOOTHED)
 
 
 def other_origin(log: Recording, model: Model, own: Candidate) -> Iterator[Story]:

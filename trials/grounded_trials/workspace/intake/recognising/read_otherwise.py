@@ -5,43 +5,33 @@ Tried are: another rate, another unit, two signals in each other's columns, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from grounded.accounts.judge import contradicted
+from grounded.accounts.table import Account, of_commands
 from grounded.findings import Quantity, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import apart, like_predicted, multiplied
-from grounded.search.returned.other_scale import (
-    NEARLY,
-    THOUSAND,
-    any_factor,
-    any_offset,
-    full_scales,
-    of_full_scale,
-    unit_by_factor,
-    units_tried,
-)
-from grounded.search.returned.who_drove import Following, follows, latest
+from grounded.search.returned.as_predicted import apart, like_predicted
+from grounded.search.returned.smoothed import smoothed
+from grounded.search.returned.stories import ANY, NEARLY, Kind, Story, full_scales, scored, stories
+from grounded.search.returned.who_drove import follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.locating.missed_steps import begins_late
 from grounded_trials.workspace.intake.locating.run_start import TRIED, Recording, recording
-from grounded_trials.workspace.intake.recognising.stories import Kind, Story, scored
-
-if TYPE_CHECKING:
-    from grounded.accounts.table import Account
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 PACES = (2.0, 0.5)  # rates of a recording that are tried
-ANY, EXCHANGED = 1.0, 0.5  # [nats] that a factor costs which is no unit, and an exchange
+EXCHANGED = 0.5  # [nats] that an exchange costs
 
-Proven = Callable[["Account"], Sequence[str]]  # trials, read by the same [log], without a fault
+Proven = Callable[[Account], Sequence[str]]  # trials, read by the same [log], without a fault
 
 
 def otherwise(log: Recording, task: Task, own: Candidate, proven: Proven) -> Iterator[Story]:
@@ -55,16 +45,28 @@ def otherwise(log: Recording, task: Task, own: Candidate, proven: Proven) -> Ite
     """
     yield from _at_other_rates(log, task, own)
     yield from _in_other_units(log, task, own)
-    if not log.whole.inputs.any():
-        return
-    if swap := exchanged_in(log, task, own, proven):
-        yield swap
-    if late := begun_late(log, own):
-        yield late
-    for begins in (log.first, *log.openings[:TRIED]):
-        if (trial := log.trial_from(begins)) and (off := offset_in(log, task, own, trial)):
-            yield off
-            return
+    if log.whole.inputs.any():
+        yield from filter(None, (exchanged_in(log, task, own, proven), begun_late(log, own)))
+
+
+def at_each_start(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
+    """Yield the stories of the part of a log that begins where its run may.
+
+    Args:
+        log: a log in which no run of the candidate was found: its commands don't tell where.
+        task: the task with the control step.
+        own: the candidate.
+    """
+    acts = not np.allclose(log.whole.inputs, own.policy.past, rtol=0, atol=1e-9)
+    logged = [name for name in task.model.state_names if name in log.logged]
+    for begins in dict.fromkeys([log.first, *log.openings[:TRIED]]):
+        if (trial := log.trial_from(begins)) is None:
+            continue
+        run = trial.until(min(trial.finite_steps, task.horizon))
+        plain = follows(own.policy, run, latest(task))
+        yield from stories(task, own, run, plain, acts=acts, logged=logged)
+        if smooth := smoothed(task.model, own, run):
+            yield scored(Kind.PROGRAM, smooth.finding(own), own, run, smooth.left, price=ANY)
 
 
 def _at_other_rates(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
@@ -80,39 +82,36 @@ def _at_other_rates(log: Recording, task: Task, own: Candidate) -> Iterator[Stor
 
 def _in_other_units(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
     """Yield the signals and factors with which a log contains a run."""
-    fits, tried = False, set[tuple[tuple[str, ...], float]]()
-    for group, by in (*full_scales(task, log.whole.inputs), *units_tried(task.model)):
-        names = tuple(name for name in group if name in log.logged)
-        if not names or (names, by) in tried:
-            continue
-        tried.add((names, by))
-        scaled = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
-        run = _run_in(recording({**log.logged, **scaled}, task, log.complete), own.policy)
-        fit = run and follows(own.policy, run.until(own.policy.horizon), 0)
-        if run and fit and fit.error < NEARLY and _nearer(own, run, multiplied(run, names, 1 / by)):
-            fits = True
-            yield scored(Kind.UNIT, None, own, run, fit.error, names=names, by=by)
-    for begins in log.openings[:TRIED] if not fits else ():
-        if trial := log.trial_from(begins):
-            names, by = any_factor(task, own, trial)
-            if names:
-                yield in_unit(task, own, trial, names, by)
-                return
+    every = (*task.model.state_names, *task.model.input_names)
+    tried = dict.fromkeys(
+        (*full_scales(task, log.whole.inputs), *of_commands(task.model, log.whole.inputs))
+    )
+    for account in tried:
+        names, by = tuple(every[k] for k in account.columns), 1 / account.factor
+        if {*names} <= {*log.logged}:
+            some = {n: replace(log.logged[n], values=log.logged[n].values * by) for n in names}
+            if its := _read_as(log, task, own, some):
+                run, error, _ = its
+                yield scored(Kind.UNIT, None, own, run, error, names=names, by=by)
 
 
-def in_unit(task: Task, own: Candidate, trial: Trial, names: tuple[str, ...], by: float) -> Story:
-    """Return the story that columns of a trial have to be multiplied by a factor."""
-    run, model = multiplied(trial, names, by), task.model
-    fit = follows(own.policy, run.until(task.horizon), latest(task))
-    known = by in (*THOUSAND, -1.0) or unit_by_factor(model, names, by)
-    price = 0.0 if known or of_full_scale(task, names, by) else ANY
-    error = fit.error if fit else 1.0
-    return scored(Kind.UNIT, None, own, run, error, price=price, names=names, by=by)
+def _read_as(
+    log: Recording, task: Task, own: Candidate, changed: Mapping[str, Series]
+) -> tuple[Trial, float, float] | None:
+    """Return the run in a log with other columns, what is left of its commands, and its start.
 
-
-def _nearer(own: Candidate, run: Trial, as_logged: Trial | None) -> bool:
-    """Return whether a log without a fault is not farther from the prediction than as logged."""
-    return as_logged is None or apart(own, run) <= apart(own, as_logged)
+    None if there is none, or if it is farther from its prediction than as it was logged.
+    """
+    other = recording({**log.logged, **changed}, task, log.complete)
+    begun = other.start_of(own.policy, only_alike=True) if other else None
+    run = other.trial_from(begun.seconds) if other and begun and begun.alike else None
+    fit = follows(own.policy, run.until(own.policy.horizon), 0) if run else None
+    if not begun or not run or not fit or fit.error >= NEARLY:
+        return None
+    as_logged = log.trial_from(begun.seconds)
+    if as_logged is not None and apart(own, run) > apart(own, as_logged):
+        return None
+    return run, fit.error, begun.seconds
 
 
 def begun_late(log: Recording, own: Candidate) -> Story | None:
@@ -145,16 +144,10 @@ def exchanged_in(
     for a, b in (*inputs, *list(combinations(states, 2))[:PAIRS]):
         one, other = log.logged[a], log.logged[b]
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
-        if (mended := recording({**log.logged, **back}, task, log.complete)) is None:
-            continue
-        begun = mended.start_of(policy, only_alike=True)
-        run = mended.trial_from(begun.seconds) if begun and begun.alike else None
-        fit = run and follows(policy, run.until(policy.horizon), 0)
-        if not begun or not run or not fit or not fit.error < NEARLY:
-            continue
-        if _nearer(own, run, log.trial_from(begun.seconds)):
-            story = scored(Kind.LOG, None, own, run, fit.error, price=EXCHANGED, names=(a, b))
-            some.append((story, begun.seconds))
+        if its := _read_as(log, task, own, back):
+            run, error, begins = its
+            story = scored(Kind.LOG, None, own, run, error, price=EXCHANGED, names=(a, b))
+            some.append((story, begins))
     if not some:
         return None
     best, begins = min(some, key=lambda one: one[0].left)
@@ -170,9 +163,6 @@ def _in_other_column(
     program passed them to the policy, or on to the motors, in each other's place. (With both [log]
     and the wires exchanged a log looks the same, unless [log] read earlier trials well.)
     """
-    from grounded.accounts.judge import contradicted
-    from grounded.accounts.table import Account
-
     (a, b), model = story.names, task.model
     every = (*model.state_names, *model.input_names)
     fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
@@ -182,30 +172,6 @@ def _in_other_column(
     parts = "states" if a in model.state_names else "outputs"
     told = found("run.exchanged", a, b, parts=parts, moved="as the log says", **facts)
     return replace(story, finding=told, rerun=True)
-
-
-def offset_in(
-    log: Recording, task: Task, own: Candidate, trial: Trial, plain: Following | None = None
-) -> Story | None:
-    """Return that a state of a log is off by a constant from what its program measured, or None.
-
-    Args:
-        log: the log.
-        task: the task.
-        own: the candidate.
-        trial: its run, as far as the commands tell.
-        plain: the comparison of its commands, if it is known.
-    """
-    names = [name for name in task.model.state_names if name in log.logged]
-    plain = plain or follows(own.policy, trial.until(task.horizon), latest(task))
-    if (off := any_offset(task, own, trial, names, plain)) is None:
-        return None
-    name, by, error = off
-    size, unit = "large" if by > 0 else "small", task.model.states[name]
-    told = found("log.zero", name, ran=own.id, size=size, off=Quantity(abs(by), unit))
-    told = told.also(add=-by, tables=(f"[log.state.{name}]",))
-    moved = np.where(np.isin(trial.state_names, name), trial.states - by, trial.states)
-    return scored(Kind.LOG, told, own, replace(trial, states=moved), error, price=ANY)
 
 
 def _run_in(log: Recording | None, policy: Policy) -> Trial | None:

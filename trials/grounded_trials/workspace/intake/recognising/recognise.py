@@ -23,14 +23,16 @@ from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import apart, odd_columns
-from grounded.search.returned.misused import without_feedback
-from grounded.search.returned.other_scale import (
-    THOUSAND,
+from grounded.search.returned.as_predicted import apart, multiplied, odd_columns
+from grounded.search.returned.stories import (
+    Kind,
+    Story,
+    fed_nothing,
+    likeliest,
     of_full_scale,
-    other_units,
+    scored,
+    stories,
     unit_by_factor,
-    units_tried,
 )
 from grounded.search.returned.who_drove import FINE, follows, latest
 from grounded.search.returned.whose_run import OTHERS
@@ -40,28 +42,21 @@ from grounded_trials.workspace.candidates.search_state import latest_candidates,
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.intake.locating.run_start import Recording
+from grounded_trials.workspace.intake.opening.foreign import misread
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
     cut_log,
     cut_short,
     is_stored,
-    misread,
     read_log_file,
 )
 from grounded_trials.workspace.intake.recognising.look import Look
-from grounded_trials.workspace.intake.recognising.misused_run import misused_in, misuses
+from grounded_trials.workspace.intake.recognising.misused_run import misuses
 from grounded_trials.workspace.intake.recognising.read_otherwise import (
+    at_each_start,
     exchanged_in,
-    in_unit,
-    offset_in,
     otherwise,
-)
-from grounded_trials.workspace.intake.recognising.stories import (
-    Kind,
-    Story,
-    likeliest,
-    scored,
 )
 from grounded_trials.workspace.intake.remarks.control_loop import old_samples
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
@@ -239,17 +234,16 @@ def _of_trial(case: Case) -> Iterator[Story]:
     task, own, whole, ran = case.task, case.own, case.whole, case.seen.ran
     if case.rival:
         return
-    names, by = other_units(task, whole, own, ran)
-    if names and not case.guessed & {*names}:
-        yield in_unit(task, own, whole, names, by)
-    elif case.log and not case.seen.why:
-        logged = {name for name in task.model.state_names if name not in case.guessed}
-        tried = [(names, f) for names, f in units_tried(task.model) if {*names} <= logged]
-        names, by = odd_columns(task.model, own, whole, tried)
+    logged = [name for name in task.model.state_names if name not in case.guessed]
+    some = stories(task, own, whole, ran, logged=logged)
+    some = [one for one in some if one.kind is Kind.UNIT or (one.kind is Kind.LOG and case.log)]
+    yield from (one for one in some if one.kind is Kind.UNIT or not (case.named or case.seen.why))
+    if case.log and not case.seen.why and not some:
+        names, by = odd_columns(task.model, own, whole, logged)
         if names:
-            yield in_unit(task, own, whole, names, by)
-        elif not case.named and (off := offset_in(case.log, task, own, whole, ran)):
-            yield off
+            run = multiplied(whole, names, by)
+            fit = follows(own.policy, run.until(task.horizon), latest(task))
+            yield scored(Kind.UNIT, None, own, run, fit.error if fit else 1.0, names=names, by=by)
 
 
 def _of_log(case: Case) -> Iterator[Story]:
@@ -265,6 +259,7 @@ def _of_log(case: Case) -> Iterator[Story]:
         yield scored(Kind.FELL, fell[1], own, part, FINE * float(error), price=SHORTER)
     if log:
         yield from otherwise(log, task, own, case.proven)
+        yield from at_each_start(log, task, own)
         yield from misuses(log, task, own, case.look.found)
     if dead := [one for one in case.columns if one.code == "log.dead"]:
         names = [name for one in dead for name in one.about]
@@ -319,8 +314,9 @@ def _in_unit(case: Case, story: Story) -> Story:
     """Return the story of columns times a factor: in the log, or by the robot's program."""
     names, by, model = story.names, story.by, case.task.model
     its = case.log if _in_programs_unit(model, names, by) else None
-    if its and (how := next(misused_in(its, case.task, case.own), None)):
-        return how
+    for how in at_each_start(its, case.task, case.own) if its else ():
+        if how.kind is Kind.PROGRAM:
+            return how
     facts: dict[str, Any] = {"ran": case.ran}
     if shown := sent_otherwise(case.workspace, case.whole, names, by):
         told = found("run.sends", *names, times=1 / by, **facts, **shown)
@@ -397,7 +393,7 @@ def sent_otherwise(
         return {"proven": tuple(right)} if right else {}
     unit = unit_by_factor(model, names, by) or of_full_scale(task, names, by)
     runs = tuple(one.id for one in workspace.task_trials(measured=True) if one.candidate)
-    return {"proven": runs} if runs and not unit and by not in THOUSAND else {}
+    return {"proven": runs} if runs and not unit and by not in (1e-3, 1e3) else {}
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
@@ -459,7 +455,7 @@ def _unlike(case: Case) -> Finding | None:
     It was driven without its candidate's feedback, little disturbed; or it is another workspace's.
     """
     ran = case.seen.ran
-    if ran is not None and without_feedback(case.own, case.whole, ran):
+    if ran is not None and fed_nothing(case.own, case.whole, ran):
         return found("run.unfed", ran=case.ran, weight=Weight.WARN)
     if not case.read.bare or ran is None or np.nanmax(np.abs(ran.off) / ran.fine) < EXACT:
         return None

@@ -31,6 +31,7 @@ from grounded.search.returned.who_drove import (
     LEAST,
     UNLIKE,
     Following,
+    as_sent,
     commanded,
     follows,
     latest,
@@ -58,6 +59,8 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     if not trial.candidate:
         return None
     own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
+    if as_sent(own.policy, whole):
+        return None
     if cut := clipped(own, whole):
         return cut.finding(own)
     if one := steps_skipped(workspace.task, own, whole):
