@@ -17,8 +17,8 @@ from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.recognising.misused_run import (
     exactly_misused,
-    misused_in,
 )
+from grounded_trials.workspace.intake.recognising.read_otherwise import at_each_start
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])
@@ -128,7 +128,7 @@ def test_degrees_are_named_though_somebody_else_drove_first(seed):
 def test_another_policy_at_its_limits_is_no_misuse(seed):
     ran, own = candidate(6 * HAND, 2), candidate((2 + 0.5 * seed) * HAND, 3)
     task, log = log_of(balanced(ran, seed))
-    assert not [*exactly_misused(log, task, own), *misused_in(log, task, own)]
+    assert not [*exactly_misused(log, task, own), *at_each_start(log, task, own)]
 
 
 def test_commands_at_the_same_limit_make_neither_of_two_policies_likelier():
