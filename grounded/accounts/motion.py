@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.frozen import Array, white_noise
+from grounded.frozen import Array, median, white_noise
 from grounded.model import Model
 from grounded.places import motion, true_values
 from grounded.rollout import stepper
@@ -68,7 +68,7 @@ def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
         known = np.isfinite(moved).all(axis=0)
         if len(moved) < LEAST or not known.any():
             return seconds
-        if np.median((moved.std(axis=0) / noise)[known]) > LOUD:
+        if median((moved.std(axis=0) / noise)[known]) > LOUD:
             return seconds
     return HORIZONS[-1]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.frozen import Array
+from grounded.frozen import Array, median
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
 from grounded.trial import Trial
@@ -79,7 +79,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     for late in range(-1, min(latest, T - LEAST) + 1):
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
         squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
-        usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
+        usual, mean = median(squares.T), squares.mean(axis=1)
         for back, score in enumerate(usual + 1e-3 * mean):  # robust to a takeover in some steps
             fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
@@ -103,7 +103,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
     # > 0: commands are only alike due to clipping, or most are not of this input
-    past_limits = np.maximum(beyond.mean(axis=0) - width, np.median(beyond, axis=0) - OUT * width)
+    past_limits = np.maximum(beyond.mean(axis=0) - width, median(beyond) - OUT * width)
     sane = not (past_limits > 0).any()
     alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(

@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
@@ -27,7 +27,6 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
-from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
@@ -42,7 +41,6 @@ from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
     copied,
-    read_log_file,
     read_own_trial,
 )
 from grounded_trials.workspace.intake.opening.stored_before import (
@@ -60,6 +58,9 @@ from grounded_trials.workspace.intake.remarks.trial_check import checked
 from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
 from grounded_trials.workspace.unknown_id import refuse_ids
+
+if TYPE_CHECKING:
+    from grounded_trials.logs.signal_report import SignalReport
 
 FARTHER = 2.0  # times as far as was told: a robot that moves on after its run is told again
 FAULTS = (*COLUMNS, "run.exchanged")  # the next plan would be based on wrong columns
@@ -150,6 +151,8 @@ def ingest_log(
     if kind == TRIAL:
         read = read_own_trial(workspace, path, candidate, data)
     else:
+        from grounded_trials.workspace.intake.opening.cutting import read_log_file
+
         try:
             read = read_log_file(workspace, path, candidate, data, sent_before)
         except NoneWaits as error:

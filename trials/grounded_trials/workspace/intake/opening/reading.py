@@ -1,4 +1,4 @@
-"""Read a file, a trial written by grounded or a log, before it is checked what it ran.
+"""Read a trial written by grounded, before it is checked what it ran; `cutting` reads logs.
 
 A trial written by grounded must have this workspace's model, time grid and task. If it contains the
 policy that it ran, that must equal this workspace's candidate to the last bit.
@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from grounded.checks import refused, same_dt, same_names
@@ -19,10 +18,6 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.trial import Trial
 from grounded.units import same_unit
-from grounded_trials.formats.text_tables import table_remarks
-from grounded_trials.logs.log_files import log_files
-from grounded_trials.logs.resample import Gridded
-from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS
@@ -32,26 +27,22 @@ from grounded_trials.workspace.candidates.standing_without import asked_again
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
-    INTERPOLATED,
     LASTED,
     READ_BY,
-    ROWS,
     other_task,
     sha256,
 )
 from grounded_trials.workspace.intake.opening.stored_before import (
     Aside,
     refuse_as_another,
-    refuse_known_data,
     same_recording,
-    set_aside_of,
 )
-from grounded_trials.workspace.where_to_mend import twice_in_time
 
 if TYPE_CHECKING:
+    from grounded_trials.logs.resample import Gridded
+    from grounded_trials.logs.signal_report import SignalReport
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
-SLIGHT = 0.002  # of a control step, by which interpolated states may be early
 HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
 
 
@@ -97,11 +88,6 @@ class Read:
         return {"unknown": longest.name, "gap": Quantity(longest.largest_gap_s, "s")}
 
 
-def as_finding(said: Finding | str, code: str) -> Finding:
-    """Return what another room says as a finding, under a code if it is a text still."""
-    return found(code, said) if isinstance(said, str) else said
-
-
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:
     """Read a trial written by grounded; its names, time grid and task must be this workspace's.
 
@@ -123,19 +109,19 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         if not trial.candidate:
             return Read(trial, content)
         kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, LASTED, READ_BY)
-        about = {k: v for k, v in meta.items() if k in kept}
-        about |= {"kind": "data", "ran": trial.candidate}
+        kept_of = {k: v for k, v in meta.items() if k in kept}
+        kept_of |= {"kind": "data", "ran": trial.candidate}
         some = _elsewhere(workspace, trial.candidate, policy)
         trial = replace(trial, candidate="")
-        return Read(trial, _encode(workspace, trial, about), some)
+        return Read(trial, encode(workspace, trial, kept_of), some)
     if candidate is not None and trial.candidate not in ("", candidate):
         raise refused("log.another", log=str(path), ran=candidate, other=trial.candidate)
     if trial.candidate:
-        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+        check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
         return Read(trial, content, bare=policy is None)
-    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
-    _check_candidate(workspace, path, trial.candidate)
-    return Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
+    trial = replace(trial, candidate=candidate or outstanding(workspace, path))
+    check_candidate(workspace, path, trial.candidate)
+    return Read(trial, encode(workspace, trial, about(workspace, trial.candidate)))
 
 
 def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
@@ -155,7 +141,7 @@ def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple
     return (found("log.elsewhere", candidate),)
 
 
-def _check_candidate(
+def check_candidate(
     workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
 ) -> None:
     """Check that a candidate is of this workspace and task, and the policy equals its file.
@@ -174,78 +160,6 @@ def _check_candidate(
         raise refused("log.foreign_run", path, ran=candidate, what="policy")
 
 
-def read_log_file(
-    workspace: Folder,
-    path: Path,
-    candidate: str | None,
-    data: bool,
-    sent_before: Mapping[str, float] = MappingProxyType({}),
-) -> Read:
-    """Read a foreign log through [log]; `sent_before`: inputs' values until their first samples.
-
-    Raises:
-        GroundedError: if it can't be mapped or sampled, if no candidate is outstanding, or if [log]
-            removes a delay that the model has as well.
-    """
-    from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-
-    if twice := twice_in_time(workspace):
-        raise GroundedError(twice)
-    log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
-    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
-    refuse_as_another(workspace, path, log.stored, "" if data else candidate)
-    if not (data or ran):
-        refuse_known_data(workspace, path, log.stored, None)
-    before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
-    if before and before.candidate in workspace.candidate_ids():
-        ran = before.candidate
-    chosen = "" if data else ran or _outstanding(workspace, path)
-    if chosen:
-        refuse_as_another(workspace, path, log.stored, chosen)
-        _check_candidate(workspace, path, chosen)
-    read = cut_log(log, chosen)
-    return replace(read, before=before) if before and chosen == ran else read
-
-
-def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
-    """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
-    from grounded_trials.workspace.intake.opening.foreign import begun, misread
-
-    trial, grid = log.cut(candidate, start)
-    about = _about(log.workspace, candidate) | log.source
-    about |= {ROWS: f"{grid.row_s:.6g}"} if grid.row_s and not candidate else {}
-    early = grid.interpolated_s / trial.dt > SLIGHT
-    about |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
-    encoded = _encode(log.workspace, trial, about, grid.start_ns)
-    remarks = [text for file in log_files(log.path) for text in table_remarks(file)]
-    return Read(
-        trial,
-        encoded,
-        (
-            *misread(log),
-            *log.unlike_units,
-            *log.unread,
-            *(as_finding(one, "log.reading") for one in remarks),
-            *(as_finding(one, "log.reading") for one in grid.warnings),
-            *(() if candidate else begun(grid, trial.dt, trial.input_names)),
-        ),
-        grid.reports,
-        log=log,
-        cut=grid,
-        last_s=(grid.last_ns - grid.start_ns) * 1e-9,
-    )
-
-
-def cut_short(read: Read, steps: int, fell: Finding | None = None) -> Read:
-    """Cut a run in a foreign log after `steps`, where it failed, if it is longer."""
-    if read.log is None or read.cut is None or read.trial.steps <= steps:
-        return read
-    trial, workspace = read.trial.until(steps), read.log.workspace
-    about = _about(workspace, trial.candidate) | read.log.source
-    data = _encode(workspace, trial, about, read.cut.start_ns)
-    return replace(read, trial=trial, data=data).telling(*([fell] if fell else []))
-
-
 class NoneWaits(GroundedError):
     """Raised if no candidate is waiting for a trial; `best` may have been run again."""
 
@@ -255,7 +169,8 @@ class NoneWaits(GroundedError):
         self.best = best
 
 
-def _outstanding(workspace: Folder, path: Path) -> str:
+def outstanding(workspace: Folder, path: Path) -> str:
+    """Return the candidate that waits for a trial, or raise that none does."""
     now = standing_in(workspace)
     if now.outstanding is None and (asked := asked_again(workspace)):
         return asked
@@ -264,7 +179,7 @@ def _outstanding(workspace: Folder, path: Path) -> str:
     return now.outstanding.id
 
 
-def _about(workspace: Folder, candidate: str) -> dict[str, str]:
+def about(workspace: Folder, candidate: str) -> dict[str, str]:
     """Return the metadata of a trial that is written here."""
     if not candidate:
         return {"kind": "data"}
@@ -274,10 +189,11 @@ def _about(workspace: Folder, candidate: str) -> dict[str, str]:
     }
 
 
-def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
+def encode(workspace: Folder, trial: Trial, facts: dict[str, str], start_ns: int = 0) -> bytes:
+    """Return the file of a trial with these metadata."""
     return trial_bytes(
         trial,
-        about,
+        facts,
         workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
         state_units=dict(workspace.base_model.states),
         input_units=dict(workspace.base_model.inputs),

@@ -18,7 +18,8 @@ from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell
 from grounded_trials.workspace.intake.locating.late_start import late_start
 from grounded_trials.workspace.intake.locating.missed_steps import not_sent
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
-from grounded_trials.workspace.intake.opening.reading import Read, cut_log
+from grounded_trials.workspace.intake.opening.cutting import cut_log
+from grounded_trials.workspace.intake.opening.reading import Read
 from grounded_trials.workspace.intake.recognising.sender import on_other_speeds, rival_in, sender_of
 
 if TYPE_CHECKING:

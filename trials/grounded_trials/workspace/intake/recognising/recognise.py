@@ -42,15 +42,9 @@ from grounded_trials.workspace.candidates.search_state import latest_candidates,
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.intake.locating.run_start import Recording
+from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short, read_log_file
 from grounded_trials.workspace.intake.opening.foreign import misread
-from grounded_trials.workspace.intake.opening.reading import (
-    NoneWaits,
-    Read,
-    cut_log,
-    cut_short,
-    is_stored,
-    read_log_file,
-)
+from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.recognising.look import Look
 from grounded_trials.workspace.intake.recognising.misused_run import misuses
 from grounded_trials.workspace.intake.recognising.read_otherwise import (

@@ -23,6 +23,7 @@ import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
+from grounded.frozen import median
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import like_predicted
 from grounded.search.returned.who_drove import LEAST
@@ -85,7 +86,7 @@ def _missed(
     usual = max(
         abs(tried.promised),
         min((abs(t.utility) for t in others), default=0.0),
-        float(np.median([abs(t.promised - t.utility) for t in others])) if others else 0.0,
+        float(median(np.array([abs(t.promised - t.utility) for t in others]))) if others else 0.0,
         1e-9,
     )
     return tried.promised - workspace.task.utility(trial), usual
@@ -160,7 +161,7 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     said = own.predicted_states
     off = np.abs(task.model.difference(run.states, said[: len(run.states)]))
     known = np.maximum(GROWN * off[:-LEAST].max(axis=0), NEAR * np.ptp(said, axis=0))
-    end = np.median(off[-END:], axis=0)
+    end = median(off[-END:])
     soon = 2 * run.states[-1] - run.states[-1 - LEAST]  # as many steps later, at the same rate
     assert task.safety_low is not None and task.safety_high is not None
     inside = [((x >= task.safety_low) & (x <= task.safety_high)).all() for x in run.states]
