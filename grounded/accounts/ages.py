@@ -37,7 +37,17 @@ from grounded.accounts.kinematics import (
     pieces,
     turned,
 )
-from grounded.accounts.lag import LEAST_S, SAME, SURE, SURELY, Lag, at_samples, earlier, lag_between
+from grounded.accounts.lag import (
+    CLEAR,
+    LEAST_S,
+    SAME,
+    SURE,
+    SURELY,
+    Lag,
+    at_samples,
+    earlier,
+    lag_between,
+)
 from grounded.accounts.signals import quantum
 from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.model import Model
@@ -45,7 +55,6 @@ from grounded.places import Integral, heading, integrals, partner, speed, true_v
 from grounded.result import SMALL, with_error
 from grounded.trial import Trial
 
-ALIKE = 0.9  # coherence above which two sensors are compared
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
@@ -58,7 +67,7 @@ FORESEEN = 0.1  # weight of the second later difference above which it is no cau
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
-NONE, LARGE, FINE = 3.0, 0.01, 0.02  # of a bias: standard deviations, shares of the rms
+FINE = 0.02  # of the rms: so small a bias would have been seen
 SPEEDY = 0.5  # share of the squares that a constant leaves, below which the speed explains more
 CLOSE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
 AGREE, UNSURE = 2.5, 0.25  # standard deviations; and of a delay: larger ones show none
@@ -140,7 +149,7 @@ class Ages:
     def clear(self, relation: Integral) -> Lag | None:
         """Return the lag of a velocity behind the rate of its position; None if they differ."""
         lag = lag_of(self.model, relation, self.trials)
-        return lag if lag is not None and lag.coherence > ALIKE else None
+        return lag if lag is not None and lag.coherence > CLEAR else None
 
     def with_message(self, findings: Iterator[Finding], names: Sequence[str]) -> Iterator[Finding]:
         """Correct all states of a message by the delay of one of them, the most certain one."""
@@ -454,12 +463,12 @@ class Bias:
     @property
     def found(self) -> bool:
         """Whether the bias is significant and large enough to report."""
-        return abs(self.value) > max(SURE * self.std, LARGE * self.rms)
+        return abs(self.value) > max(SURE * self.std, SAME * self.rms)
 
     @property
     def refuted(self) -> bool:
         """Whether the trials rule a bias out: none is seen, and one would have been."""
-        return abs(self.value) < NONE * self.std and SURE * self.std < FINE * self.rms
+        return abs(self.value) < SURELY * self.std and SURE * self.std < FINE * self.rms
 
 
 def bias_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Bias | None:
@@ -554,7 +563,7 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
         lag_between([(said[:, k], moved[:, k]) for k in some for moved, said in ways], dt)
         for some in ((0, 1), (0,), (1,))
     )
-    if every is None or every.sign < 0 or every.coherence < ALIKE:
+    if every is None or every.sign < 0 or every.coherence < CLEAR:
         return None
     if every.delay < max(SURE * every.std, 0.5 * dt):
         return None

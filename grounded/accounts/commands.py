@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.motion import HORIZONS, LEAST, Ahead, Fit, basis
+from grounded.accounts.motion import HALF, HINT, HORIZONS, LEAST, LIKE, Ahead, Fit, basis
 from grounded.accounts.reported import names_of, tables
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
@@ -29,9 +29,8 @@ from grounded.places import integrals
 from grounded.trial import Trial
 
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
-HINT, CLEAR, HALF = 0.5, 0.8, 0.5  # [nats] uncalibrated, calibrated; share of one error
+CLEAR = 0.8  # [nats] by which later commands must lead in calibrated predictions
 SURELY = 1.6  # [nats] the same in fewer than half of the trials: all have one clock, mostly
-LIKE = 4.0  # factor within which an input must act as in the model
 LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
 STARTS = 120  # samples to predict from
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late

@@ -12,6 +12,7 @@ import numpy as np
 
 from grounded.accounts.finding import Finding
 from grounded.accounts.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
+from grounded.accounts.table import OVER
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import extent
@@ -21,7 +22,6 @@ from grounded.trial import Trial
 OFTEN = 0.1  # share of the time above which it is reported
 COPY = 0.99  # coherence of two identical inputs: two motors of one vehicle have 0.96
 FAR = 20.0  # times the limit: a value in percent exceeds it by more
-OVER = 1.03  # of full scale: the largest value seen of a signal in percent or counts
 ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
 

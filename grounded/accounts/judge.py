@@ -27,7 +27,7 @@ from grounded.accounts.kinematics import (
     kinematic_rows,
     turned,
 )
-from grounded.accounts.motion import Ahead, Fit, horizon_of, plainly_missed
+from grounded.accounts.motion import HALF, HINT, LIKE, Ahead, Fit, horizon_of, plainly_missed
 from grounded.accounts.table import Account, Term, Told, accounts, versions
 from grounded.frozen import Array
 from grounded.model import Model
@@ -41,8 +41,7 @@ OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
 NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
-CLEAR, HINT, HALF = 1.0, 0.4, 0.5  # [nats] by calibrated and plain predictions; share of one error
-LIKE = 4.0  # factor within which an input must act as in the model
+CLEAR = 1.0  # [nats] by which an account must lead in calibrated predictions
 TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 FAR = 20.0  # times as large as in other trials: a trial to be examined

@@ -17,10 +17,10 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import number
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import LEAST, Commanded, commanded
+from grounded.search.returned.who_drove import LEAST, SLIGHT, Commanded, commanded
 from grounded.trial import Trial
 
-SAME, INSIDE = 1e-6, 0.02  # of a command's size: at the cut, and inside the limit or beyond the cut
+SAME = 1e-6  # of a command's size: at the cut
 PART = 0.05  # least share of the steps at a cut
 NEARLY = 0.8  # least share of them in which more is asked for, and of those in which it is
 
@@ -74,7 +74,7 @@ def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
     u, wanted, size = sign * run.sent[:, j], sign * run.asked[:, j], float(run.size[j])
     end = float(u.max())
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
-    at, more = u >= end - SAME * size, wanted > end + INSIDE * size
+    at, more = u >= end - SAME * size, wanted > end + SLIGHT * size
     both = float((at & more).sum())
-    enough = at.sum() >= max(LEAST, PART * len(u)) and end < limit - INSIDE * size
+    enough = at.sum() >= max(LEAST, PART * len(u)) and end < limit - SLIGHT * size
     return at if enough and both >= NEARLY * max(at.sum(), more.sum()) else None

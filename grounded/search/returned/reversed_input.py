@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.accounts.commands import Acts, how_inputs_act
-from grounded.accounts.motion import Ahead
+from grounded.accounts.motion import HALF, Ahead
 from grounded.findings import Finding, found
 from grounded.search.planner import Planner
 from grounded.search.returned.as_predicted import multiplied
@@ -21,7 +21,6 @@ from grounded.trial import Trial
 STARTS = 120  # samples to predict from
 CLEAR = 2.0  # [nats] by which the flipped sign must lower the errors
 MUCH = 0.3  # the error of at least one state must fall to this share
-PLAIN = 0.5  # and to this share of how far the state moves: else the model explains neither
 
 
 def reversed_input(planner: Planner, trial: Trial) -> Finding | None:
@@ -44,7 +43,7 @@ def reversed_input(planner: Planner, trial: Trial) -> Finding | None:
         for name in known.input_names:
             after = _ahead(planner, multiplied(known, [name], -1.0)).plain(gains)
             shares = after.rms[:own] / before.rms[:own]
-            shares[after.rms[:own] > PLAIN * far] = 1.0
+            shares[after.rms[:own] > HALF * far] = 1.0
             i = int(np.argmin(shares))
             if after.score < least and shares[i] < MUCH:
                 state = planner.task.model.state_names[i]

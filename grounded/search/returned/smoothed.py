@@ -18,12 +18,9 @@ from grounded.model import Model
 from grounded.places import velocities
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import LEAST, states_ago
+from grounded.search.returned.who_drove import LATEST, LEAST, SAME, SLIGHT, UNLIKE, states_ago
 from grounded.trial import Trial
 
-OFF = 0.02  # rms difference of the commands, relative to their size, from which a filter is sought
-LEAVES, RATHER = 0.25, 0.5  # most that a filter may leave of that, and of what the best age leaves
-LATE = 3  # steps by which the run may begin later than was found: lagging commands look later
 SHARES = np.arange(1, 49) / 50  # tried for `a`
 AGES = np.arange(13) / 4  # tried, in steps
 
@@ -49,20 +46,20 @@ def smoothed(model: Model, own: Candidate, trial: Trial) -> Smoothed | None:
     Args:
         model: has the units of the states, which tell velocities from positions.
         own: the candidate.
-        trial: its run, without gaps; the run may begin up to `LATE` steps after it.
+        trial: its run, without gaps; the run may begin up to `LATEST` steps after it.
     """
     policy, T = own.policy, min(trial.finite_steps, own.policy.horizon)
     names = (policy.state_names, policy.input_names)
-    if policy.gain is None or T < LEAST + LATE or names != (trial.state_names, trial.input_names):
+    if policy.gain is None or T < LEAST + LATEST or names != (trial.state_names, trial.input_names):
         return None
     off = float(_off(policy, trial, 0, trial.states[None, :T])[0])
-    if off < OFF:
+    if off < SLIGHT:
         return None
     x = trial.states[:T]
     aged = np.stack([states_ago(x, age, policy.angles) for age in AGES])
-    least = min(float(_off(policy, trial, late, aged).min()) for late in range(LATE + 1))
-    best, found = min(LEAVES * off, RATHER * least), None
-    for late in range(LATE + 1):
+    least = min(float(_off(policy, trial, late, aged).min()) for late in range(LATEST + 1))
+    best, found = min(UNLIKE * off, SAME * least), None
+    for late in range(LATEST + 1):
         filtered = _filtered(x[late:])
         for group in _groups(model, policy):
             which = np.isin(np.arange(x.shape[1]), group)

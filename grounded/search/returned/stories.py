@@ -29,6 +29,7 @@ from grounded.search.returned.as_predicted import apart, multiplied
 from grounded.search.returned.who_drove import (
     CLEAR,
     DECISIVE,
+    EXPLAINED,
     FINE,
     Following,
     evidence,
@@ -39,13 +40,11 @@ from grounded.search.returned.who_drove import (
 from grounded.task import Task
 from grounded.trial import Trial
 
-EXACT, NEARLY = 0.01, 0.1  # difference of commands: as logged is as good, and a story explains them
-LEADS, ALIKE = 0.7, 3.0  # [nats] by which it must lead, and where the commands are alike as logged
-CLEARLY = 1.0  # [nats] by which a story must lead all terms of the log as it is
-ANY = 0.7  # [nats] that any number costs, which is no unit
+LEADS = 0.7  # [nats] by which a story must lead as logged, and that a number costs that is no unit
+ALIKE = 3.0  # [nats] where the commands are alike as logged
 MANY = 12  # rows that are compared in full
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest factor, or its inverse
-TELLS, NEARLY_ALL = 0.1, 0.95  # difference that tells two policies apart; steps that must be nearer
+NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
 ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
 AGES = (0.0, 1.0, 2.0)  # [steps] of the states acted on that rows are first compared with
@@ -155,7 +154,7 @@ def stories(
     Returns:
         The stories, the likeliest first.
     """
-    if plain is None or (plain.alike and plain.error < EXACT) or not trial.inputs.any():
+    if plain is None or (plain.alike and plain.error < CLEAR) or not trial.inputs.any():
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
@@ -165,7 +164,7 @@ def stories(
     before, late, some = _left(plain), latest(task), list[Story]()
     for row in _nearest(rows):
         fit = follows(row.policy, row.run, late)
-        if fit is None or not fit.alike or fit.error >= NEARLY:
+        if fit is None or not fit.alike or fit.error >= EXPLAINED:
             continue
         gained, program = np.log((before + FINE) / (_left(fit) + FINE)), row.kind is Kind.PROGRAM
         unit = row.kind is Kind.UNIT and not row.price
@@ -241,7 +240,7 @@ def _of_log(task: Task, own: Candidate, trial: Trial, logged: Sequence[str]) -> 
                 continue
             by = -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
             if (group, round(float(np.log(abs(by))), 2), by > 0) not in known:
-                tried.append((group, by, ANY))
+                tried.append((group, by, LEADS))
     for group, by, price in tried:
         if guessed & {*group}:
             continue
@@ -260,7 +259,7 @@ def _of_log(task: Task, own: Candidate, trial: Trial, logged: Sequence[str]) -> 
             told = found("log.zero", name, ran=own.id, size=size)
             told = told.also(off=Quantity(abs(off), model.states[name]), add=-off)
             yield Row(
-                Kind.LOG, run, policy, told.also(tables=(f"[log.state.{name}]",)), ANY, (name,)
+                Kind.LOG, run, policy, told.also(tables=(f"[log.state.{name}]",)), LEADS, (name,)
             )
 
 
@@ -469,7 +468,7 @@ def _tells(plain: Following, fit: Following) -> bool:
     """
     size = fit.fine / FINE
     with np.errstate(invalid="ignore"):
-        told = np.abs(plain.off - fit.off) > TELLS * size
+        told = np.abs(plain.off - fit.off) > EXPLAINED * size
         nearer = np.abs(fit.off) < np.abs(plain.off) / 2
     return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
 
@@ -511,5 +510,5 @@ def fed_nothing(own: Candidate, trial: Trial, ran: Following) -> bool:
 
 def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
     """Return the story that explains a log best; `as_logged` unless one leads it clearly."""
-    better = [one for one in some if one and one.left < as_logged.left - CLEARLY]
+    better = [one for one in some if one and one.left < as_logged.left - LEADS]
     return min(better, key=lambda one: one.left, default=as_logged)

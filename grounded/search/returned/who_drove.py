@@ -25,7 +25,9 @@ DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1
 SAME, CLEAR = 0.5, 0.01  # shares: of another difference, and of an input, that count as none
 OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
-DIGITS = 1e-5  # of an input's size: smaller differences are rounding
+# differences of commands, relative to their size: of rounding, none, hardly any, alike, explained
+DIGITS, EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-5, 1e-3, 0.02, 0.05, 0.1
+LATEST = 3  # steps by which commands may be sent or logged late
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 FOREIGN = 0.5  # of the squared difference of unrelated commands: from here on nothing is alike
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps

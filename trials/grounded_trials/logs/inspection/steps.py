@@ -20,8 +20,8 @@ from itertools import islice, permutations, product
 
 import numpy as np
 
-from grounded.accounts.judge import CLEAR, HALF
-from grounded.accounts.motion import Ahead
+from grounded.accounts.judge import CLEAR
+from grounded.accounts.motion import HALF, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model

@@ -19,6 +19,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.returned.who_drove import (
+    EXACT,
     FINE,
     LEAST,
     WINDOWS,
@@ -33,7 +34,6 @@ OLDEST = 2.0  # largest age of a sample, in steps
 AGES = 128  # largest number of ages tried per topic
 PARTS = 8  # number of ages tried in the time between samples
 ROUNDS = 2  # rounds of coordinate search over the topics' ages
-EXACT = 1e-3  # median difference, relative to an input's size, of the candidate that ran
 FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
 USUAL = 0.03  # median difference of commands on speeds that the program had differently, at most
 MOST = 0.75  # share of a run's parts in which commands must be that near, within 2x

@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import FINE, LEAST, SAME, Following
+from grounded.search.returned.who_drove import EXPLAINED, FEW, FINE, LEAST, SAME, Following
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
@@ -82,13 +82,9 @@ def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
     moves = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > ran.fine).any(axis=1))
     held = int(moves[-1]) + 1 if len(moves) else 0
     before, after = (float((part**2).mean()) for part in (off[: max(held, 1)], off[held:]))
-    if T - held >= FEW and after > max(STOPPED**2, 4 * before):
+    if T - held >= FEW and after > max(EXPLAINED**2, 4 * before):
         return held
     return None if ran.alike else round(ran.until_s / task.dt)
-
-
-FEW = 5  # smallest number of steps with constant inputs that counts as motors cut
-STOPPED = 0.1  # rms difference from the policy during these steps, relative to an input's size
 
 
 def who_fell(

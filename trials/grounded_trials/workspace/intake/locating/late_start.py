@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.policy import Policy
+from grounded.search.returned.who_drove import LATEST
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start, instants_apart
 
-LATEST = 3  # steps by which commands are tried earlier
 NEAR = 5  # steps about a start that fits about, within which the true one is sought
 EACH = 3  # instants that are examined for each lag
 

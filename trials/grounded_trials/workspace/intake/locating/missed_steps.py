@@ -17,7 +17,7 @@ from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import LEAST, commanded, follows
+from grounded.search.returned.who_drove import LEAST, RESEMBLES, UNLIKE, commanded, follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 
 MOST = 5  # largest number of missed steps that is tried
 COARSE = 100  # steps of a run at which a log may begin, first tried
-ALIKE = 0.05  # median difference of commands, relative to their size, below which they are alike
 WAITS = 3.5  # steps without a change of commands at the beginning of a log, before any run
-BY_FAR = 0.25  # the difference of the commands must fall below this share of that elsewhere
 
 
 def missed_steps(log: Recording, policy: Policy, first: float, otherwise: float) -> int:
@@ -56,7 +54,7 @@ def missed_steps(log: Recording, policy: Policy, first: float, otherwise: float)
         return k
     ran = follows(policy, trial.until(policy.horizon), 0)
     alike = ran is not None and ran.alike and not ran.late
-    return k if alike and usual is not None and there.left < BY_FAR * usual.left else 0
+    return k if alike and usual is not None and there.left < UNLIKE * usual.left else 0
 
 
 def _left(log: Recording, policy: Policy, first: float, missed: int) -> float:
@@ -135,7 +133,7 @@ def _step_at(log: Recording, policy: Policy, begins: float) -> tuple[int, float]
     stride = max(1, policy.horizon // COARSE)
     best = min(range(0, policy.horizon, stride), key=left)
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
-    known = best > 0 and left(best) < min(ALIKE, BY_FAR * left(0))
+    known = best > 0 and left(best) < min(RESEMBLES, UNLIKE * left(0))
     return best if known else 0, left(best)
 
 

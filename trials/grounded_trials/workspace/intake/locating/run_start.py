@@ -23,10 +23,13 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
+from grounded.search.returned.who_drove import EXACT as TO_DIGITS
 from grounded.search.returned.who_drove import (
     FINE,
     LEAST,
+    RESEMBLES,
     SAME,
+    SLIGHT,
     UNLIKE,
     follows,
 )
@@ -45,11 +48,8 @@ FINEST = 8  # largest number of instants per step at which a start is tried
 KNOWN = 0.25  # largest std, in rows, with which feedback determines the start within a row
 EXACT = 0.1  # share of the effect of a late row below which the logged states were the policy's
 SOUGHT = 24  # number of instants at which samples of different ages are tried
-MOVES = 0.05  # smallest change of commands, relative to an input's size, that identifies a run
-EXACT_TO = 1e-3  # largest median difference of the first commands, relative to an input's size
 QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
 SHORT = 4  # at least 1 / SHORT of a run must be in the log
-EXACTLY = 0.02  # mean difference, relative to an input's size, below which commands are alike
 BATCH = 256  # instants compared at once
 UNRELATED = 0.3  # mean difference, relative to an input's size, above which commands aren't alike
 
@@ -202,7 +202,7 @@ class Recording:
             told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
             if fit is None or len(told) < LEAST:
                 return np.inf
-            moves = bool((np.ptp(fit.asked[told], axis=0) > MOVES * fit.size).any())
+            moves = bool((np.ptp(fit.asked[told], axis=0) > RESEMBLES * fit.size).any())
             return float(np.median(fit.off[told])) if moves else np.inf
 
         tried, left = dict[float, float](), strays.copy()
@@ -212,7 +212,7 @@ class Recording:
             at, _ = self._on_step(policy, self.first + k * self.dt / self.parts)
             tried[at] = off(at)
         best = min(tried, key=tried.__getitem__, default=0.0)
-        if not tried or tried[best] > EXACT_TO:
+        if not tried or tried[best] > TO_DIGITS:
             return None
         return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
 
@@ -431,11 +431,11 @@ def instants_apart(
         whole = (left >= H - LAST) | (begun & (left >= least))
         apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
         mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
-        alike = np.where(mean < EXACTLY, steps, 0).max(axis=1)
+        alike = np.where(mean < SLIGHT, steps, 0).max(axis=1)
         at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
-        lost = 1 - alike / H + 0.1 * at / EXACTLY  # one more step must not cost a worse fit
+        lost = 1 - alike / H + 0.1 * at / SLIGHT  # one more step must not cost a worse fit
         until[ks] = np.where(alike >= least, lost, np.inf)
-        strays[ks] = (off[:, :least] > EXACTLY).mean(axis=1)
+        strays[ks] = (off[:, :least] > SLIGHT).mean(axis=1)
     return apart, until, strays
 
 

@@ -20,7 +20,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import Clipped, clipped
 from grounded.search.returned.stories import NEARLY_ALL, Kind, Story, Way, scored, ways
-from grounded.search.returned.who_drove import Commanded, commanded, follows
+from grounded.search.returned.who_drove import RESEMBLES, SLIGHT, Commanded, commanded, follows
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
@@ -34,8 +34,6 @@ from grounded_trials.workspace.intake.locating.run_start import (
 )
 
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
-NEAR = 0.02  # largest difference of a command, relative to its size, that is no stray
-ORIGIN = 0.05  # share of the commands' difference that offsets of states may leave
 MOSTLY = 0.9  # least share of the steps in which cut commands are near what is logged
 MANY = 300_000  # largest number of commands that are computed for a misuse, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a misuse, and in all
@@ -117,9 +115,9 @@ def other_origin(log: Recording, model: Model, own: Candidate) -> Iterator[Story
             continue
         by = np.linalg.lstsq(gains, off, rcond=1e-6)[0]
         left = float(np.median(np.abs(off - gains @ by)))
-        if left > min(ORIGIN * float(np.median(np.abs(off))), nearest):
+        if left > min(RESEMBLES * float(np.median(np.abs(off))), nearest):
             continue
-        does = np.abs(gains * by).max(axis=0) > ORIGIN * np.abs(off).max()
+        does = np.abs(gains * by).max(axis=0) > RESEMBLES * np.abs(off).max()
         if does.sum() < 2:  # of one state, its sensor's zero may differ as well
             continue
         shares = zip(model.states.items(), by, does, strict=True)
@@ -149,7 +147,7 @@ def cut_in(log: Recording, own: Candidate, start: Start | None) -> Iterator[Stor
             within = replace(own.policy, low=low, high=high)
             sent, fit = commanded(within, run), follows(within, run, 0)
             off = (np.abs(sent.asked - sent.sent) / sent.size).max(axis=1)
-            if (off <= NEAR).mean() >= MOSTLY or (fit and fit.alike):
+            if (off <= SLIGHT).mean() >= MOSTLY or (fit and fit.alike):
                 error = float(np.median(off))
                 yield scored(Kind.PROGRAM, cut.finding(own), own, run, error)
                 return
@@ -187,7 +185,7 @@ def _begins(every: Trial, way: Way) -> Iterator[tuple[float, int]]:
         u = sent[here]
         asked = policy.commands(states[here], policy.past, u)
         told = known[:, :, None] & ((asked != u) | ((u > policy.low) & (u < policy.high)))
-        stray = told & (np.abs(asked - u) / size > NEAR)
+        stray = told & (np.abs(asked - u) / size > SLIGHT)
         count, lost = (one.any(axis=2).sum(axis=1) for one in (told, stray))
         strays[first : first + BATCH] = np.where(count < FEW, np.inf, lost / np.maximum(count, 1))
     for k in np.argsort(strays, kind="stable")[:EACH]:

@@ -19,8 +19,8 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart, like_predicted
 from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.stories import ANY, NEARLY, Kind, Story, full_scales, scored, stories
-from grounded.search.returned.who_drove import follows, latest
+from grounded.search.returned.stories import LEADS, Kind, Story, full_scales, scored, stories
+from grounded.search.returned.who_drove import EXPLAINED, follows, latest
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.signals import Series
@@ -29,7 +29,6 @@ from grounded_trials.workspace.intake.locating.run_start import TRIED, Recording
 
 PAIRS = 28  # largest number of pairs of states, and of inputs, that are tried exchanged
 PACES = (2.0, 0.5)  # rates of a recording that are tried
-EXCHANGED = 0.5  # [nats] that an exchange costs
 
 Proven = Callable[[Account], Sequence[str]]  # trials, read by the same [log], without a fault
 
@@ -66,7 +65,7 @@ def at_each_start(log: Recording, task: Task, own: Candidate) -> Iterator[Story]
         plain = follows(own.policy, run, latest(task))
         yield from stories(task, own, run, plain, acts=acts, logged=logged)
         if smooth := smoothed(task.model, own, run):
-            yield scored(Kind.PROGRAM, smooth.finding(own), own, run, smooth.left, price=ANY)
+            yield scored(Kind.PROGRAM, smooth.finding(own), own, run, smooth.left, price=LEADS)
 
 
 def _at_other_rates(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
@@ -106,7 +105,7 @@ def _read_as(
     begun = other.start_of(own.policy, only_alike=True) if other else None
     run = other.trial_from(begun.seconds) if other and begun and begun.alike else None
     fit = follows(own.policy, run.until(own.policy.horizon), 0) if run else None
-    if not begun or not run or not fit or fit.error >= NEARLY:
+    if not begun or not run or not fit or fit.error >= EXPLAINED:
         return None
     as_logged = log.trial_from(begun.seconds)
     if as_logged is not None and apart(own, run) > apart(own, as_logged):
@@ -146,7 +145,7 @@ def exchanged_in(
         back = {a: replace(other, spec=one.spec), b: replace(one, spec=other.spec)}
         if its := _read_as(log, task, own, back):
             run, error, begins = its
-            story = scored(Kind.LOG, None, own, run, error, price=EXCHANGED, names=(a, b))
+            story = scored(Kind.LOG, None, own, run, error, price=LEADS, names=(a, b))
             some.append((story, begins))
     if not some:
         return None

@@ -34,7 +34,7 @@ from grounded.search.returned.stories import (
     stories,
     unit_by_factor,
 )
-from grounded.search.returned.who_drove import FINE, follows, latest
+from grounded.search.returned.who_drove import FINE, RESEMBLES, follows, latest
 from grounded.search.returned.whose_run import OTHERS
 from grounded.task import Task
 from grounded.trial import Trial
@@ -60,7 +60,6 @@ if TYPE_CHECKING:
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
-NEAR = 0.05  # largest mean difference from the policy's commands, relative to an input's size
 ENDED = ("stopped", "converged")  # phases of a search
 SHORTER = 1.0  # [nats] that a fall costs
 LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
@@ -487,8 +486,10 @@ def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> S
     for one in reversed(void[-OTHERS:]):
         start = log.start_of(one.policy) if log else None
         fit = None if log else follows(one.policy, trial.until(one.policy.horizon), latest(task))
-        error = start.apart if start and start.alike else fit.error if fit and fit.alike else NEAR
-        if error < NEAR:
+        error = (
+            start.apart if start and start.alike else fit.error if fit and fit.alike else RESEMBLES
+        )
+        if error < RESEMBLES:
             run = (log.trial_from(start.seconds) if log and start else None) or trial
             told = found("log.earlier", ran=one.id, was=other_task(task, one))
             some.append(scored(Kind.EARLIER, told, one, run, error, names=(one.id,)))

@@ -17,7 +17,9 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.returned.who_drove import (
     FINE,
+    LATEST,
     LEAST,
+    RESEMBLES,
     SAME,
     Following,
     follows,
@@ -28,10 +30,7 @@ from grounded_trials.workspace.intake.locating.acted_on import ActedOn, acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 
 LUCK = float(np.log(2) / 2)  # [nats] per step: half the squares, which lower gains also give
-THEIRS = 0.05  # largest median difference, relative to size, of another that is said to have run
 CLEARLY = 6.0  # [nats] of evidence, beyond LUCK, for another candidate
-LATEST = 3  # steps by which commands may be logged late
-EXACT_TO = 1e-4  # of a command: smaller differences count as this
 ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 
 
@@ -92,7 +91,7 @@ def sender_of(
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
         if fit is None or _one(mine, fit):
             continue
-        if fit.left > THEIRS or (for_it := nats(mine, fit)) <= best:
+        if fit.left > RESEMBLES or (for_it := nats(mine, fit)) <= best:
             continue
         if fit.exact or (not late and (there := _following(log, one.policy, at)) and there.alike):
             best, name, theirs = for_it, one.id, fit
@@ -101,7 +100,7 @@ def sender_of(
     if not name:
         return Sender(mine)
     why = found("log.another", ran=own.id, other=name, nats=best)
-    left = {"theirs": max(theirs.left, EXACT_TO), "mine": max(mine.left, EXACT_TO)}
+    left = {"theirs": max(theirs.left, FINE), "mine": max(mine.left, FINE)}
     return Sender(mine, name, why.also(**left))
 
 

@@ -28,7 +28,9 @@ from grounded.search.returned.clipped import clipped
 from grounded.search.returned.late_commands import Late, what_is_late
 from grounded.search.returned.smoothed import smoothed
 from grounded.search.returned.who_drove import (
+    LATEST,
     LEAST,
+    RESEMBLES,
     UNLIKE,
     Following,
     as_sent,
@@ -42,9 +44,8 @@ from grounded_trials.workspace.folder import Folder
 
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 UNSENT = 5  # steps without a command that are fewer are sought where the run begins
-LACKING, SENT = 0.05, 0.25  # difference of commands in these, and share of it in the later steps
 LOST = 0.3  # share of the steps that tell which may be lost in a run
-LATEST, EARLIER = 3, 3  # steps by which late commands are reported; earlier runs to compare with
+EARLIER = 3  # runs to compare with
 SAME = 0.4  # relative difference of two ages or lags that are one
 LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
@@ -198,7 +199,7 @@ def _unsent(off: Array, held: Array) -> int:
     lacking, sent = (
         float(np.median(off[part].max(axis=1))) for part in (slice(begins), slice(begins, None))
     )
-    return begins if lacking > LACKING and sent < SENT * lacking else 0
+    return begins if lacking > RESEMBLES and sent < UNLIKE * lacking else 0
 
 
 def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> Iterator[Finding]:
