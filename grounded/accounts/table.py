@@ -54,6 +54,9 @@ class Term(Flag):
     COMMANDS = auto()
 
 
+ROWS, MOTION, COMMANDS = Term.ROWS, Term.MOTION, Term.COMMANDS
+
+
 @dataclass(frozen=True)
 class Account:
     """One story of how a log came about.
@@ -212,66 +215,98 @@ def accounts(
         plane: the heading, its rate (-1 if it is no state), and the speeds in m/s of a plane.
         inputs: commands of logs (T, m), whose largest suggest the unit of a part of 1.
     """
-    n, units = model.n, [*model.states.values(), *model.inputs.values()]
-    shown, sent = range(n) if shown is None else shown, range(n, n + model.m)
-    exact = [one for one in integrals(model) if one.exact and {one.i, one.j} <= {*shown}]
-    pairs = [(one.i, one.j) for one in exact]
-    alone = [(k,) for k in shown if not any(k in pair for pair in pairs)]
-    rows, motion, commands = Term.ROWS, Term.MOTION, Term.COMMANDS
-    groups = dict[tuple[int, ...], Term]()
-
-    def add(terms: Term, *some: tuple[int, ...]) -> None:
-        for group in filter(None, some):
-            groups[group] = groups.get(group, Term(0)) | terms
-
-    def of(some: Collection[int], *wanted: str) -> tuple[int, ...]:
-        return tuple(k for k in some if units[k] in wanted)
-
-    # columns that one mistake concerns: one sensor's, all of a kind, all commands of a unit
-    add(commands, *((k,) for k in (*shown, *sent)), *pairs)
-    add(rows, *((k,) for k in related))
-    for stem in ("rad", "deg", "m"):
-        add(commands, of(shown, stem, f"{stem}/s"), of(shown, stem), of(shown, f"{stem}/s"))
-    turning, angles = of(shown, "rad", "rad/s"), of(shown, "rad")
-    add(motion, turning, angles, *((k,) for k in angles), angles + of(sent, "rad"))
-    add(motion, *(one for one in alone if one[0] in turning))
-    if not any(units[k].partition("/")[0] == "m" for k in sent):
-        add(motion, of(shown, "m", "m/s"), *(one for one in alone if units[one[0]] == "m"))
-    add(rows, *(one for unit in ("m", "m/s") if len(one := of(sorted(related), unit)) > 1))
-    add(motion | commands, *(of(sent, units[k]) for k in sent), *((k,) for k in sent))
-    for group, terms in groups.items():
-        yield from _units(units, group, terms, n, inputs)
-    # signs: what no other sensor relates, a position with its velocity, commands
-    for k in shown:
-        terms = commands | (rows if k in related else Term(0))
-        yield Account("sign", (k,), -1.0, price=0.3 * (not units[k].endswith("/s")), terms=terms)
-    for group in sorted((*pairs, *alone)):
-        yield Account("sign", group, -1.0, price=0.5, terms=motion | commands)
-    for group in dict.fromkeys((*((k,) for k in sent), *(of(sent, units[k]) for k in sent))):
-        yield Account("sign", group, -1.0, terms=commands)
-    # exchanges: of inputs (one perhaps of the other sign), of joints, of two columns
-    for a, b in combinations(sent, 2):
-        yield Account("exchange", pairs=((a, b),), terms=motion)
-        for k in (a, b):
-            yield Account("exchange", (k,), -1.0, pairs=((a, b),), price=1.5, terms=motion)
-    for p, q in combinations(exact, 2):
-        if np.isclose(p.c, q.c):
-            yield Account("exchange", pairs=((p.i, q.i), (p.j, q.j)), price=0.5, terms=motion)
-    for pair in combinations(shown, 2):
-        terms = motion | (rows if {*pair} <= {*related} else Term(0))
-        yield Account("exchange", pairs=(pair,), price=1.0, terms=terms)
-    for k in related:
-        yield from (Account("exchange", pairs=((k, j),), price=1.5, terms=rows) for j in sent)
-    # headings from another zero, or counted the other way
-    if plane:
+    columns = _Columns(model, range(model.n) if shown is None else shown, related)
+    for group, terms in columns.groups().items():
+        yield from _units(columns.units, group, terms, model.n, inputs)
+    yield from columns.signs()
+    yield from columns.exchanges()
+    if plane:  # headings from another zero, or counted the other way
         psi, rate, *speeds = plane
-        yield Account("offset", (psi,), fitted=True, price=0.5, terms=rows)
-        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True, terms=rows)  # a compass
+        yield Account("offset", (psi,), fitted=True, price=0.5, terms=ROWS)
+        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True, terms=ROWS)  # a compass
         if rate >= 0:
-            yield Account("sign", (psi, rate), -1.0, price=0.5, terms=rows)
-            yield Account("sign", (psi, rate), -1.0, price=1.0, fitted=True, terms=rows)
+            yield Account("sign", (psi, rate), -1.0, price=0.5, terms=ROWS)
+            yield Account("sign", (psi, rate), -1.0, price=1.0, fitted=True, terms=ROWS)
         if len(speeds) == 2:
-            yield Account("axes", (psi, *speeds), price=0.5, terms=rows)
+            yield Account("axes", (psi, *speeds), price=0.5, terms=ROWS)
+
+
+class _Columns:
+    """The columns of a model by what one mistake may concern together.
+
+    Args:
+        model: with the units.
+        shown: indices of the states with a sensor.
+        related: those that kinematic rows relate.
+    """
+
+    def __init__(self, model: Model, shown: Sequence[int], related: Collection[int]) -> None:
+        self.units = [*model.states.values(), *model.inputs.values()]
+        self.shown, self.sent = shown, range(model.n, model.n + model.m)
+        self.related = sorted(related)
+        self.exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
+        self.pairs = [(one.i, one.j) for one in self.exact]
+        self.alone = [(k,) for k in shown if not any(k in pair for pair in self.pairs)]
+
+    def of(self, some: Collection[int], *wanted: str) -> tuple[int, ...]:
+        """Return those of some columns that have one of these units."""
+        return tuple(k for k in some if self.units[k] in wanted)
+
+    def groups(self) -> dict[tuple[int, ...], Term]:
+        """Return the columns of one sensor, all of a kind, all commands of a unit, with terms."""
+        found, shown, sent = dict[tuple[int, ...], Term](), self.shown, self.sent
+
+        def add(terms: Term, *some: tuple[int, ...]) -> None:
+            for group in filter(None, some):
+                found[group] = found.get(group, Term(0)) | terms
+
+        add(COMMANDS, *((k,) for k in (*shown, *sent)), *self.pairs)
+        add(ROWS, *((k,) for k in self.related))
+        for stem in ("rad", "deg", "m"):
+            kinds = ((stem, f"{stem}/s"), (stem,), (f"{stem}/s",))
+            add(COMMANDS, *(self.of(shown, *kind) for kind in kinds))
+        turning, angles = self.of(shown, "rad", "rad/s"), self.of(shown, "rad")
+        add(MOTION, turning, angles, *((k,) for k in angles), angles + self.of(sent, "rad"))
+        add(MOTION, *(one for one in self.alone if one[0] in turning))
+        if not any(self.units[k].partition("/")[0] == "m" for k in sent):
+            lone = (one for one in self.alone if self.units[one[0]] == "m")
+            add(MOTION, self.of(shown, "m", "m/s"), *lone)
+        add(ROWS, *(one for u in ("m", "m/s") if len(one := self.of(self.related, u)) > 1))
+        add(MOTION | COMMANDS, *self.alike(), *((k,) for k in sent))
+        return found
+
+    def alike(self) -> list[tuple[int, ...]]:
+        """Return the commands of one unit, which are probably logged alike."""
+        return [self.of(self.sent, self.units[k]) for k in self.sent]
+
+    def signs(self) -> Iterator[Account]:
+        """Yield the other sign of one column, of a position with its velocity, of commands."""
+        for k in self.shown:
+            terms, place = COMMANDS | self._rows(k), not self.units[k].endswith("/s")
+            yield Account("sign", (k,), -1.0, price=0.3 * place, terms=terms)
+        for group in sorted((*self.pairs, *self.alone)):
+            yield Account("sign", group, -1.0, price=0.5, terms=MOTION | COMMANDS)
+        for group in dict.fromkeys((*((k,) for k in self.sent), *self.alike())):
+            yield Account("sign", group, -1.0, terms=COMMANDS)
+
+    def exchanges(self) -> Iterator[Account]:
+        """Yield inputs (one perhaps of the other sign), joints, and any two columns."""
+        for a, b in combinations(self.sent, 2):
+            yield Account("exchange", pairs=((a, b),), terms=MOTION)
+            for k in (a, b):
+                yield Account("exchange", (k,), -1.0, pairs=((a, b),), price=1.5, terms=MOTION)
+        for p, q in combinations(self.exact, 2):
+            if np.isclose(p.c, q.c):
+                pairs = ((p.i, q.i), (p.j, q.j))
+                yield Account("exchange", pairs=pairs, price=0.5, terms=MOTION)
+        for pair in combinations(self.shown, 2):
+            yield Account("exchange", pairs=(pair,), price=1.0, terms=MOTION | self._rows(*pair))
+        for k in self.related:
+            for j in self.sent:
+                yield Account("exchange", pairs=((k, j),), price=1.5, terms=ROWS)
+
+    def _rows(self, *some: int) -> Term:
+        return ROWS if {*some} <= {*self.related} else Term(0)
 
 
 def _units(

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
-from grounded.findings import Weight, found
+from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.whose_run import suspicion
+from grounded.search.returned.whose_run import Suspicion, suspicion
 from grounded.task import Task
-from grounded.trial import interpolate_gaps
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell
 from grounded_trials.workspace.intake.locating.late_start import late_start
 from grounded_trials.workspace.intake.locating.missed_steps import not_sent
@@ -50,78 +51,105 @@ class Look:
         candidates: list[Candidate],
         task: Task,
     ) -> None:
-        ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
-        apart = None if log is read.log else log  # set if judged on other samples than stored
-        self.read, self.found, self.exact = read, None, False
+        self.read, self.own, self.candidates, self.task = read, own, candidates, task
+        self.found: Start | None = None
+        self.exact = self.moved = False
         self.old: Array | None = None  # ages of the samples acted on [s], (n,), if it is surely its
-        self.whole = interpolate_gaps(apart.cut(ran)[0] if apart else read.trial).trial
-        seen = judged(self.whole)
-        if read.bare and (alone := judged(self.whole, others=())).why:
+        # set if judged on other samples than stored
+        self.apart = None if log is read.log else log
+        cut = self.apart.cut(read.trial.candidate)[0] if self.apart else read.trial
+        self.whole = interpolate_gaps(cut).trial
+        seen = self._judged()
+        if read.bare and (alone := self._judged(others=())).why:
             seen = alone  # it may be of another workspace: resembling one of these is coincidence
         self.log = log.recording if log else None
-        if log and read.log and self.log:
-            start_of = cache(partial(_start_of, self.log))
-            self.found = start = start_of(own)
-            sender = sender_of(self.log, own, candidates, start_of)
-            self.exact = sender.own is not None and sender.own.exact
-            if sender.own is not None and sender.sure:
-                self.old = sender.own.old
-            behind = _behind(self.log, own.policy, start, self.old)
-            if behind:
-                self.found, self.exact, self.old = behind, True, None
-                if abs(behind.seconds - self.log.first) > ALIGNED * self.log.interval:
-                    self._cut(read.log, apart, behind, own, task)
-                seen = judged(self.whole)
-            elif start and elsewhere(self.log, start, own.policy, why=bool(seen.why)):
-                self._cut(read.log, apart, start, own, task)
-                seen = judged(self.whole)
-            if behind or sender.sure:
-                seen = replace(seen, why=None, other="")
-            elif sender.other:
-                seen = replace(seen, why=sender.why, other=sender.other)
-            elif (rival := rival_in(self.log, own, candidates, start_of)) is not None:
-                best = judged(rival)  # cut where the other candidate fits best
-                told = best if best.other else seen if seen.why else replace(seen, why=best.why)
-                seen = replace(told, ran=seen.ran)
-            guessed = [name for name in self.log.names[0] if name not in self.log.logged]
-            doubted = start and guessed and seen.why and not sender.sure
-            if start and doubted and on_other_speeds(self.log, own, candidates, start_of):
-                if self.read is read:
-                    self._cut(read.log, apart, start, own, task)
-                seen = replace(judged(self.whole), why=None, other="")
-                self.read = self.read.telling(found("log.speeds", *guessed, ran=ran))
+        self.start_of: Callable[[Candidate], Start | None] = cache(partial(_start_of, self.log))
+        if self.log and read.log:
+            seen = self._located(self.log, read.log, seen)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
             begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
                 seen = replace(seen, why=None, other="")
         if self.log and seen.why and not seen.other and not (self.found and self.found.opens_alike):
-            for at in self.log.openings[:1]:  # told beside the rest before it, any difference grows
-                trial = self.log.trial_from(self.log.on_step(own.policy, at))
-                there = judged(trial) if trial else None
-                if there and there.ran and seen.ran and there.ran.rms < seen.ran.rms:
-                    seen = replace(seen, why=there.why) if there.why and not there.other else seen
-        asked = read.log and not seen.other
-        self.fell = fall_in(task, own, self.read.trial, seen.ran) if asked else None
-        if self.fell and self.log:
-            first, steps = self.found.seconds if self.found else self.log.first, self.fell[0]
-            if name := who_fell(self.log, own, candidates, start_of, first + steps * task.dt):
-                self.fell, seen = (
-                    None,
-                    replace(seen, other=name, why=found("log.another", ran=ran, other=name)),
-                )
+            seen = self._from_opening(self.log, seen)
+        self.fell: tuple[int, Finding] | None = None
+        if read.log and not seen.other:
+            seen = self._fallen(seen)
         self.suspicion = seen
 
-    def _cut(
-        self, log: ForeignLog, apart: ForeignLog | None, start: Start, own: Candidate, task: Task
-    ) -> None:
+    def _judged(
+        self, trial: Trial | None = None, others: Sequence[Candidate] | None = None
+    ) -> Suspicion:
+        """Return whose run a trial, or the one that was cut, seems to be by its commands."""
+        others = self.candidates if others is None else others
+        return suspicion(self.task, trial or self.whole, self.own, others)
+
+    def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
+        """Cut the run where it begins in the log; return whose it is then."""
+        own, candidates, start_of = self.own, self.candidates, self.start_of
+        self.found = start = start_of(own)
+        sender = sender_of(log, own, candidates, start_of)
+        self.exact = sender.own is not None and sender.own.exact
+        if sender.own is not None and sender.sure:
+            self.old = sender.own.old
+        behind = _behind(log, own.policy, start, self.old)
+        if behind:
+            self.found, self.exact, self.old = behind, True, None
+            if abs(behind.seconds - log.first) > ALIGNED * log.interval:
+                self._cut(stored, behind)
+            seen = self._judged()
+        elif start and elsewhere(log, start, own.policy, why=bool(seen.why)):
+            self._cut(stored, start)
+            seen = self._judged()
+        if behind or sender.sure:
+            seen = replace(seen, why=None, other="")
+        elif sender.other:
+            seen = replace(seen, why=sender.why, other=sender.other)
+        elif (rival := rival_in(log, own, candidates, start_of)) is not None:
+            best = self._judged(rival)  # cut where the other candidate fits best
+            told = best if best.other else seen if seen.why else replace(seen, why=best.why)
+            seen = replace(told, ran=seen.ran)
+        guessed = [name for name in log.names[0] if name not in log.logged]
+        doubted = start and guessed and seen.why and not sender.sure
+        if start and doubted and on_other_speeds(log, own, candidates, start_of):
+            if not self.moved:
+                self._cut(stored, start)
+            seen = replace(self._judged(), why=None, other="")
+            self.read = self.read.telling(found("log.speeds", *guessed, ran=own.id))
+        return seen
+
+    def _from_opening(self, log: Recording, seen: Suspicion) -> Suspicion:
+        """Return why it is nobody's from its first commands on: beside the rest all differ more."""
+        for at in log.openings[:1]:
+            trial = log.trial_from(log.on_step(self.own.policy, at))
+            there = self._judged(trial) if trial else None
+            if there and there.ran and seen.ran and there.ran.rms < seen.ran.rms:
+                seen = replace(seen, why=there.why) if there.why and not there.other else seen
+        return seen
+
+    def _fallen(self, seen: Suspicion) -> Suspicion:
+        """Find where the run failed; another candidate's may fall as its own does not."""
+        own, task = self.own, self.task
+        self.fell = fall_in(task, own, self.read.trial, seen.ran)
+        if self.fell and self.log:
+            first, steps = self.found.seconds if self.found else self.log.first, self.fell[0]
+            end = first + steps * task.dt
+            if name := who_fell(self.log, own, self.candidates, self.start_of, end):
+                self.fell = None
+                why = found("log.another", ran=own.id, other=name)
+                return replace(seen, other=name, why=why)
+        return seen
+
+    def _cut(self, stored: ForeignLog, start: Start) -> None:
         """Cut the run from a log where it begins."""
-        ran, begins = own.id, start.seconds + (_sooner(apart, log) if apart else 0)
+        ran, apart = self.own.id, self.apart
+        begins = start.seconds + (_sooner(apart, stored) if apart else 0)
         kept = [one for one in self.read.findings if one.weight is Weight.NOTE]
-        cut_there = replace(cut_log(log, ran, begins), before=self.read.before)
-        self.read = cut_there.telling(*kept)
+        cut_there = replace(cut_log(stored, ran, begins), before=self.read.before)
+        self.read, self.moved = cut_there.telling(*kept), True
         if start.missed:
-            self.read = self.read.telling(not_sent(task, ran, start.missed))
+            self.read = self.read.telling(not_sent(self.task, ran, start.missed))
         elif begins > 0:
             self.read = self.read.telling(found("log.earlier_rows", ran=ran, seconds=begins))
         cut = apart.cut(ran, start.seconds)[0] if apart else self.read.trial
@@ -134,9 +162,9 @@ class Look:
         return bool(self.suspicion.why), math.inf if ran is None else ran.error
 
 
-def _start_of(log: Recording, candidate: Candidate) -> Start | None:
+def _start_of(log: Recording | None, candidate: Candidate) -> Start | None:
     """Return where a candidate's run seems to begin in a log."""
-    return log.start_of(candidate.policy)
+    return log.start_of(candidate.policy) if log else None
 
 
 def _behind(log: Recording, policy: Policy, found: Start | None, old: Array | None) -> Start | None:
