@@ -20,10 +20,17 @@ from grounded.search.candidate import Candidate
 from grounded.search.returned.as_predicted import apart
 from grounded.search.returned.clipped import Clipped, clipped
 from grounded.search.returned.stories import NEARLY_ALL, Kind, Story, Way, scored, ways
-from grounded.search.returned.who_drove import RESEMBLES, SLIGHT, Commanded, commanded, follows
+from grounded.search.returned.who_drove import (
+    EXACT,
+    RESEMBLES,
+    SLIGHT,
+    Commanded,
+    commanded,
+    follows,
+)
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.locating.acted_on import EXACT, FEW, acted_on, held_before
+from grounded_trials.workspace.intake.locating.acted_on import FEW, acted_on, held_before
 from grounded_trials.workspace.intake.locating.missed_steps import other_clock
 from grounded_trials.workspace.intake.locating.run_start import (
     BATCH,
