@@ -71,7 +71,7 @@ class Look:
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
                 seen = replace(seen, why=None, other="")
-        if self.log and seen.why and not seen.other and not (self.found and self.found.opens_alike):
+        if self.log and seen.why and not seen.other:
             seen = self._from_opening(self.log, seen)
         self.fell: tuple[int, Finding] | None = None
         if read.log and not seen.other:
@@ -121,6 +121,8 @@ class Look:
 
     def _from_opening(self, log: Recording, seen: Suspicion) -> Suspicion:
         """Return why it is nobody's from its first commands on: beside the rest all differ more."""
+        if self.found and self.found.opens_alike:
+            return seen
         for at in log.openings[:1]:
             trial = log.trial_from(log.on_step(self.own.policy, at))
             there = self._judged(trial) if trial else None
