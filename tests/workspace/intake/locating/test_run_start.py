@@ -19,7 +19,7 @@ from grounded.search.feedback.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.locating.run_start import recording
-from grounded_trials.workspace.intake.opening import reading
+from grounded_trials.workspace.intake.opening import cutting
 from recorded import LOGGED, RATE, follow, record, waiting
 from workspaces import make
 
@@ -260,7 +260,7 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
     renamed = w.ingest(copy, candidate="c0002")
     assert renamed.known and renamed.trial == first.trial and len(w.trials()) == 2
     with monkeypatch.context() as nothing:  # the search has ended
-        nothing.setattr(reading, "_outstanding", lambda *_: pytest.fail("asked for"))
+        nothing.setattr(cutting, "outstanding", lambda *_: pytest.fail("asked for"))
         assert w.ingest(copy).trial == first.trial
 
 
