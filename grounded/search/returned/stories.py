@@ -164,9 +164,14 @@ def stories(
     before, late, some = _left(plain), latest(task), list[Story]()
     for row in _nearest(rows):
         fit = follows(row.policy, row.run, late)
-        if fit is None or not fit.alike or fit.error >= EXPLAINED:
+        if fit is None:
             continue
-        gained, program = np.log((before + FINE) / (_left(fit) + FINE)), row.kind is Kind.PROGRAM
+        program = row.kind is Kind.PROGRAM
+        share = _moved(own, trial, fit) if program else 1.0
+        if not fit.alike or fit.error >= EXPLAINED * share:
+            continue
+        left = _left(fit) / share
+        gained = np.log((before + FINE) / (left + FINE))
         unit = row.kind is Kind.UNIT and not row.price
         if gained < (ALIKE if plain.alike and not unit else LEADS) + row.price:
             continue
@@ -181,7 +186,7 @@ def stories(
                 _without_feedback(own, trial, fit, row) if program else row.finding,
                 own,
                 seen,
-                _left(fit),
+                left,
                 price=row.price,
                 names=row.names,
                 by=row.by,
@@ -193,6 +198,15 @@ def stories(
 def _left(ran: Following) -> float:
     """Return the rms difference of the commands from the policy's, in units of their size."""
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
+
+
+def _moved(own: Candidate, trial: Trial, fit: Following) -> float:
+    """Return how far the commands that moved most did, relative to their size, at most 1.
+
+    What a program sends that hardly moves is near to any commands that hardly move.
+    """
+    far = np.abs(trial.inputs - own.policy.past).max(axis=0) * FINE / fit.fine
+    return float(np.clip(far.max(), FINE, 1.0))
 
 
 def _nearest(rows: Sequence[Row]) -> list[Row]:
