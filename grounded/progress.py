@@ -1,4 +1,4 @@
-"""Progress of long computations: stage, time taken and left; partial results on Ctrl-C."""
+"""Progress of long computations: stage and time taken; partial results on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -57,51 +57,25 @@ def within(seconds: float) -> Iterator[None]:
 
 @dataclass
 class Stages:
-    """Reports each stage with the time taken, and the most time that may be left.
+    """Reports each stage with the time taken.
 
-    How many stages follow is not known: whether a diagnosis looks for one more effect depends on
-    what the last one left. But a stage begins when at least a known share of the whole is done. So
-    the most time that may be left is told, once `SEEN` of the whole is surely done; it is no bound
-    if the whole is open-ended.
+    The time left is not known to within a factor of two before the end: whether a diagnosis looks
+    for one more effect depends on what the last one left, and its last stages took 3 to 15 % of it.
 
     Args:
         tell: shows a line; None for no output.
-        done: the least share of the whole that is done when a stage begins for the k-th time.
-        open_ended: whether what is found may ask for more stages than those shares were learnt on.
     """
 
     tell: Callable[[str], None] | None
-    done: Callable[[str, int], float]
-    open_ended: bool = False
     began: float = field(default_factory=time.monotonic)
     so_far: str = "nothing was found yet"  # the result so far, for Ctrl-C
     beside: str = ""  # what all further stages are for
-    begun: dict[str, int] = field(default_factory=dict)  # how often each stage began
-    last: str = ""  # the stage of the last call
-    end: float | None = None  # the latest end that was told, seconds after the start
 
-    def __call__(self, stage: str, part: str = "") -> None:
-        """Report that a stage, or a part of it (`, round 2 of at most 8`), begins or continues."""
-        taken = time.monotonic() - self.began
-        if stage + part != self.last:
-            self.begun[stage], self.last = self.begun.get(stage, 0) + 1, stage + part
-            share = self.done(stage, self.begun[stage])
-            self.end = taken / share if share >= SEEN else self.end
-        if self.tell is None:
-            return
-        text = f"{stage}{part}{f' ({self.beside})' * bool(self.beside)}, {duration(taken)} so far"
-        if self.end is not None and (left := _round(self.end - taken)) > 0:
-            most, more = ("", ", more if more is found") if self.open_ended else ("up to ", "")
-            text += f", {most}about {duration(left).replace('.0 ', ' ')} left{more}"
-        self.tell(text)
-
-
-SEEN = 0.05
-
-
-def _round(seconds: float) -> float:
-    """Return a duration in one significant digit below 100 s, else in whole minutes."""
-    return float(f"{seconds:.1g}") if seconds < 100 else 60 * round(seconds / 60)
+    def __call__(self, stage: str) -> None:
+        """Report that a stage begins or continues."""
+        if self.tell is not None:
+            taken = duration(time.monotonic() - self.began)
+            self.tell(f"{stage}{f' ({self.beside})' * bool(self.beside)}, {taken} so far")
 
 
 def duration(seconds: float) -> str:

@@ -126,7 +126,7 @@ def diagnose(
         compare: a second group of trials. Both groups are diagnosed together, and `changed` lists
             the values that differ between them.
         engine: workers that fit hypotheses; the result does not depend on their number.
-        progress: called with the stage, the time taken and the time left, for a display.
+        progress: called with the stage and the time taken, for a display.
 
     Returns:
         The diagnosis, with its verdict, ranking of effects and prediction errors.
@@ -137,7 +137,7 @@ def diagnose(
         GroundedError: if the trials don't fit the model, or hold no data.
     """
     options = _checked(subject, trials, options)
-    tick = Stages(progress, _done, open_ended=True)
+    tick = Stages(progress)
     tick("instruments")
     sound = _sound(subject, trials, compare, options)
     data, looked = sound.data, sound.looked
@@ -361,14 +361,3 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 PAIR = 2  # effects at least that are sought without the leader
-# The least share of a diagnosis that was done when it scanned for the k-th time or reached a stage,
-# in nine blind cases of four systems (7 s in the mean).
-SCANS = (0.05, 0.10, 0.19, 0.29, 0.35, 0.43, 0.50)
-REACHED = {"more effects": 0.35, "predict": 0.76, "leftover": 0.83, "gap": 0.87}
-
-
-def _done(stage: str, time: int) -> float:
-    """Return the least share of a diagnosis that is done when a stage begins for the k-th time."""
-    if stage == "scan":
-        return SCANS[min(time, len(SCANS)) - 1]
-    return REACHED.get(stage, 0.0)

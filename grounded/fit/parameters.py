@@ -80,7 +80,7 @@ def fit(
         one_message: states that are logged in one message, so that all or none of them are late.
         interpolated_s: standard deviation of times [s] because the states were interpolated.
         engine: workers of the likelihood; the result does not depend on them.
-        progress: called with a line on the stage, the time taken and the time left.
+        progress: called with a line on the stage and the time taken.
 
     Returns:
         A `Fit`: values with intervals, the model with these values, and prediction errors on
@@ -104,7 +104,7 @@ def fit(
     if max((trial.known_steps for trial in logged), default=0) < 3:
         raise refused("given.short", what="fit", needs=3)
     # the data of a diagnosis; what is not asked for is constant
-    share, tick = share_of(logged), Stages(progress, _done)
+    share, tick = share_of(logged), Stages(progress)
     tick("instruments")
     data, looked = sound_data(
         model,
@@ -234,7 +234,7 @@ def _with_all(
     crude = search.fits.get((own, 0.0, ())) or search.fits.get((Structure(), 0.0, ()))
     if more is few:
         return search, fit, crude
-    tick("fit", f" to all {more.steps} steps")
+    tick(f"fit to all {more.steps} steps")
     every = Alone(more, late, tick)
     found = [
         every.refined([(one.hypothesis, one.noise, every.fresh(one.hypothesis)[2])], TO_THE_TOP)
@@ -292,10 +292,6 @@ def _tell(tick: Stages, fit: Fitted, data: Data) -> None:
     )
     tick.so_far = f"so far, not converged yet: {told}"
     tick(f"fit, {data.steps} steps")
-
-
-def _done(stage: str, time: int) -> float:
-    return 0.0  # how long a fit takes is not known
 
 
 def _delay(data: Data, inputs: Sequence[int]) -> Effect:

@@ -265,7 +265,7 @@ class Workspace(Folder):
             latency: also fit one transport delay, common to all inputs.
             apply: write the values to grounded.toml.
             engine: workers for the trials' likelihoods; their number does not change the result.
-            progress: called with the stage, the share done and the time left.
+            progress: called with the stage and the time taken.
 
         Raises:
             GroundedError: with `apply`, if the fitted values predict held-out data worse.
