@@ -94,7 +94,8 @@ class Salvage:
                 pos, before = after, 0
                 continue
             opcode, content = self._read(pos, end)
-            if opcode == MESSAGE and before in (CHUNK, MESSAGE_INDEX):  # in a file with chunks
+            chunked = before in (CHUNK, MESSAGE_INDEX)  # such a file has none outside
+            if opcode == MESSAGE and (chunked or self._ended):
                 self.losses.append(found("file.lost", part=_NAMES[MESSAGE], byte=pos))
             elif opcode == MESSAGE:
                 yield from self._message(content)
