@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -23,12 +24,13 @@ from grounded_cli.console.terminal import (
     tinted,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
-from grounded_trials.wording import percent
+from grounded_trials.wording import figure, percent
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding
     from grounded.diagnosis.report import Diagnosis
     from grounded.engine import Engine
+    from grounded_trials.workspace.home.rivals import Compared
 
 
 @click.command("diagnose")
@@ -45,7 +47,7 @@ if TYPE_CHECKING:
     nargs=2,
     metavar="A B",
     shell_complete=complete.trials,
-    help="Two groups of trials, T1,T2 T3,T4: report what changed.",
+    help="Two groups of trials, T1,T2 T3,T4: what changed. Or two models: which predicts better.",
 )
 @click.option(
     "--probe", is_flag=True, help="Write the most informative next trial, even without a tie."
@@ -73,11 +75,19 @@ def command(
     The verdict is one effect, several, none (the rest is noise, or cannot be told from it) or
     unknown (a gap that no known effect explains). If two effects tie, a probe is written: a
     candidate whose trial would tell them apart.
+
+    --compare also takes two models: a workspace (`.` for this one), a model.py, an MJCF or URDF
+    file, or a YAML file with values. It says which predicts the trials better, where, and which
+    numbers they can't decide.
     """
     workspace = open_workspace()
     from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
     from grounded_trials.workspace.last_diagnosis import left_out
 
+    if compare and not all(_GROUP.fullmatch(text) for text in compare):
+        with stages() as tell:
+            compared = workspace.compare(*compare, trials, progress=tell)
+        return show_json(compared.to_json()) if json_ else _models(compared)
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
         raise GroundedError(
@@ -119,6 +129,25 @@ def command(
             show_extent(extent_of(workspace.candidate(found.probe)[0], workspace.task))
         assert found.then is not None
         show(f"\n{next_line(found.then)}")
+
+
+_GROUP = re.compile(r"[tT]\d+(,[tT]\d+)*")
+
+
+def _models(found: Compared) -> None:
+    """Print which of two models to trust."""
+    first, *others = found.findings
+    show(field("trust", first.sentence))
+    for one in others:
+        show(field("open", one.sentence))
+    rows = [
+        (name, *(figure(e) for e in both), found.channels[name] or "undecided")
+        for name, both in found.errors.items()
+    ]
+    show("\n" + table(rows, (f"rms {found.ahead_s:g} s ahead", *found.labels, "better")))
+    if found.numbers:
+        told = [(one.name, *one.values, one.better or "undecided") for one in found.numbers]
+        show("\n" + table(told, ("number", *found.labels, "better")))
 
 
 def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:

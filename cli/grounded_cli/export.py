@@ -48,6 +48,11 @@ USES = {
 @click.option(
     "--model", is_flag=True, help="Write the model with the values found: MJCF, URDF or model.py."
 )
+@click.option(
+    "--library",
+    metavar="FILE.yaml",
+    help="Write what is known of one actuator; ID is its input (default: the only one).",
+)
 @anyway
 @in_workspace
 @as_json
@@ -57,6 +62,7 @@ def command(
     output: str | None,
     runner: bool,
     model: bool,
+    library: str | None,
     anyway: bool,
     json_: bool,
 ) -> None:
@@ -70,10 +76,16 @@ def command(
     current [limits] and [safety].
 
     --model writes the model as it is now, fitted values and adopted effects, in the form that it
-    came in; all else of that file stays as it is.
+    came in; all else of that file stays as it is. --library writes one actuator, from which
+    another workspace begins: `grounded init --actuators FILE`.
     """
-    if (candidate is None) != model or (model and (form or runner or anyway)):
-        raise click.UsageError("expected a candidate, or --model, without other options but -o")
+    for_robot = form or runner or anyway
+    if library is not None and not (model or output or for_robot):
+        return _library(library, candidate, json_)
+    if (candidate is None) != model or library or (model and for_robot):
+        raise click.UsageError(
+            "expected a candidate, --model or --library, each without options of another"
+        )
     if candidate is None:
         return _model(output, json_)
     named = Path(output or "").suffix.lstrip(".").lower()
@@ -115,3 +127,12 @@ def _model(output: str | None, json_: bool) -> None:
     show(f"the model is written to {', '.join(map(str, (done.file, *done.others)))}")
     rows = [(one.name, f"{one.was:g}", one.now.text) for one in done.values]
     show("\n" + table(rows, ("", "was", "now")) if rows else "  nothing in it is changed")
+
+
+def _library(file: str, actuator: str | None, json_: bool) -> None:
+    """Write an actuator, and tell what is known of it."""
+    done = open_workspace().export_actuator(file, actuator)
+    if json_:
+        return show_json(done.to_json())
+    show(f"{done.actuator} is written to {done.file}\n")
+    show(table([(key, one.text) for key, one in done.values.items()], ("number", "value")))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from grounded.findings import found as finding
 from grounded.result import listed
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, table_layout
@@ -55,6 +57,12 @@ FEW = 8  # alternative signals listed for an unsure state or input
     metavar="SECONDS",
     help="Control interval (the log's; 0.05 with --blank).",
 )
+@click.option(
+    "--actuators",
+    multiple=True,
+    metavar="FILE[:INPUT,...]",
+    help="Begin with an actuator that `export --library` wrote, for inputs of its unit or these.",
+)
 @click.option("--yes", is_flag=True, help="Ask nothing: use the best guesses, marked as such.")
 @click.option(
     "--example",
@@ -74,6 +82,7 @@ def command(
     inputs: str | None,
     layout: Layout,
     dt: float | None,
+    actuators: tuple[str, ...],
     yes: bool,
     name: str | None,
     list_: bool,
@@ -104,6 +113,7 @@ def command(
         raise click.UsageError("an example has its own model and dt: edit its files afterwards")
     elif blank:
         _blank(folder, model, dt, json_)
+        _with(folder, actuators)
     elif log is not None:
         from pathlib import Path
 
@@ -114,9 +124,20 @@ def command(
             named = names_in(inputs)
             about: Any = {"model": model, "kind": kind, "dt": dt, "layout": layout}
             begun = begin(Path(folder), log, inputs=named, ask=asked, **about)
+        _with(folder, actuators)
         show_json(begun.to_json()) if json_ else _tell(begun)
     else:
         _example(folder, str(name), json_)
+        _with(folder, actuators)
+
+
+def _with(folder: str, actuators: Sequence[str]) -> None:
+    """Begin with actuators of other workspaces."""
+    if actuators:
+        from grounded_trials import Workspace
+
+        effects = Workspace(folder).begin_with(*actuators)
+        tell([finding("model.begun", *(str(effect["name"]) for effect in effects))], all_=True)
 
 
 def _ask(guess: Guess) -> str:

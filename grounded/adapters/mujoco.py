@@ -70,7 +70,7 @@ HUGE = 1e9  # MuJoCo treats 1e10 as unstable: it warns and stops
 
 
 def model(
-    xml: str | Path,
+    xml: Any,
     *,
     params: Sequence[str] | Mapping[str, float | tuple[float, ...]] = (),
     inputs: str | Sequence[str] = "auto",
@@ -83,8 +83,8 @@ def model(
     """Return the Model of an MJCF or URDF file.
 
     Args:
-        xml: path of the file, or MJCF text. In a model.py, a relative path is looked up beside that
-            file, then in the current folder.
+        xml: path of the file, MJCF text, or an MjModel. In a model.py, a relative path is looked up
+            beside that file, then in the current folder.
         params: parameters that can be set, fitted or diagnosed, as "element.field": `mass` of a
             body (its inertia scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of
             a joint; `gear`, `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. In a
@@ -124,7 +124,8 @@ def model(
     several = threads or min(cores(), MOST_THREADS)
     stepper = MujocoStepper(compiled, coordinates, states, kept, controls, settings, several)
     stepper.without = left_out
-    stepper.source = None if str(xml).lstrip().startswith("<") else located(xml).resolve()
+    on_disk = isinstance(xml, Path) or (isinstance(xml, str) and not xml.lstrip().startswith("<"))
+    stepper.source = located(xml).resolve() if on_disk else None
     free = [
         joint_name(compiled, j)
         for j in range(compiled.njnt)
@@ -191,6 +192,12 @@ class MujocoStepper(Stepper):
     def timestep(self) -> float:
         """The simulation's step [s]; a control step is a whole multiple of it."""
         return self._own
+
+    def compiled(self, p: Array) -> Any:
+        """Return a copy of the model with parameters p (k,)."""
+        found = copy.deepcopy(self._model)
+        self._write(found, p)
+        return found
 
     def _prepare(self) -> None:
         mj, compiled = library("mujoco"), self._model
@@ -286,8 +293,7 @@ class MujocoStepper(Stepper):
         """Return the model with parameters p (k,); the most recent copies are cached."""
         found = self._copies.pop(p.tobytes(), None)
         if found is None:
-            found = copy.deepcopy(self._model)
-            self._write(found, p)
+            found = self.compiled(p)
         self._copies[p.tobytes()] = found
         for old in list(self._copies)[: -2 * MOST_COPIES]:
             del self._copies[old]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,15 @@ from grounded.adapters.stepper import library
 from grounded.errors import GroundedError
 
 
-def load(xml: str | Path) -> Any:
-    """Return the compiled file (an MjModel).
+def load(xml: Any) -> Any:
+    """Return the compiled file (an MjModel) of a path or of MJCF text; a compiled one as it is.
 
     Raises:
         GroundedError: if the file is missing or MuJoCo can't load it, with MuJoCo's reason.
     """
     mj = library("mujoco")
+    if isinstance(xml, mj.MjModel):
+        return copy.deepcopy(xml)
     if str(xml).lstrip().startswith("<"):
         shown, path = "the MJCF text", None
     elif not (path := located(xml)).is_file():

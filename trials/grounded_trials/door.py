@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.discarding import SetAside
     from grounded_trials.workspace.exciting import Excited
     from grounded_trials.workspace.fitting import Fitted
+    from grounded_trials.workspace.home.library import Shelved
+    from grounded_trials.workspace.home.rivals import Compared
     from grounded_trials.workspace.home.taking_home import TakenHome
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.intake.ingest import Ingested
@@ -318,6 +320,27 @@ class Workspace(Folder):
             progress=progress,
         )
 
+    def compare(
+        self,
+        first: str | Path,
+        second: str | Path,
+        trials: Sequence[str] = (),
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> Compared:
+        """Compare two models on the stored trials: which predicts better, where, and which numbers.
+
+        Args:
+            first: a folder (a workspace; "." for this one), a model.py, an MJCF or URDF file, or a
+                YAML file with values of this model.
+            second: likewise.
+            trials: short names such as t0007; empty: all usable trials.
+            progress: called with each stage.
+        """
+        from grounded_trials.workspace.home.rivals import compare_models
+
+        return compare_models(self.forget(), str(first), str(second), trials, progress)
+
     def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
         """Check the sensors of some or all trials for delays and scale errors, from their data."""
         from grounded_trials.workspace.diagnosing import instruments_in
@@ -424,6 +447,30 @@ class Workspace(Folder):
         from grounded_trials.workspace.home.taking_home import export_model
 
         return export_model(self.forget(), Path(path) if path else None)
+
+    def export_actuator(self, path: str | Path, actuator: str | None = None) -> Shelved:
+        """Write what is known of one actuator as a YAML file that another workspace begins from.
+
+        Args:
+            path: the file.
+            actuator: the input; None: the only one.
+        """
+        from grounded_trials.workspace.home.library import export_actuator
+
+        return export_actuator(self.forget(), Path(path), actuator)
+
+    def begin_with(self, *actuators: str) -> tuple[Mapping[str, Any], ...]:
+        """Begin with actuators that were exported: their values as effects, their +- as priors.
+
+        Args:
+            actuators: files; FILE:INPUT,INPUT for these inputs, else for all with its unit.
+
+        Returns:
+            [model] effects.
+        """
+        from grounded_trials.workspace.home.library import begin_with
+
+        return begin_with(self.forget(), actuators)
 
     def verify(self) -> Verified:
         """Check all stored files for changes, damage, deletion and replacement.

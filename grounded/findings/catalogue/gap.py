@@ -215,4 +215,16 @@ ENTRIES: dict[str, Entry] = {
         "no run inside the limits would tell [[{effect} from {others}]][[{value} better]]",
         "[[claimed? adopt {claimed}]][[!claimed? record larger inputs or another manoeuvre]]",
     ),
+    # two models
+    "trusted": Entry(
+        "note",
+        "{better} predicts these trials better: errors of {worse} are {ratio:.3g} times as large",
+    ),
+    "undecided": Entry("note", "these trials can't decide between {about}"),
+    "undecided_numbers": Entry(
+        "note",
+        "these trials can't decide {about}",
+        "record runs in which {about:it/they} matter{about:s/}",
+    ),
+    "rival_lost": Entry("refuse", "{about} can't follow these trials at all"),
 }

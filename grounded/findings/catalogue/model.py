@@ -218,4 +218,27 @@ ENTRIES: dict[str, Entry] = {
         "[[long? write it with fewer steps, or give the model as step=, which is run as it is]]"
         "[[!long? use np.where: that holds for these parameters only]]",
     ),
+    # models that are compared
+    "yaml": Entry(
+        "refuse",
+        "{about} can't be read: {why}",
+        "write `name: value` a line, with params: and effects: as tables",
+    ),
+    "no_rival": Entry(
+        "refuse",
+        "there is no {about}",
+        "name a workspace, a model.py, an MJCF or URDF file, or a YAML file with values",
+    ),
+    "not_loaded": Entry("refuse", "MuJoCo can't load {about}: {why}"),
+    "other_names": Entry(
+        "refuse",
+        "{about} has other states or inputs than this workspace's model",
+        "compare models of one robot, with the same names",
+    ),
+    # an actuator on its own
+    "which_actuator": Entry("refuse", "one input is to be named: {named}"),
+    "nothing_found": Entry(
+        "refuse", "nothing is known of {about} beyond the model", "adopt or fit something first"
+    ),
+    "begun": Entry("note", "the model begins with {about}, as sure as that file is of each value"),
 }

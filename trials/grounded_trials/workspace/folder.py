@@ -140,10 +140,19 @@ class Folder:
         from grounded.search.planner import Planner
 
         if not self.config.model.effects:
-            return Planner(self.task, self.task)
+            return self._believed(Planner(self.task, self.task))
         from grounded_trials.workspace.adopted import planner_of
 
-        return planner_of(self.task, self.config.model.effects)
+        return self._believed(planner_of(self.task, self.config.model.effects))
+
+    def _believed(self, planner: Planner) -> Planner:
+        """Return the planner with the standard deviations of [model] priors."""
+        priors, model = self.config.model.priors, planner.plan.model
+        if not priors:
+            return planner
+        check_names(priors, list(model.params), "grounded.toml: [model] priors: parameter")
+        own = {name: replace(model.params[name], std=std) for name, std in priors.items()}
+        return planner.with_model(replace(model, params={**model.params, **own}))
 
     @cached_property
     def _trials(self) -> tuple[StoredTrial, ...]:

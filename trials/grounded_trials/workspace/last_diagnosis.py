@@ -267,9 +267,22 @@ def newer_alone(diagnosis: Diagnosis) -> NextCommand:
 
 
 def write_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    """Write which trials and model a fit was made from, and whether it predicts better."""
-    made = _made_from(workspace, used) | {"helps": found.helps}
+    """Write what a fit was made from, whether it predicts better, and its values with their std."""
+    finite = {
+        n: e for n, e in found.params.items() if math.isfinite(e.value) and math.isfinite(e.std)
+    }
+    known = {name: [e.value, e.std] for name, e in finite.items()}
+    made = _made_from(workspace, used) | {"helps": found.helps, "known": known}
     write_document(made_folder(workspace.reports) / FIT, made)
+
+
+def as_fitted(workspace: Folder) -> dict[str, tuple[float, float]]:
+    """Return value and standard deviation by parameter of the last fit of all; {} without one."""
+    try:
+        known = read_document(workspace.reports / FIT).get("known", {})
+        return {str(name): (float(value), float(std)) for name, (value, std) in known.items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, GroundedError):
+        return {}
 
 
 def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from grounded.adapters.mujoco import MujocoStepper
-from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS
+from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.adapters.stepper import library
 
 Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
@@ -116,7 +116,7 @@ class Held:
 
     def dof(self, state: str) -> int:
         """Return the degree of freedom of a hinge's or slide's velocity or position, else -1."""
-        names, nv = self.stepper.states, self.file.nv
+        names, nv = list(states_of(self.file)), self.file.nv
         dof = names.index(state) % nv if state in names[: 2 * nv] else -1
         single = dof >= 0 and self.file.jnt_type[self.file.dof_jntid[dof]] >= SLIDE
         return dof if single else -1

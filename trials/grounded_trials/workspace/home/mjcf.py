@@ -35,6 +35,7 @@ OWN = {
     ("position", "tau"): "timeconst",
     ("position", "lag"): "timeconst",
 }
+POINT = 1e-9  # [kg m^2] inertia of a payload, which MuJoCo wants to be positive
 GAINS, BIASES = ("fixed", "affine"), ("none", "affine")  # mjtGain, mjtBias
 LAGS = {0: "none", 2: "filter", 3: "filterexact"}  # mjtDyn
 
@@ -149,7 +150,8 @@ class Mjcf:
 
     def _mass(self, element: Element, number: Number) -> bool:
         """Scale the mass and the inertia of a body."""
-        factor, text = number.value / number.was, element.text
+        factor = number.value / number.was if number.was else 0.0  # a payload is a point
+        text = element.text
         inertial = next((one for one in self._inside(element) if one.tag == "inertial"), None)
         if inertial is None:
             model, i = self.compiled, number.index
@@ -157,7 +159,7 @@ class Mjcf:
                 "pos": model.body_ipos[i],
                 "quat": model.body_iquat[i],
                 "mass": [number.value],
-                "diaginertia": model.body_inertia[i] * factor,
+                "diaginertia": np.maximum(model.body_inertia[i] * factor, POINT),
             }
             inertial = text.child(element, "inertial")
             for name, each in row.items():

@@ -34,6 +34,7 @@ from grounded_trials.workspace.home.mjcf import Mjcf
 from grounded_trials.workspace.home.python_file import with_values
 from grounded_trials.workspace.home.urdf import Urdf
 from grounded_trials.workspace.home.xml_text import XmlText, commented
+from grounded_trials.workspace.last_diagnosis import as_fitted
 
 SAME = 1e-6  # relative difference of a value from the one whose +- is known
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
@@ -100,9 +101,10 @@ def export_model(workspace: Folder, path: Path | None) -> TakenHome:
 def known_values(workspace: Folder) -> dict[str, Estimate]:
     """Return the values of parameters and adopted effects, by parameter name, with their +-.
 
-    The +- is that of the adoption, NaN if the value is another one now.
+    The +- is that of the adoption or of the last fit, NaN if the value is another one now.
     """
-    adopted, now = as_adopted(workspace), dict[str, Estimate]()
+    sources = [{n: (e.value, e.std) for n, e in as_adopted(workspace).items()}]
+    sources, now = [*sources, as_fitted(workspace)], dict[str, Estimate]()
     for name, param in workspace.base_model.params.items():
         now[name] = Estimate(param.value, unit=param.unit)
     for effect in workspace.config.model.effects:
@@ -112,9 +114,9 @@ def known_values(workspace: Folder) -> dict[str, Estimate]:
                 name = param_name(str(effect["name"]), q)
                 now[name] = Estimate(float(value), unit=units.get(q, ""))
     for name, one in now.items():
-        known = adopted.get(name)
-        if known and math.isclose(known.value, one.value, rel_tol=SAME, abs_tol=1e-12):
-            now[name] = Estimate(one.value, known.std, unit=one.unit)
+        for value, std in (source[name] for source in sources if name in source):
+            if math.isclose(value, one.value, rel_tol=SAME, abs_tol=1e-12):
+                now[name] = Estimate(one.value, std, unit=one.unit)
     return now
 
 

@@ -49,7 +49,7 @@ class Urdf:
         mass = inertial and inertial.first("mass")
         if not (inertial and mass):
             return False
-        factor = number.value / number.was
+        factor = number.value / number.was if number.was else 1.0
         self.text.set(mass, "value", f"{number.value:.8g}")
         inertia = inertial.first("inertia")
         for name, given in list(inertia.attributes.items()) if inertia else ():

@@ -35,6 +35,7 @@ class ModelTable:
     module: str = ""
     params: Mapping[str, float] = field(default_factory=dict)
     effects: tuple[Mapping[str, Any], ...] = ()
+    priors: Mapping[str, float] = field(default_factory=dict)
     smoothing: float = 0.05
 
 
@@ -217,6 +218,11 @@ def as_toml(
             array.append(_inline(effect))
         found["effects"] = array.multiline(len(effects) > 1)
     return found
+
+
+def set_priors(file: Path, priors: Mapping[str, float]) -> None:
+    """Replace [model] priors."""
+    _change(file, "model", {"priors": _inline(priors)})
 
 
 def set_latency(file: Path, latency: Mapping[str, float]) -> None:

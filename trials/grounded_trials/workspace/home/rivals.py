@@ -1,0 +1,285 @@
+"""diagnose --compare of two models, or sets of values: which one to trust, where, and of what.
+
+A model comes from a workspace (a folder, `.` for this one), a model.py, an MJCF or URDF file, or a
+YAML file with values for this workspace's model. Both predict the stored trials as they are
+(`grounded.diagnosis.rivals`). Each number in which they differ is then exchanged alone: if neither
+model predicts better or worse with the other's value, the trials cannot decide it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.accounts.sound_trials import sound_trials
+from grounded.adapters.mujoco import MujocoStepper
+from grounded.diagnosis.levels import LEAST, SURE
+from grounded.diagnosis.rivals import Predicted, predicted
+from grounded.errors import GroundedError
+from grounded.findings import Finding, Quantity
+from grounded.findings import found as finding
+from grounded.model import Model
+from grounded.result import Result
+from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.home.files_of_others import numbers_of_file, simulated_model
+from grounded_trials.workspace.home.yaml_file import number_in, read_yaml
+from grounded_trials.workspace.last_diagnosis import chosen, ids_of
+from grounded_trials.workspace.user_files.model_file import load_module, model_in
+from grounded_trials.workspace.where_to_mend import one_message
+
+Effects = tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """One of two models that are compared.
+
+    Attributes:
+        label: what the user called it.
+        model: with its values.
+        effects: as in [model] effects.
+        latency: of inputs [s].
+        compiled: of MuJoCo, the compiled file with its values.
+    """
+
+    label: str
+    model: Model
+    effects: Effects
+    latency: Mapping[str, float]
+    compiled: Any = None
+
+    def numbers(self) -> dict[str, Any]:
+        """Return what it consists of by name: parameters, latencies, effects (None: without it)."""
+        own = {name: param.value for name, param in self.model.params.items()}
+        late = {f"latency:{name}": value for name, value in self.latency.items()}
+        return {**own, **late, **{str(effect["name"]): effect for effect in self.effects}}
+
+    def having(self, name: str, value: Any) -> Rival:
+        """Return it with one number or effect of another model; None removes an effect."""
+        if name in self.model.params:
+            return replace(self, model=self.model.with_values({name: value}))
+        if name.startswith("latency:"):
+            late = {**self.latency, name.partition(":")[2]: value or 0.0}
+            return replace(self, latency=late)
+        effects = [effect for effect in self.effects if effect["name"] != name]
+        at = next((i for i, e in enumerate(self.effects) if e["name"] == name), len(effects))
+        if value is not None:
+            effects.insert(at, value)
+        return replace(self, effects=tuple(effects))
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A number in which two models differ, and what the trials say of it."""
+
+    name: str
+    values: tuple[str, str]  # of the two models
+    better: str  # the label of the model whose value predicts better; "" if it can't be decided
+
+    def to_json(self) -> dict[str, Any]:
+        """Return its entry in the document."""
+        return {"values": list(self.values), "better": self.better or None}
+
+
+@dataclass(frozen=True, repr=False)
+class Compared(Result):
+    """Which of two models predicts the stored trials better."""
+
+    labels: tuple[str, str]
+    better: str  # a label; "" if it can't be decided
+    gain: Quantity  # mean log ratio of errors, of the second over the first
+    ahead_s: float  # how far ahead `errors` are
+    errors: Mapping[str, tuple[float, float]]  # rms by state of both
+    channels: Mapping[str, str]  # the label that predicts a state better, "" if undecided
+    numbers: tuple[Decided, ...]
+    trials: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    def summary(self) -> str:
+        """Return what was found."""
+        return self.findings[0].sentence
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `diagnose --compare` for two models."""
+        return {
+            "models": list(self.labels),
+            "better": self.better or None,
+            "gain": self.gain.to_json(),
+            "ahead_s": self.ahead_s,
+            "where": {
+                name: {"errors": list(both), "better": self.channels[name] or None}
+                for name, both in self.errors.items()
+            },
+            "numbers": {one.name: one.to_json() for one in self.numbers},
+            "trials": list(self.trials),
+            "findings": [one.to_json() for one in self.findings],
+        }
+
+
+def compare_models(
+    workspace: Folder,
+    first: str,
+    second: str,
+    trials: Sequence[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Compared:
+    """Compare two models on the stored trials, see `Workspace.compare`.
+
+    Raises:
+        GroundedError: if one can't be read, or has other states or inputs than this workspace.
+    """
+    tick = progress or (lambda stage: None)
+    one, other = _aligned(workspace, _rival(workspace, first), _rival(workspace, second))
+    used = chosen(workspace, trials).trials
+    looked = sound_trials(workspace.task, used, (), None, one_message(workspace)).trials
+
+    def errors(rival: Rival) -> Predicted:
+        own = replace(workspace.task, model=rival.model, latency=_latency(rival))
+        planner = planner_of(own, rival.effects)
+        hidden = planner.plan.model.state_names[own.model.n :]
+        return predicted(planner.plan, [planner.lift(trial) for trial in looked], hidden)
+
+    tick("predict")
+    a, b = errors(one), errors(other)
+    labels = (one.label, other.label)
+    mine, theirs = one.numbers(), other.numbers()
+    numbers = []
+    for name in (n for n in {**mine, **theirs} if not _same(mine.get(n), theirs.get(n))):
+        tick(name)
+        swapped = one.having(name, theirs.get(name)), other.having(name, mine.get(name))
+        votes = {a.better(errors(swapped[0])), -b.better(errors(swapped[1]))} - {0}
+        better = "" if len(votes) != 1 else labels[1] if 1 in votes else labels[0]
+        texts = _text(mine.get(name)), _text(theirs.get(name))
+        numbers.append(Decided(name, texts, better))
+    return _result(labels, a, b, numbers, ids_of(used))
+
+
+def _result(
+    labels: tuple[str, str],
+    a: Predicted,
+    b: Predicted,
+    numbers: Sequence[Decided],
+    trials: tuple[str, ...],
+) -> Compared:
+    """Return the comparison of two models with the same trials."""
+    way, gain = a.better(b), a.gain(b)
+    better = {1: labels[1], -1: labels[0], 0: ""}[way]
+    ahead = len(a.by_horizon) - 2 if len(a.by_horizon) > 1 else 0  # the last one before the whole
+    errors = {
+        name: (value, b.by_horizon[ahead][1][name])
+        for name, value in a.by_horizon[ahead][1].items()
+    }
+    sure = np.abs(gain.channels) > np.maximum(SURE * gain.scatters, LEAST)
+    channels = {
+        name: (labels[1] if more > 0 else labels[0]) if clear else ""
+        for name, more, clear in zip(errors, gain.channels, sure, strict=True)
+    }
+    size = Quantity(gain.mean, "1", gain.scatter)
+    if better:
+        worse = labels[0] if way > 0 else labels[1]
+        ratio = float(np.exp(abs(gain.mean)))
+        told = [finding("gap.trusted", better, better=better, worse=worse, ratio=ratio)]
+    else:
+        told = [finding("gap.undecided", *labels)]
+    if open_ := [one.name for one in numbers if not one.better]:
+        told.append(finding("gap.undecided_numbers", *open_))
+    ahead_s = a.by_horizon[ahead][0]
+    return Compared(
+        labels, better, size, ahead_s, errors, channels, tuple(numbers), trials, tuple(told)
+    )
+
+
+def _rival(workspace: Folder, text: str) -> Rival:
+    """Return the model that a path names."""
+    path, here = Path(text), workspace.config
+    if path.is_dir() or path.suffix == ".toml":
+        other = workspace if text == "." else Folder(path if path.is_dir() else path.parent)
+        late, effects = other.config.task.latency, other.config.model.effects
+        return Rival(text, other.base_model, tuple(effects), late)
+    if not path.is_file():
+        raise GroundedError(finding("model.no_rival", text))
+    if path.suffix == ".py":
+        return Rival(
+            text, model_in(load_module(path.resolve().parent, path.name)), (), here.task.latency
+        )
+    if path.suffix in (".yaml", ".yml"):
+        return _of_values(workspace, path)
+    return _of_file(workspace, path)
+
+
+def _of_file(workspace: Folder, path: Path) -> Rival:
+    """Return the model of an MJCF or URDF file; its delays and lags are latency and effects."""
+    compiled, late, effects = simulated_model(path)
+    step = workspace.base_model.step
+    own = step if isinstance(step, MujocoStepper) else None
+    model = numbers_of_file(compiled, (), own)
+    return Rival(str(path), model, effects, late, compiled)
+
+
+def _of_values(workspace: Folder, path: Path) -> Rival:
+    """Return this workspace's model with the values of a YAML file."""
+    table, model = read_yaml(path), workspace.base_model
+    params = table.pop("params", {}) or {}
+    effects = table.pop("effects", None)
+    values = {**params, **table}
+    given = {str(n): number_in(path, str(n), value)[0] for n, value in values.items()}
+    own = tuple(workspace.config.model.effects)
+    if effects is not None:
+        own = tuple(
+            {"name": str(name)} | {q: number_in(path, q, v)[0] for q, v in dict(c).items()}
+            for name, c in dict(effects).items()
+        )
+    return Rival(str(path), model.with_values(given), own, workspace.config.task.latency)
+
+
+def _aligned(workspace: Folder, one: Rival, other: Rival) -> tuple[Rival, Rival]:
+    """Return two models with the same states, and of files with the numbers they differ in."""
+    if one.compiled is not None or other.compiled is not None:
+        pair = [
+            replace(rival, compiled=rival.compiled or _compiled(rival)) for rival in (one, other)
+        ]
+        step = workspace.base_model.step
+        own = step if isinstance(step, MujocoStepper) else None
+        files = [rival.compiled for rival in pair if rival.compiled is not None]
+        if len(files) == len(pair):
+            make = partial(numbers_of_file, others=files, like=own)
+            one, other = (replace(rival, model=make(rival.compiled)) for rival in pair)
+    base = workspace.base_model
+    for rival in (one, other):
+        names = rival.model.state_names, rival.model.input_names
+        if names != (base.state_names, base.input_names):
+            raise GroundedError(finding("model.other_names", rival.label))
+    return one, other
+
+
+def _compiled(rival: Rival) -> Any:
+    """Return the compiled file of a model with its values; None if it is not MuJoCo's."""
+    step = rival.model.step
+    return step.compiled(rival.model.values) if isinstance(step, MujocoStepper) else None
+
+
+def _latency(rival: Rival) -> Any:
+    return np.array([rival.latency.get(name, 0.0) for name in rival.model.input_names])
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two numbers, or the values of two effects, are equal."""
+    if isinstance(one, float | int) and isinstance(other, float | int):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return bool(one == other)
+
+
+def _text(value: Any) -> str:
+    """Return a number or an effect's values for a table."""
+    if value is None:
+        return "-"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{q} {v:.4g}" for q, v in value.items() if q != "name")
+    return f"{value:.4g}"
