@@ -150,7 +150,7 @@ class Folder:
         priors, model = self.config.model.priors, planner.plan.model
         if not priors:
             return planner
-        check_names(priors, list(model.params), "grounded.toml: [model] priors: parameter")
+        known("parameter", priors, model.params, "the model", "grounded.toml: [model] priors")
         own = {name: replace(model.params[name], std=std) for name, std in priors.items()}
         return planner.with_model(replace(model, params={**model.params, **own}))
 
