@@ -131,7 +131,7 @@ def command(
         show(f"\n{next_line(found.then)}")
 
 
-_GROUP = re.compile(r"[tT]\d+(,[tT]\d+)*")
+_GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
 
 
 def _models(found: Compared) -> None:

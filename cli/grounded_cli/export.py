@@ -76,8 +76,8 @@ def command(
     current [limits] and [safety].
 
     --model writes the model as it is now, fitted values and adopted effects, in the form that it
-    came in; all else of that file stays as it is. --library writes one actuator, from which
-    another workspace begins: `grounded init --actuators FILE`.
+    came in; all else of that file stays as it is. --library writes one actuator, from which another
+    workspace begins (`grounded init --actuators`).
     """
     for_robot = form or runner or anyway
     if library is not None and not (model or output or for_robot):

@@ -145,10 +145,10 @@ def probe(
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
-        safe = [run for run in runs if run is not None and safe(task, run)]
-        if len(safe) < len(runs):
+        kept = [run for run in runs if run is not None and safe(task, run)]
+        if len(kept) < len(runs):
             continue
-        expected = min(way.adds(run) for way, run in zip(ways, safe, strict=True))
+        expected = min(way.adds(run) for way, run in zip(ways, kept, strict=True))
         if best is None or expected > best[0]:
             best = (expected, candidate, words)
     if best is None:

@@ -137,7 +137,7 @@ def _address(text):
 def test_no_cluster_is_said_so(monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed")
     monkeypatch.setattr("grounded.engine.CONNECT_S", 1.0)
-    with pytest.raises(GroundedError, match=holding("Dask", "tcp://127.0.0.1:9")):
+    with pytest.raises(GroundedError, match=holding("tcp://127.0.0.1:9")):
         run_jobs(draws(1), Engine(name="dask", address="tcp://127.0.0.1:9"))
 
 

@@ -143,13 +143,9 @@ def test_refusals() -> None:
         encoded_candidate(replace(policy, gain=gain), x, u, {})
     with pytest.raises(GroundedError, match=holding("(21, 3)", "(20, 3)")):
         encoded_candidate(policy, x[1:], u, {})
-    with pytest.raises(
-        GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
-    ):
+    with pytest.raises(GroundedError, match=holding("grounded trial 1", "grounded candidate 1")):
         read_trial(encoded_candidate(policy, x, u, {})[0])
-    with pytest.raises(
-        GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
-    ):
+    with pytest.raises(GroundedError, match=holding("grounded trial 1", "grounded candidate 1")):
         read_candidate(trial_bytes(a_trial(), {}))
     with pytest.raises(GroundedError, match=holding("/nowhere/t.mcap")):
         read_trial("/nowhere/t.mcap")
@@ -206,7 +202,7 @@ def test_a_live_trial_on_a_full_disk_says_so() -> None:
     with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
         for k in range(1000):
             writer.append(k * 0.1, np.zeros(1), np.zeros(1))
-    with pytest.raises(GroundedError, match="expected 1 numbers"):
+    with pytest.raises(GroundedError, match=holding("(1,)", "(2,)")):
         writer.append(0.0, np.zeros(2), None)
 
 

@@ -29,7 +29,7 @@ def test_a_recovered_log_is_an_mcap_file_in_a_folder_that_exists(tmp_path):
 
 @pytest.mark.parametrize(
     ("rows", "named"),
-    [(["t,mode", "0,auto", "0.1,man", "0.2,man"], "mode"), (["t", "0", "0.1", "0.2"], "times")],
+    [(["t,mode", "0,auto", "0.1,man", "0.2,man"], "mode"), (["t", "0", "0.1", "0.2"], "run.csv")],
 )
 def test_init_writes_nothing_for_a_log_without_numbers(tmp_path, rows, named):
     log = tmp_path / "run.csv"

@@ -299,7 +299,7 @@ def test_repeats_that_do_not_fit_any_more_are_not_begun():
     story = Story(max_trials=5, repeats=3).add().add().add()
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
-    with pytest.raises(GroundedError, match=holding("repeats = 3", "max_trials = 2")):
+    with pytest.raises(GroundedError, match=holding("repeats", "3", "2")):
         SearchOptions(repeats=3, max_trials=2)
 
 

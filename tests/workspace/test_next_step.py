@@ -422,7 +422,7 @@ def test_all_claimed_effects_are_adopted_at_once(w):
     ("changes", "names", "facts"),
     [
         ({}, ["viscous_friction:v", "delay:forse"], ["'delay:force'"]),
-        ({}, ["viscous_friction:v", "delay:force"], ["delay:force", "(viscous_friction:v)"]),
+        ({}, ["viscous_friction:v", "delay:force"], ["delay:force", "viscous_friction:v"]),
         (UNKNOWABLE, ["viscous_friction:v"], []),
     ],
 )

@@ -119,9 +119,9 @@ def test_a_joint_effect_is_offered_of_the_inputs_that_move():
     (late,) = (e for e in all_of_them if e.name == "delay:u1+u2+u3")
     assert Library().effect("delay:u2+u3", ARM, data.scales).site.targets == ("u2", "u3")
     assert [e.name for e in knowable(data, [late], [late.name])] == [late.name]  # it is adopted
-    with pytest.raises(GroundedError, match="does not apply"):
+    with pytest.raises(GroundedError, match="delay:"):
         Library().effect("delay:u3+u2", ARM)
-    with pytest.raises(GroundedError, match="does not apply"):
+    with pytest.raises(GroundedError, match="delay:"):
         Library().effect("delay:u2+u4", ARM)
 
 

@@ -157,7 +157,7 @@ def _check_end(shape: str, name: str, asked: float, end: float, model: Model) ->
     if abs(end - asked) > NEAR * max(abs(asked), 1.0):
         unit = model.states[name]
         facts = {"end": f"{end:.3g} {unit}", "hold": int(asked == 0)}
-        raise refused("start.follows_path", name, asked=f"{asked:g}", why="ends", **facts)
+        raise refused("start.follows_path", name, asked=f"{asked:g}", why="ends", rate=1, **facts)
 
 
 def _carrying(
@@ -281,7 +281,7 @@ def line_target(
     carrying = _carrying(model, columns, moved, [*to]) if moved else {}
     for name in carrying:
         if to[name]:
-            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="rest")
+            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="rest", rate=1)
     return columns | carrying
 
 

@@ -33,6 +33,8 @@ DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
 _TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+MENDS = {errno.ENOSPC: "space", errno.EDQUOT: "space"}
+MENDS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "permission")
 POLL_S = 0.01  # [s] between two attempts to lock a folder that another process has locked
 OLD_S = 3600.0  # [s] age at which a temporary file counts as abandoned
 
@@ -259,8 +261,8 @@ class Store:
                 lock.release()
 
     def _unwritable(self, error: OSError) -> GroundedError:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return unwritable(self.folder, error, mend="space" if full else "permission")
+        mend = MENDS.get(error.errno or 0)
+        return unwritable(self.folder, error, **({"mend": mend} if mend else {}))
 
 
 def made_folder(folder: Path) -> Path:

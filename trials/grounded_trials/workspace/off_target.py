@@ -84,6 +84,7 @@ class OffTarget(Document):
                 told |= {"end": size(at_end)} if at_end else {"there": 1}
                 unsure = self.end_std > UNSURE * at_end
                 told |= {"std": size(self.end_std), "runs": self.runs} if unsure else {}
+            told |= {"also": int("rms" in told)}
         return found("run.off_target", self.what, **told)
 
     def summary(self) -> str:

@@ -74,7 +74,7 @@ def refuse_known_data(
     waits = now.outstanding.id if now.outstanding and now.phase == "await-trial" else ""
     then = to_run(workspace, waits) if waits else NextCommand("status")
     if wanted:
-        facts = {"used": "data", "wanted": wanted, "waits": waits or wanted}
+        facts = {"used": "data", "wanted": wanted, "waits": waits or wanted, "both": 1}
         raise refused("log.stored", path, trial=identity, then=then, **facts)
     facts = {"used": "data", "waits": waits}
     raise refused("log.stored", path, trial=identity, then=then, **facts)
