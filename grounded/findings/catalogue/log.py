@@ -312,8 +312,8 @@ ENTRIES: dict[str, Entry] = {
         "{about} is stored already, as {trial}[[ ({used})]][[part?, a part of it]][[other?, read "
         "in another way (another [log], [estimate] or [task] dt)]]",
         "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted} all the "
-        "same, discard {trial} and ingest it again]][[part? discard that and ingest this]][[other? discard "
-        "{trial} and ingest it again]]",
+        "same, discard {trial} and ingest it again]][[part? discard that and ingest this]]"
+        "[[other? discard {trial} and ingest it again]]",
     ),
     "foreign_run": Entry(
         "refuse",

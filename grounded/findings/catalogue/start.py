@@ -96,8 +96,8 @@ ENTRIES: dict[str, Entry] = {
         "--to {about}={asked} can't be chosen: {why:path=the shape sets it,ends=the path ends "
         "with another,rest=the line ends at rest,swing=it would be held during the swing}[[, "
         "{end}]]",
-        "omit it[[rate?, or ask for 0 (--to {about}=0)]][[; --hold 1 lets the path end at rest and stay "
-        "there{hold:1=}]]",
+        "omit it[[rate?, or ask for 0 (--to {about}=0)]]"
+        "[[; --hold 1 lets the path end at rest and stay there{hold:1=}]]",
     ),
     "no_way": Entry(
         "refuse",
