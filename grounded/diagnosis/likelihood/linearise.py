@@ -95,6 +95,7 @@ def linearise(
         F (L, B, n, n), d (L, B, n, C) and r (L + 1, B, n, C). The columns are the residual, the
         derivative by each value, the derivative by each shift.
     """
+    # the residual, of steps and of samples
     data, count = predictor.data, columns_of(h, predictor.data)
     model = data.model
     x = track[:-1]
@@ -111,13 +112,46 @@ def linearise(
     r[..., 0] = model.difference(y - here, np.asarray(offset))
     if (begun := predictor.begun(h)) is not None:
         r[0, ..., 0] += begun
+    # slopes in the state and in the parameters
     carried = not (whole and adds_to_steps(h)) or simulated(model)
     F, f_p = (
         sensitivities_of(predictor, h, x, u, after)
         if h.spread and carried
         else (step_jacobian(predictor, h, x, after), None)
     )
-    # each value is nudged; those that then change nothing (thresholds) by more
+    for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(h.theta)):
+        if f_p is not None:
+            np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
+        else:
+            d[..., j] = _by_parameter(predictor, h, x, u, after, i)
+    _by_values(predictor, h, track, (after, ahead, shown, offset), (d, r))
+    if data.idle.any():  # padding is never measured: identity, so that nothing grows there
+        F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
+    return F, d, r
+
+
+def _by_values(
+    predictor: Predictor,
+    h: Hypothesis,
+    track: Array,
+    known: tuple[Array, Array, Array, Array | float],
+    into: tuple[Array, Array],
+) -> None:
+    """Fill the slopes in the values of effects: differences of steps and of samples.
+
+    Each value is nudged; those that then change nothing (thresholds) by more.
+
+    Args:
+        predictor: evaluates the hypothesis on the data.
+        h: the hypothesis.
+        track: (L + 1, B, n).
+        known: the steps' ends (L, B, n), the predictions, those that are shown and what sensors
+            add to these (L + 1, B, n).
+        into: d and r, see `linearise`.
+    """
+    data, (after, ahead, shown, offset), (d, r) = predictor.data, known, into
+    model, delays, begun = data.model, delays_of(h, data), predictor.begun(h)
+    x, u = track[:-1], predictor.inputs(h)
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
     base = after if near is predictor else near.advance(h, x, u, data.time)
     tried, acts = _tried(h), [not of_sensor(effect) for effect in h.effects for _ in effect.free]
@@ -137,14 +171,6 @@ def linearise(
             r[..., 1 + j] = (shown - other_shown + offset - shifted) / moved
             if begun is not None and (other_begun := predictor.begun(other)) is not None:
                 r[0, ..., 1 + j] += (other_begun - begun) / moved
-    for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(theta)):
-        if f_p is not None:
-            np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
-        else:
-            d[..., j] = _by_parameter(predictor, h, x, u, after, i)
-    if data.idle.any():  # padding is never measured: identity, so that nothing grows there
-        F, d[data.idle] = np.where(data.idle[..., None, None], np.eye(model.n), F), 0.0
-    return F, d, r
 
 
 def sensitivities_of(

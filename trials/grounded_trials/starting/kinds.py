@@ -107,23 +107,15 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     """
     found, known = moving(log), units or {}
     unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
-    for name in inputs:
-        if name not in found:
-            same = [one for one in log.numbers if _word(one.path) == name]
-            if same:
-                raise refused("start.still", name)
-            raise unknown("number", name, found, "the log")
-    names = list(reversed(found))
-    called = [n for n in names if called_input(n, found[n].path)]
+    for name in (one for one in inputs if one not in found):
+        if any(_word(one.path) == name for one in log.numbers):
+            raise refused("start.still", name)
+        raise unknown("number", name, found, "the log")
+    called = [n for n in reversed(found) if called_input(n, found[n].path)]
     followers = _followers(found, list(inputs) or called)
-    if not inputs and followers:
-        inputs = list(followers.values())[:MOST]
-    elif not inputs:
-        held = [n for n in names if found[n].held > HELD]
-        driven = [n for n in names if ACTUATOR.search(n.lower())]
-        held = held if 2 * len(held) < len(names) else []
-        efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
-        inputs = (called or held or driven or efforts)[:INPUTS] or ["u"]
+    inputs = inputs or list(followers.values())[:MOST] or _inputs_in(found, called, unit)
+
+    # The states, and those whose rate is another one.
     named = [name for name in reversed(found) if name not in inputs]
     moved = [name for name in named if not _noise_only(found[name])]
     states = (moved or named)[:MOST] or ["x"]
@@ -132,6 +124,8 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         known_as = rate.removeprefix("s.")
         if unit.get(known_as) == "1" != unit[position]:
             unit[known_as] = f"{unit[position]}/s"
+
+    # The equations of the others.
     per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
     drives = {s: [followers[s]] if s in followers else inputs for s in states if s not in rates}
     named_gains = {
@@ -147,19 +141,36 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         s: " + ".join(f"p.{named_gains[s, i]} * a.{i}" for i in drive)
         for s, drive in drives.items()
     }
-    turned = {s: found[s] for s in states if unit.get(s) == "rad"}
+    equations = [
+        f'"{s}": {rates[s]}' if s in rates else f'"{s}": ({sums[s]} - s.{s}) / p.tau_{s}'
+        for s in states
+    ]
     return Skeleton(
         "generic",
         f"Numbers that follow the inputs with a lag: {PLACEHOLDER}",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
         {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,
-        [
-            f'"{s}": {rates[s]}' if s in rates else f'"{s}": ({sums[s]} - s.{s}) / p.tau_{s}'
-            for s in states
-        ],
-        tuple(s for s, one in turned.items() if min(-(one.low or 0.0), one.high or 0.0) > 3.0),
+        equations,
+        tuple(s for s in states if unit.get(s) == "rad" and _turns(found[s])),
     )
+
+
+def _inputs_in(
+    found: Mapping[str, FieldReport], called: Sequence[str], unit: Mapping[str, str]
+) -> list[str]:
+    """Return the numbers that look like inputs: by their names, how they are held, their units."""
+    names = [*found][::-1]
+    held = [n for n in names if found[n].held > HELD]
+    held = held if 2 * len(held) < len(names) else []
+    driven = [n for n in names if ACTUATOR.search(n.lower())]
+    efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
+    return (list(called) or held or driven or efforts)[:INPUTS] or ["u"]
+
+
+def _turns(number: FieldReport) -> bool:
+    """Return whether an angle goes nearly all the way round, to either side."""
+    return min(-(number.low or 0.0), number.high or 0.0) > 3.0
 
 
 def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[str, str]:
