@@ -222,7 +222,9 @@ ADD = """
 import os, sys
 import filelock  # before the user changes, who may read no library
 from grounded.errors import GroundedError
+from grounded.findings.catalogue import codes
 from grounded_trials.store.store import Store
+codes()  # the words of an error
 if len(sys.argv) > 3:
     os.setuid(int(sys.argv[3]))
 try:
