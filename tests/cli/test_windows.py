@@ -34,6 +34,7 @@ builtins.__import__ = without
 
 @pytest.fixture
 def grounded(tmp_path):
+    pytest.importorskip("psutil", reason="not needed on Linux")
     (tmp_path / "sitecustomize.py").write_text(SITE)
     path = os.pathsep.join([str(tmp_path), *sys.path])
     strict = {"PYTHONPATH": path, "PYTHONWARNDEFAULTENCODING": "1"}

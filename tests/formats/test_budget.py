@@ -81,6 +81,7 @@ def crash() -> None:
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Start children as on Linux, and as elsewhere."""
     if request.param == "spawn":
+        pytest.importorskip("psutil", reason="not needed on Linux")
         monkeypatch.setattr("grounded_trials.within.FORKS", False)
     return str(request.param)
 
