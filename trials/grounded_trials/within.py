@@ -198,7 +198,8 @@ class _Other:
             used = child.cpu_times()
             if child.memory_info().rss > limits.memory:
                 return "memory"
-            return "time" * (used.user + used.system > limits.seconds)
+            if used.user + used.system > limits.seconds:
+                return "time"
         return ""
 
     def wait(self) -> int:
