@@ -19,6 +19,7 @@ import mujoco as mj
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.result import with_error
 from grounded_trials import Workspace
 
 DT, STEP, SECONDS, TRIALS = 0.02, 0.002, 6.0, 5
@@ -100,7 +101,7 @@ def study(seed: int) -> None:
         values = {one.name: one.now for one in done.values}
         for name, value in true.items():
             now = values.get(name)
-            told = "not found" if now is None else f"{now.value:.4f} +- {now.std:.4f}"
+            told = "not found" if now is None else with_error(now.value, now.std)
             print(f"  {name:20} true {value:.4f}, {told}")
         ahead = next(row for row in found.prediction_error if row.horizon_s == 1.0)
         off = new_runs(robot, mj.MjModel.from_xml_path(str(done.file)), rng)
