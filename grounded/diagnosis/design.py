@@ -91,13 +91,7 @@ def design(task: Task, steps: int, noise: Array, hidden: tuple[str, ...] = ()) -
     """
     # The largest drive of each pattern that stays inside [safety], with feedback if it must be.
     task = _of_length(task, steps)
-    drives = []
-    for gain in (None, _regulator(task)):
-        for pattern, cycles, shape in _patterns(task):
-            if (largest := _largest(task, shape, gain)) is not None:
-                drives.append((pattern, cycles, *largest))
-        if drives:
-            break
+    drives = _drives(task, None) or _drives(task, _regulator(task))
     if not drives:
         return None
 
@@ -105,18 +99,14 @@ def design(task: Task, steps: int, noise: Array, hidden: tuple[str, ...] = ()) -
     moved = np.median([np.ptp(run.states, axis=0) for *_, run in drives], axis=0)
     unseen = [task.model.state_names.index(name) for name in hidden]
     known = _known_noise(noise, moved, unseen, hidden)
-    names, best = uncertain(task), None
-    h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
+    best = None
     for pattern, cycles, size, policy, run in drives:
-        F = information(task, [run], h, known).sum(axis=0)
-        if F.shape != (len(names), len(names)) or not np.isfinite(F).all():
+        whole = _precision(task, [run], known)
+        if whole.shape != 2 * (len(uncertain(task)),) or not np.isfinite(whole).all():
             continue
-        whole = F + np.eye(len(F))
         nats = 0.5 * float(np.linalg.slogdet(whole)[1])
         if best is None or nats > best.nats:
-            left = np.sqrt(np.diag(np.linalg.inv(whole)))
-            each = dict(zip(names, left.tolist(), strict=True))
-            best = Drive(policy, run, pattern, cycles, size, each, nats)
+            best = Drive(policy, run, pattern, cycles, size, _left(task, whole), nats)
     return best
 
 
@@ -129,9 +119,19 @@ def told_by(task: Task, runs: Sequence[Trial], noise: Array) -> dict[str, float]
         noise: standard deviation of a sample of each state's sensor, (n,).
     """
     known = _known_noise(noise, np.ones(task.model.n), (), ())
+    return _left(task, _precision(task, runs, known))
+
+
+def _precision(task: Task, runs: Sequence[Trial], known: KnownNoise) -> Array:
+    """Return I + F of runs, in units of the parameters' priors."""
     h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
-    whole = information(task, runs, h, known).sum(axis=0)
-    left = np.sqrt(np.diag(np.linalg.inv(whole + np.eye(len(whole)))))
+    F = information(task, runs, h, known).sum(axis=0)
+    return np.asarray(F + np.eye(len(F)))
+
+
+def _left(task: Task, precision: Array) -> dict[str, float]:
+    """Return `Drive.left`."""
+    left = np.sqrt(np.diag(np.linalg.inv(precision)))
     return dict(zip(uncertain(task), left.tolist(), strict=True))
 
 
@@ -178,8 +178,10 @@ def _patterns(task: Task) -> Iterator[tuple[str, tuple[float, float], Array]]:
             yield "staircase", (low, high), np.round(2 * shape) / 2
 
 
-def _largest(task: Task, shape: Array, gain: Array | None) -> tuple[float, Policy, Trial] | None:
-    """Return the largest drive of a shape that stays inside [safety]: its size, policy and run."""
+def _drives(
+    task: Task, gain: Array | None
+) -> list[tuple[str, tuple[float, float], float, Policy, Trial]]:
+    """Return the largest drive of each pattern: its name, cycles, size, policy and run."""
     # The model as it is, and with each parameter a standard deviation away, unless the robot would
     # then not even stay while its inputs are held: no drive is to blame for that.
     model, problem = task.model, task.problem(exact=True)
@@ -189,18 +191,23 @@ def _largest(task: Task, shape: Array, gain: Array | None) -> tuple[float, Polic
     away = [np.clip(model.values + move, *reach.T) for move in (*moves, *-moves)]
     held = _about_its_run(task, np.tile(task.past, (task.horizon, 1)), gain)
     others = [replace(problem, p=values) for values in away]
-    others = [one for one in others if held is not None and _stays(task, one, held)]
+    others = [one for one in others if held is not None and _run(task, one, held) is not None]
 
-    # The largest size.
-    up, down, run = task.high - task.past, task.past - task.low, None
-    for size in SIZES:
-        sent = task.past + size * np.where(shape > 0, shape * up, shape * down)
-        policy = _about_its_run(task, sent, gain)
-        if policy is None or (run := _run(task, problem, policy)) is None:
-            continue
-        if all(_stays(task, one, policy) for one in others):
-            return size, policy, run
-    return None
+    # The largest size of each.
+    up, down = task.high - task.past, task.past - task.low
+
+    def largest(shape: Array) -> tuple[float, Policy, Trial] | None:
+        for size in SIZES:
+            sent = task.past + size * np.where(shape > 0, shape * up, shape * down)
+            policy = _about_its_run(task, sent, gain)
+            if policy is None or (run := _run(task, problem, policy)) is None:
+                continue
+            if all(_run(task, one, policy) is not None for one in others):
+                return size, policy, run
+        return None
+
+    each = ((pattern, cycles, largest(shape)) for pattern, cycles, shape in _patterns(task))
+    return [(pattern, cycles, *made) for pattern, cycles, made in each if made is not None]
 
 
 def _about_its_run(task: Task, sent: Array, gain: Array | None) -> Policy | None:
@@ -215,10 +222,6 @@ def _about_its_run(task: Task, sent: Array, gain: Array | None) -> Policy | None
     if not np.isfinite(run.z).all():
         return None
     return task.policy(run.inputs, gains, run.z[:-1])
-
-
-def _stays(task: Task, problem: Problem, policy: Policy) -> bool:
-    return _run(task, problem, policy) is not None
 
 
 def _run(task: Task, problem: Problem, policy: Policy) -> Trial | None:
