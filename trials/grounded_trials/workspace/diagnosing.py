@@ -278,9 +278,7 @@ def _probe(
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
-            while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
-                workspace.forget_trials()  # another process took the name
-                candidate = replace(candidate, id=workspace.next_id())
+            saved = workspace.save_probe(candidate)
             facts = {**made.step.facts, "candidate": saved.id}
             return saved.id, replace(made.step, facts=facts)
     return "", finding("gap.probe_unsafe") if offer else None

@@ -152,7 +152,4 @@ def _stored(workspace: Folder, drive: Drive) -> Candidate:
         predicted_utility=math.nan,
         units={**model.states, **model.inputs},
     )
-    while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
-        workspace.forget_trials()  # another process took the name
-        candidate = replace(candidate, id=workspace.next_id())
-    return saved
+    return workspace.save_probe(candidate)

@@ -313,6 +313,13 @@ class Folder:
             write_atomically(path, data)
         return candidate
 
+    def save_probe(self, candidate: Candidate) -> Candidate:
+        """Write a candidate that is none of the search, under the first name that is free."""
+        while (saved := self.save_candidate(candidate, kind="probe")) is None:
+            self.forget_trials()  # another process took the name
+            candidate = replace(candidate, id=self.next_id())
+        return saved
+
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
         broken: list[Damaged] = []
