@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rolling
 from cli import grounded
 from dataflash import dataflash
 from grounded.errors import GroundedError
@@ -15,13 +16,9 @@ from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import column_units
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from rolling import DT, MODEL, N, T
 
-DT, TAU, N = 0.02, 0.25, 400
-T = np.arange(N) * DT
-WANTED = 20 * np.sign(np.sin(1.7 * T)) + 10 * np.sin(3 * T)  # [deg]
-ROLL = np.zeros(N)
-for i in range(1, N):
-    ROLL[i] = ROLL[i - 1] + (1 - np.exp(-DT / TAU)) * (WANTED[i - 1] - ROLL[i - 1])
+WANTED, ROLL = 50 * rolling.WANTED, 50 * rolling.ROLL  # [deg]
 ROLL += 0.05 * np.random.default_rng(0).normal(size=N)
 GYRO = np.deg2rad(np.gradient(ROLL, DT))
 KINDS = [
@@ -29,20 +26,6 @@ KINDS = [
     ("IMU", "QBf", "TimeUS,I,GyrX", "s#E"),
     ("MSG", "QZ", "TimeUS,Message", "s-"),
 ]
-MODEL = """from grounded import Model, Param
-
-
-def dynamics(s, a, p):
-    return {"roll": (a.roll_command - s.roll) / p.tau}
-
-
-model = Model(
-    states={"roll": "rad"},
-    inputs={"roll_command": "rad"},
-    params={"tau": Param(0.5, "s", 0.01, 5.0)},
-    derivative=dynamics,
-)
-"""
 
 
 @pytest.fixture

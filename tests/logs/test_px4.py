@@ -12,31 +12,12 @@ from grounded_trials import Workspace
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from rolling import MODEL, ROLL, WANTED, T
 from ulog import ulog
 
 pytest.importorskip("pyulog", reason="needs the extra px4")
-DT, TAU = 0.02, 0.25
-T = np.arange(400) * DT
 US = np.round(T * 1e6).astype(np.int64) + 10**6
-WANTED = 0.4 * np.sign(np.sin(1.7 * T)) + 0.2 * np.sin(3 * T)
-ROLL = np.zeros(400)
-for i in range(1, 400):
-    ROLL[i] = ROLL[i - 1] + (1 - np.exp(-DT / TAU)) * (WANTED[i - 1] - ROLL[i - 1])
 YAW = 2.5 * T  # turns beyond pi
-MODEL = """from grounded import Model, Param
-
-
-def dynamics(s, a, p):
-    return {"roll": (a.roll_command - s.roll) / p.tau}
-
-
-model = Model(
-    states={"roll": "rad"},
-    inputs={"roll_command": "rad"},
-    params={"tau": Param(0.5, "s", 0.01, 5.0)},
-    derivative=dynamics,
-)
-"""
 
 
 def quaternion(roll: np.ndarray, yaw: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from grounded.errors import GroundedError
+from grounded_trials.plain_file import unreadable
 
 _ATTRIBUTE = re.compile(rb"""\s+([\w:.-]+)\s*=\s*("[^"]*"|'[^']*')""")
 _NAME = re.compile(rb"<\s*([\w:.-]+)")
@@ -72,7 +72,7 @@ class XmlText:
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            raise GroundedError(f"{name} can't be read as XML: {error}") from None
+            raise unreadable(name, f"it is no XML: {error}") from None
         self.root = roots[0]
 
     @property
