@@ -17,7 +17,7 @@ listed. A role that no name fits gets a number only if as many fit as there are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -46,7 +46,6 @@ from grounded_trials.logs.inspection.relations import (
     Follows,
     Signals,
     follows,
-    scale_of,
     velocities,
 )
 from grounded_trials.logs.inspection.steps import by_groups, by_inputs
@@ -185,37 +184,42 @@ class _Table:
 
     def _by_itself(self, role: _Role, number: _Number, called: Sequence[str]) -> None:
         """Count what a number's name, unit and kind say."""
-        topic, one, r = number.topic, number.field, self.row[role.name]
-        own = role.name, number.path
         if role.sent and number.measured:
-            self.points[r, self.at[number.path]] = -2 * CAP
+            self.add(role.name, number.path, -2 * CAP)
             return
-        name = words.name_points(called, role.name, topic, one, is_input=role.sent)
-        if not name and not role.sent and number.moves:
-            name = words.STEM * words.is_stem(role.name, role.unit, number.path)
-        points = name
-        if name:
-            self.named.add(own)
-            points -= 3.0 * (one.low is None) + 2.0 * (one.not_finite > 0.1 * topic.messages)
-            points -= 1.0 * (not number.moves) + 1.0 * (topic.messages < 3)
-        elif not number.moves or one.low is None:
-            return
+        name = self._name(role, number, called)
+        if name or (number.moves and number.field.low is not None):
+            kind = 1.0 + 0.9 * words.has_words(number.path, role.name) * (not name)
+            kind *= role.sent and number.command and number.moves
+            self.add(role.name, number.path, name + self._unit(role, number) + kind)
+
+    def _name(self, role: _Role, number: _Number, called: Sequence[str]) -> float:
+        """Return the points of a name, fewer for numbers that tell little; 0 if none fits."""
+        topic, one = number.topic, number.field
+        points = words.name_points(called, role.name, topic, one, is_input=role.sent)
+        if not points and not role.sent and number.moves:
+            points = words.STEM * words.is_stem(role.name, role.unit, number.path)
+        if not points:
+            return 0.0
+        self.named.add((role.name, number.path))
+        points -= 3.0 * (one.low is None) + 2.0 * (one.not_finite > 0.1 * topic.messages)
+        return points - 1.0 * (not number.moves) - 1.0 * (topic.messages < 3)
+
+    def _unit(self, role: _Role, number: _Number) -> float:
+        """Return the points of a unit, stated by the log or known by convention."""
+        points = -1.5 * (role.unit in LENGTHS and is_angle(number.path))
+        unit, fits = number.said or number.known, self._fits(role, number)
         if role.unit in ("", "1"):
-            points += STATED * bool(number.said and role.unit) * self._fits(role, number)
-        elif number.said or number.known:
-            fits = self._fits(role, number)
-            other = -0.5 if number.said else -1.5 if role.sent else -CAP  # another sensor
-            points += (STATED if number.said else 0.5) if fits else other
-            unit = number.said or number.known
-            code = "start.unit" if fits else "start.unit_other"
-            self.why.setdefault(own, []).append(found(code, role.name, unit=unit, model=role.unit))
-            if not fits and not number.said:
-                self.doubted.add(own)
-        if role.unit in LENGTHS and is_angle(number.path):
-            points -= 1.5
-        if role.sent and number.command and number.moves:
-            points += 1.0 + 0.9 * words.has_words(number.path, role.name) * (not name)
-        self.points[r, self.at[number.path]] += points
+            return points + STATED * bool(number.said and role.unit) * fits
+        if not unit:
+            return points
+        code = "start.unit" if fits else "start.unit_other"
+        why = found(code, role.name, unit=unit, model=role.unit)
+        self.add(role.name, number.path, 0.0, why)
+        if not fits and not number.said:
+            self.doubted.add((role.name, number.path))
+        other = -0.5 if number.said else -1.5 if role.sent else -CAP  # of another sensor
+        return points + ((STATED if number.said else 0.5) if fits else other)
 
     def _fits(self, role: _Role, number: _Number) -> bool:
         return factor_between(number.said or number.known, role.unit) is not None
@@ -318,40 +322,37 @@ class _Table:
         """Count how well candidates for a rate follow those for its position."""
         q, w = pair
         taken = {path for name, path in first.items() if name not in pair}
-        free = [n for n in self.numbers if n.moves and n.path not in taken]
         sent = {path for name, path in first.items() if self.roles[self.row[name]].sent}
+        free = [n for n in self.numbers if n.moves and n.path not in taken]
+
+        # What a name fits, else what is free, if that is little.
         own = {name: [p for p in self._near(name) if p not in sent] for name in pair}
-        few = FEW if any(name in first for name in self.row) else MANY
         bare = [name for name in pair if not own[name]]
-        if bare and len(free) <= few:
+        if len(free) <= (FEW if first else MANY):
             own |= {name: self._possible(name, free) for name in bare}
         like = self._likes(own[q], own[w], signals)
-        best = max((abs(one.correlation) for one in like.values()), default=0.0)
-        if not bare and best < FOLLOWS and len(free) <= MANY:  # a name may mislead
+        if not (bare or like) and len(free) <= MANY:  # a name may mislead
             more = self._likes(own[q][:1], self._possible(w, free), signals)
-            if any(abs(one.correlation) >= FOLLOWS for one in more.values()):
-                like |= more
-                for path in own[w]:
-                    self.add(w, path, -CAP)
-        before = self.points.copy()
-        rows = self.row[q], self.row[w]
-        gains: dict[tuple[str, str], float] = {}
+            like |= more
+            for path in own[w] if more else ():
+                self.add(w, path, -CAP)
+
+        # Each gains what the best pair that it is in explains, less what its partner lacks.
+        before, gains = self.points.copy(), dict[tuple[str, str], float]()
         for (a, b), one in like.items():
-            if abs(one.correlation) < FOLLOWS:
-                continue
-            slope = one.slope * self.factor(w, b) / self.factor(q, a)
-            fits = abs(slope * scale_of(slope) - 1) < SAME
-            same = abs(abs(one.slope) - 1) < SAME  # as logged
-            if bare and not (fits or same) and abs(one.correlation) < SURELY:
+            by = self.factor(q, a), self.factor(w, b)
+            stated = [self.stated.unit(path) for path in (a, b)]
+            fits = any(True for _ in _readings(one.slope * by[1] / by[0], stated, by))
+            if bare and not fits and abs(one.correlation) < SURELY:
                 continue  # neither name nor size: a voltage follows the speed that it drives
-            if few == MANY and len(bare) == 2 and not self._tenfold(one):
+            if not first and len(bare) == 2 and not self._tenfold(one):
                 continue
-            fits = fits or (same and bool(self.stated.unit(a)) != bool(self.stated.unit(b)))
             points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
-            for key, other in ((q, a), (w, b)):
-                partner = (rows[1], b) if key == q else (rows[0], a)
-                lost = before[partner[0]].max() - before[partner[0], self.at[partner[1]]]
-                gains[key, other] = max(gains.get((key, other), 0.0), points - min(lost, CAP))
+            for own_key, partner in (((q, a), (w, b)), ((w, b), (q, a))):
+                row = before[self.row[partner[0]]]
+                lost = row.max() - row[self.at[partner[1]]]
+                gain = points - min(lost, CAP)
+                gains[own_key] = max(gains.get(own_key, gain), gain, 0.0)
         for (name, path), points in gains.items():
             self.add(name, path, points)
 
@@ -384,10 +385,10 @@ class _Table:
     def _likes(
         self, first: Sequence[str], second: Sequence[str], signals: Signals
     ) -> dict[tuple[str, str], Follows]:
-        """Return how each number follows each."""
+        """Return which numbers follow which, and how."""
         signals.read([*first, *second])
-        pairs = [(a, b) for a in first for b in second if a != b]
-        return {pair: signals.follows(*pair) for pair in pairs}
+        likes = {(a, b): signals.follows(a, b) for a in first for b in second if a != b}
+        return {pair: one for pair, one in likes.items() if abs(one.correlation) >= FOLLOWS}
 
     def _speed(self, model: Model, signals: Signals) -> None:
         """Count how an unnamed number follows the speed of the position."""
@@ -530,6 +531,35 @@ def _lagged(signals: Signals, angle: str, command: str) -> float:
     return max((float(np.corrcoef(a, c)[0, 1]) for a, c in alive), default=0.0)
 
 
+@dataclass(frozen=True)
+class _Reading:
+    """Units in which a rate is the derivative of its position, except for its sign."""
+
+    q: float = 1.0  # factor of the position
+    w: float = 1.0  # factor of its rate, positive
+    about: int | None = None  # the signal whose unit is not the expected one: 0 or 1
+    why: str = ""
+
+
+def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Iterator[_Reading]:
+    """Yield the readings of a position and its rate that agree in size, most plausible first.
+
+    Args:
+        slope: how many times as large the rate is as the derivative, in the model's units.
+        stated: the units that the log states for the two, "" for none.
+        by: the factors from these to the model's units.
+    """
+    tried = [
+        _Reading(),
+        _Reading(q=1 / DEGREES, about=0, why="start.in_degrees"),
+        _Reading(w=1 / DEGREES, about=1, why="start.in_degrees"),
+    ]
+    if bool(stated[0]) != bool(stated[1]):  # the one unit is that of both
+        other = {"w": by[0], "about": 1} if stated[0] else {"q": by[1], "about": 0}
+        tried.append(_Reading(**other, why="start.same_unit"))  # type: ignore[arg-type]
+    return (one for one in tried if abs(abs(slope) * one.w / one.q - 1) < SAME)
+
+
 def _followed(
     guesses: Mapping[str, Guess], pair: tuple[str, str], signals: Signals, table: _Table
 ) -> dict[str, Guess]:
@@ -542,46 +572,40 @@ def _followed(
     q, w = (guesses[name] for name in pair)
     if not (q.path and w.path):
         return {}
-    logged, back = signals.follows(q.path, w.path), signals.follows(w.path, q.path)
+    like, back = signals.follows(q.path, w.path), signals.follows(w.path, q.path)
     by = table.factor(q.name, q.path), table.factor(w.name, w.path)
-    slope, size = logged.slope * by[1] / by[0], logged.correlation
-    near = abs(slope - 1) < SAME
-    other = back.correlation >= SURELY and abs(back.slope - 1) <= SAME
+    slope, size = like.slope * by[1] / by[0], like.correlation
+    stated = [table.stated.unit(one.path) for one in (q, w)]
+
+    # Which is the rate of which?
+    crossed = back.fits and not (abs(slope - 1) < SAME and size > FOLLOWS)
     exchanged = found("start.exchanged", q.path, w.path, correlation=back.correlation)
-    crossed = other and not (near and size > FOLLOWS)
     if crossed and not (size < -SURELY and abs(slope + 1) < SAME):
         return {q.name: replace(q, sure=False), w.name: w.because(exchanged, sure=False)}
     if abs(size) < FOLLOWS:
         why = found("start.unfollowed", w.name, of=q.path, correlation=size)
-        return {w.name: w.because(why, sure=False)} if logged.correlation else {}
-    scale, stated = scale_of(slope), [table.stated.unit(one.path) for one in (q, w)]
-    fits = abs(slope * scale - 1) < SAME
-    why = found("start.follows", w.name, of=q.path, correlation=size, sign=int(np.sign(slope)))
-    if fits:
-        if abs(scale) == DEGREES:  # the position is in degrees
-            q = q.because(found("start.in_degrees", q.name), sure=False)
-            q, scale = replace(q, scale=1 / DEGREES), scale / DEGREES
-        elif abs(scale) != 1:
-            w = w.because(found("start.in_degrees", w.name))
-        w = replace(w, scale=scale)
-        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
-        alone = not q.others and (q.name, q.path) not in table.doubted
-        if kind and alone and size > SURELY and min(abs(slope - 1), abs(logged.slope - 1)) < SAME:
-            q = replace(q, sure=True)
-        if w.sure and alone and slope > 0 and scale == q.scale == 1:
-            q = replace(q, sure=True)
-        plain = not w.others and (w.name, w.path) not in table.doubted
-        w = replace(w, sure=w.sure or (q.sure and plain))
-    elif abs(abs(logged.slope) - 1) < SAME and bool(stated[0]) != bool(stated[1]):
-        same = found("start.same_unit", q.name, w.name)
-        q, w = (q, w.because(same)) if stated[0] else (q.because(same), w)
-        w = replace(w, scale=scale * (by[0] if stated[0] else 1.0))
-        q = replace(q, scale=1.0 if stated[0] else by[1])
-        kind = not q.others and (q.name, q.path) not in table.doubted and bool(stated[0])
-        q = replace(q, sure=q.sure or kind)
-        w = replace(w, sure=q.sure and not w.others and size > SURELY)
-    else:
+        return {w.name: w.because(why, sure=False)} if size else {}
+
+    # In which units?
+    reading = next(_readings(slope, stated, by), None)
+    if reading is None:
         w = w.because(found("start.times", w.name, of=q.path, slope=slope), sure=False)
+    else:
+        if reading.about is not None:
+            names = pair if reading.why == "start.same_unit" else pair[reading.about :][:1]
+            odd = found(reading.why, *names)
+            q, w = (g.because(odd) if i == reading.about else g for i, g in enumerate((q, w)))
+        q = replace(q, scale=reading.q, sure=q.sure and reading.q == 1)
+        w = replace(w, scale=reading.w * float(np.sign(slope)))
+
+        # Each is as sure as the other if nothing else rivals with it.
+        alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
+        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
+        same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
+        sure = (kind and size > SURELY and same) or (w.sure and slope > 0 and w.scale == 1)
+        q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
+        w = replace(w, sure=w.sure or (q.sure and alone[1]))
+    why = found("start.follows", w.name, of=q.path, correlation=size, sign=int(np.sign(slope)))
     w = w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)
     return {q.name: q, w.name: w}
 

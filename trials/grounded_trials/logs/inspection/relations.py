@@ -14,7 +14,6 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.places import integrals
-from grounded.units import DEGREES
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
@@ -64,14 +63,6 @@ def follows(q: Floats, w: Floats, step: float) -> Follows:
         return Follows(0.0, 1.0)
     a, b = a - a.mean(), b - b.mean()
     return Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
-
-
-def scale_of(slope: float) -> float:
-    """Return the factor that a rate must be multiplied by: a sign, and degrees of either."""
-    sign, size = float(np.sign(slope)), abs(slope)
-    if abs(size / DEGREES - 1) < SAME:
-        return sign / DEGREES
-    return sign * DEGREES if abs(size * DEGREES - 1) < SAME else sign
 
 
 def velocities(model: Model) -> dict[str, str]:
