@@ -23,7 +23,7 @@ bit. `ask_tell` has the loop around it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -180,6 +180,22 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     return task.model if found.worse else found.model
 
 
+@dataclass
+class _Rejected:
+    """What the ways came to that made no step worth a trial."""
+
+    promised: list[float] = field(default_factory=list)  # gains that were too small
+    least: float = 0.0  # gain from which a step is worth a trial
+    unsafe: Proposal | None = None
+    ruinous: Candidate | None = None
+    doubted: Candidate | None = None
+
+    @property
+    def at_optimum(self) -> bool:
+        """Whether the model promises no more than it would by chance."""
+        return bool(self.promised) and 0 <= max(self.promised) <= self.least
+
+
 def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
     """Steps 4 to 6: propose the first step, from the due one on, that gains in the model.
 
@@ -187,47 +203,55 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     predicted run loses is skipped without a trial: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
-    now = make.now
+    now, ways, rejected = make.now, options.ways(incumbent.candidate), _Rejected()
     if (made := make.gentler(incumbent)) is not None:
         return make.checked(made)
-    ways, promised = options.ways(incumbent.candidate), list[float]()
-    unsafe: Proposal | None = None
-    ruinous: Candidate | None = None
-    doubted: Candidate | None = None
-    least = 0.0
-    base = incumbent.candidate
-    goes_on = base.way == BY_STEP and base.model == make.fingerprint
+    lost = _steps_lost(make, incumbent.candidate.id)
     for way in ways[ways.index(now.way) :]:
-        step = now.step
+        due = now.step
         if way != now.way:
-            step = options.due(now.history, incumbent, make.fingerprint, way)
-        if step is None:
+            due = options.due(now.history, incumbent, make.fingerprint, way)
+        if due is None:
             continue
+
+        # Steps 4 and 5, and the plan of a model that was changed since the best trial.
         about = About(make, incumbent, options, way)
-        stepping = keeping_promises(about)
-        by_step = _by_step(stepping) if way == now.way and goes_on else None
-        found = by_step or stepping.step_from(step, promised)
-        if stepping is not about and found and found.candidate and about.ruined_by(found.candidate):
-            stepping, found = about, about.step_from(step, promised)
-        if stepping.corrected and found and found.candidate and not by_step:
-            found = _surer(stepping, step, found)
-        if way == now.way and not goes_on and (by_step := _by_step(stepping)) is not None:
-            found = _promising(found, by_step)
-        least = options.tolerance * abs(stepping.already)
-        if way == ways[0] and (own := about.own_plan(found)) is not None:
-            found = own
-        if found is not None and found.candidate is not None:
-            noise = _below_noise(make, incumbent, found.candidate, options)
-            return found if noise is None else Proposal(noise, None, False)
-        unsafe, ruinous = unsafe or found, ruinous or stepping.ruinous
-        if (doubted := stepping.doubted) is not None:
+        by, proposal = _step(about, due, rejected.promised)
+        if way == ways[0]:
+            proposal = about.own_plan(proposal) or proposal
+        if proposal is not None and proposal.candidate is not None:
+            noise = _below_noise(make, incumbent, proposal.candidate, options)
+            return proposal if noise is None else Proposal(noise, None, False)
+
+        # No trial is spent on another way in doubt, or at the model's optimum.
+        rejected.least, rejected.doubted = by.least, by.doubted
+        rejected.unsafe = rejected.unsafe or proposal
+        rejected.ruinous = rejected.ruinous or by.ruinous
+        if by.doubted is not None or (rejected.at_optimum and not lost):
             break
-        lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
-        if promised and not lost and 0 <= max(promised) <= least:
-            break  # at the model's optimum: no trial is spent on another way
-    return unsafe or Proposal(
-        _ended(make, incumbent, promised, least, options.tolerance, ruinous, doubted), None, False
-    )
+    return rejected.unsafe or Proposal(_ended(make, incumbent, rejected, options), None, False)
+
+
+def _step(about: About, due: Step, promised: list[float]) -> tuple[About, Proposal | None]:
+    """Return the step of one way, and the grounded model that makes it.
+
+    Args:
+        about: the current model grounded on the incumbent's trial.
+        due: the first step to try.
+        promised: predicted gains that were too small are appended to it.
+    """
+    make, base, by = about.make, about.incumbent.candidate, keeping_promises(about)
+    goes_on = base.way == BY_STEP and base.model == make.fingerprint
+    first = about.way == make.now.way
+    by_step = _by_step(by) if first and goes_on else None
+    made = by_step or by.step_from(due, promised)
+    if by is not about and made and made.candidate and about.ruined_by(made.candidate):
+        by, made = about, about.step_from(due, promised)
+    if by.corrected and made and made.candidate and not by_step:
+        made = _surer(by, due, made)
+    if first and not goes_on and (by_step := _by_step(by)) is not None:
+        made = _promising(made, by_step)
+    return by, made
 
 
 def _steps_lost(make: Maker, own: str) -> int:
@@ -306,20 +330,13 @@ def _promising(found: Proposal | None, other: Proposal) -> Proposal:
     return other if better else found
 
 
-def _ended(
-    make: Maker,
-    incumbent: Tried,
-    promised: list[float],
-    least: float,
-    tolerance: float,
-    ruinous: Candidate | None,
-    doubted: Candidate | None,
-) -> Standing:
+def _ended(make: Maker, incumbent: Tried, rejected: _Rejected, options: SearchOptions) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
-    own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
+    own, doubted = incumbent.candidate.id, rejected.doubted
+    finite = [gain for gain in rejected.promised if np.isfinite(gain)]
     lost, most = _steps_lost(make, own), max(finite, default=0.0)
     ask = found("search.diagnose", then=DIAGNOSE)
-    if doubted is None and ruinous is not None:
+    if doubted is None and (ruinous := rejected.ruinous) is not None:
         off = ruinous.likely_off
         why = found(
             "search.too_doubtful",
@@ -329,13 +346,13 @@ def _ended(
             error=off if off < -ABSURD * incumbent.utility else None,
         )
         return ended(make.now, Ending.DOUBTFUL, why, ask)
-    if doubted is None and promised and not finite:
+    if doubted is None and rejected.promised and not finite:
         return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
-    if doubted is None and most < -least and not lost:
+    if doubted is None and most < -rejected.least and not lost:
         why = found("search.every_step_loses", own, best=own, least=-most)
         return ended(make.now, Ending.EVERY_STEP_LOSES, why, ask)
     ending = Ending.NO_STEP if lost or doubted else Ending.NOTHING_PROMISED
-    why = found("search.nothing_promised", own, best=own, least=tolerance)
+    why = found("search.nothing_promised", own, best=own, least=options.tolerance)
     if lost or doubted:
         why = found(
             "search.no_step",
@@ -344,6 +361,6 @@ def _ended(
             lost=lost,
             gain=doubted.predicted_gain if doubted else None,
             error=doubted.likely_off if doubted else None,
-            least=None if doubted else tolerance,
+            least=None if doubted else options.tolerance,
         )
     return let_down(ended(make.now, ending, why), make.fingerprint)
