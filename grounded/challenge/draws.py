@@ -70,8 +70,10 @@ def values_of(
     sign = float(rng.choice([-1, 1]))
     family, values = effect.family.name, dict(effect.fixed)
     top = _rate_scale(scales, effect.site.target) * size
+    draw = _Draw(effect, size, sign, scales, rng)
     for q in effect.free:
-        values[q.name] = _value(effect, q.name, size, sign, scales, rng, mechanism)
+        rule = SIZES.get(f"{family}.{q.name}") or SIZES.get(family) or (lambda d: d.rate)
+        values[q.name] = DRIVE[family] * size if mechanism and family in DRIVE else rule(draw)
     if family == "periodic":
         phase = rng.uniform(0, 2 * np.pi)
         values |= {"A": top * np.cos(phase), "B": top * np.sin(phase)}
@@ -91,82 +93,100 @@ def _rate_scale(scales: Scales, name: str) -> float:
     return float(scales.spread(name)) / 2.0
 
 
-def _value(
-    effect: Effect,
-    quantity: str,
-    size: float,
-    sign: float,
-    scales: Scales,
-    rng: np.random.Generator,
-    mechanism: bool,
-) -> float:
-    family, target = effect.family.name, effect.site.target
-    if family in ("dead_zone", "stall"):
-        return size * scales.peak(target)
-    if family == "saturation":
-        return (1 - size) * scales.peak(target)
-    if family == "backlash":
-        return size * scales.spread(target)
-    if family in ("rate_limit", "slew_limit"):
-        return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
-    if mechanism and family in DRIVE:
-        return DRIVE[family] * size
-    if family in ("delay", "sensor_delay"):
-        return 0.6 * size
-    if family in ("first_order_lag", "sensor_lag"):
-        return float(size)
-    if family in ("input_bias", "sensor_bias"):
-        return sign * 0.5 * size * scales.spread(target)
-    if family == "input_fade":
-        return size / scales.duration
-    if family in ("input_gain", "input_curve", "rate_gain", "odometry_scale", "sensor_scale"):
-        return sign * size
-    if family == "parameter":
-        known = effect.site.model.params[target]
+@dataclass(frozen=True)
+class _Draw:
+    """What the value of an effect depends on."""
+
+    effect: Effect
+    size: float  # relative
+    sign: float
+    scales: Scales
+    rng: np.random.Generator
+
+    @property
+    def on(self) -> str:
+        """What it acts on: an input, a state, `driven<-source`."""
+        return self.effect.site.target
+
+    @property
+    def driven(self) -> str:
+        return self.on.partition("<-")[0]
+
+    @property
+    def source(self) -> str:
+        return self.on.partition("<-")[2]
+
+    def peak(self, name: str) -> float:
+        return float(self.scales.peak(name))
+
+    @property
+    def spread(self) -> float:
+        return float(self.scales.spread(self.on))
+
+    @property
+    def speed(self) -> float:
+        return self.peak("v") if self.scales.high else 1.0
+
+    @property
+    def rate(self) -> float:
+        """A part of a typical rate of what it acts on."""
+        return self.sign * self.size * _rate_scale(self.scales, self.on)
+
+    def of(self, low: float, high: float) -> float:
+        """Return a random factor between two."""
+        return float(np.exp(self.rng.uniform(np.log(low), np.log(high))))
+
+    def parameter(self) -> float:
+        """Return a change of a parameter, within its lower bound."""
+        known = self.effect.site.model.params[self.on]
         low = -np.inf if known.low is None else known.low
         high = np.inf if known.high is None else known.high
-        change = sign * size * (abs(known.value) or min((high - low) / 2, 0.5))
+        change = self.sign * self.size * (abs(known.value) or min((high - low) / 2, 0.5))
         return float(change if known.value + change >= low else -change)
-    if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):
-        speed = scales.peak(target)
-        over = {"viscous_friction": 1.0, "quadratic_drag": speed}.get(family, 1 / speed)
-        return size * 2.0 / over
-    if family == "understeer":
-        speed = scales.peak("v") if scales.high else 1.0
-        return float(size / speed**2)
-    if family == "side_slip":
-        return 0.3 * size / max(scales.peak("v"), 0.3)
-    if family == "coupling":
-        driven, _, source = target.partition("<-")
-        return sign * size * _rate_scale(scales, driven) / scales.peak(source)
-    if family == "cornering_drag":
-        return 2 * size / scales.peak(target.partition("<-")[2])
-    if family in ("joint_friction", "load_friction", "added_inertia"):
-        return _joint(quantity, size, scales, *target.split("<-"))
-    if family == "joint_spring":
-        tau, _, q = target.partition("<-")
-        return size * scales.peak(tau) / (scales.peak(q) if quantity == "k" else 5.0)
-    if family == "grip_limit":
-        return (1 - size) * max(effect.free[0].grid) / 2
-    if family == "lever_arm":
-        return sign * 0.5 * size
-    if family == "trend":
-        return sign * size * _rate_scale(scales, target) / scales.duration
-    if family == "periodic" and quantity == "omega":
-        return 2 * np.pi * float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
-    if family == "patch" and quantity == "c":
-        return 4 * sign * size * _rate_scale(scales, target)  # it acts only briefly
-    if family == "patch":
-        return 0.12 * max(effect.free[-1].grid) / 0.16  # radius; the place is drawn separately
-    return sign * size * _rate_scale(scales, target)
 
 
-def _joint(quantity: str, size: float, scales: Scales, tau: str, w: str) -> float:
-    """Return friction or inertia of a joint as a part of the largest input (0.2 s to speed)."""
-    if quantity == "k":
-        return size
-    over = {"b": scales.peak(w), "J": scales.peak(w) / 0.2}.get(quantity, 1.0)
-    return size * scales.peak(tau) / over
+_Rule = Callable[[_Draw], float]
+
+
+def _alike(*families: str, rule: _Rule) -> dict[str, _Rule]:
+    return dict.fromkeys(families, rule)
+
+
+SIZES: Mapping[str, _Rule] = {  # by `family` or `family.quantity`; else a rate (`_Draw.rate`)
+    **_alike("dead_zone", "stall", rule=lambda d: d.size * d.peak(d.on)),
+    "saturation": lambda d: (1 - d.size) * d.peak(d.on),
+    "backlash": lambda d: d.size * d.spread,
+    **_alike("rate_limit", "slew_limit", rule=lambda d: d.spread * d.of(0.3, 3.0)),
+    **_alike("delay", "sensor_delay", rule=lambda d: 0.6 * d.size),
+    **_alike("first_order_lag", "sensor_lag", rule=lambda d: d.size),
+    **_alike("input_bias", "sensor_bias", rule=lambda d: d.sign * 0.5 * d.size * d.spread),
+    "input_fade": lambda d: d.size / d.scales.duration,
+    **_alike(
+        *("input_gain", "input_curve", "rate_gain", "odometry_scale", "sensor_scale"),
+        rule=lambda d: d.sign * d.size,
+    ),
+    "parameter": _Draw.parameter,
+    "viscous_friction": lambda d: 2 * d.size,
+    "quadratic_drag": lambda d: 2 * d.size / d.peak(d.on),
+    **_alike("coulomb_friction", "stiction", rule=lambda d: 2 * d.size * d.peak(d.on)),
+    "understeer": lambda d: d.size / d.speed**2,
+    "side_slip": lambda d: 0.3 * d.size / max(d.peak("v"), 0.3),
+    "coupling": lambda d: d.sign * d.size * _rate_scale(d.scales, d.driven) / d.peak(d.source),
+    "cornering_drag": lambda d: 2 * d.size / d.peak(d.source),
+    # Of a joint: as a part of the largest input, reached in 0.2 s.
+    **_alike("joint_friction", "load_friction", rule=lambda d: d.size * d.peak(d.driven)),
+    "joint_friction.b": lambda d: d.size * d.peak(d.driven) / d.peak(d.source),
+    "load_friction.k": lambda d: d.size,
+    "added_inertia": lambda d: d.size * d.peak(d.driven) * 0.2 / d.peak(d.source),
+    "joint_spring": lambda d: d.size * d.peak(d.driven) / 5.0,
+    "joint_spring.k": lambda d: d.size * d.peak(d.driven) / d.peak(d.source),
+    "grip_limit": lambda d: (1 - d.size) * max(d.effect.free[0].grid) / 2,
+    "lever_arm": lambda d: d.sign * 0.5 * d.size,
+    "trend": lambda d: d.rate / d.scales.duration,
+    "periodic.omega": lambda d: 2 * np.pi * d.of(0.3, 2.0),
+    "patch.c": lambda d: 4 * d.rate,  # it acts only briefly
+    "patch": lambda d: 0.12 * max(d.effect.free[-1].grid) / 0.16,  # its radius
+}
 
 
 Rate = Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]]

@@ -133,7 +133,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     claimed = not physics or claims_all(found, physics)
     if physics and {*found.effects} <= {*physics}:
         names = list(dict.fromkeys([*names, *late_open(workspace, found)]))
-    calibrated = found.known_parameters if parameters and physics and claimed else {}
+    # Values of the effects only hold with the parameters that were fitted beside them.
+    whole_fit = parameters and bool(physics) and claimed
+    calibrated = found.known_parameters if whole_fit else {}
     nominal = nominal_values(found, workspace, names)
     old = workspace.config.model.effects
     own, both = joined(found, names, old, nominal, calibrated)
@@ -141,42 +143,51 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     whole = dict(workspace.config.model.params) | own
     earlier, _ = adoptions(workspace)  # raises before anything is written, as does
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects
+
+    # Write it, and how it can be undone.
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
-    known = _as_estimated(found, names, nominal, calibrated)
-    ties = {name: others for name in names if (others := _beside(found.indistinguishable, name))}
-    step = {
-        "names": names,
-        "before": _written(model),
-        "after": after,
-        "known": known,
-        "ties": ties,
-        "equivalent": {name: _beside(found.equivalent, name) for name in ties},
-        "given": {n: [*on] for n, on in found.conditions.items() if n in names or n in own},
-    }
+    step = {"names": names, "before": _written(model), "after": after}
+    step |= _of_diagnosis(found, names, own, _as_estimated(found, names, nominal, calibrated))
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
+
+    # What differs from the fit in which the values were found.
     fitted = {*names, *before, *(found.effects if claimed else ()), *found.late_sensors}
-    beside = (str(effect["name"]) for effect in adopted)
-    left = left_behind(found) if parameters and physics and claimed else {}
+    jointly = [name for name in own if name in {*calibrated} & {*found.jointly}]
+    left = left_behind(found) if whole_fit else {}
     done = Adopted(
         tuple(adopted),
         own,
         claimed,
         then=to_plan(workspace),
         logged=logged_target(workspace) if not workspace.candidate_ids() else "",
-        beside=tuple(n for n in beside if n not in fitted),
+        beside=tuple(n for n in (str(effect["name"]) for effect in adopted) if n not in fitted),
         left={n: one for n, one in left.items() if n not in own},
-        jointly=(
-            *(name for name in own if name in calibrated and name in found.jointly),
-            *(name for name in names if name in found.combined),
-        ),
+        jointly=(*jointly, *(name for name in names if name in found.combined)),
         rewritten=_rewritten(workspace, old, adopted),
         along=tuple(name for name in names if name not in asked),
     )
-    known_all = found.parameters if parameters and physics and claimed else {}
-    told = _told(done, asked, workspace.base_model.states, known_all)
+    units = workspace.base_model.states
+    told = _told(done, asked, units, found.parameters if whole_fit else {})
     return replace(done, findings=settle(told))
+
+
+def _of_diagnosis(
+    found: Diagnosis,
+    names: Sequence[str],
+    own: Mapping[str, float],
+    known: Mapping[str, Sequence[float]],
+) -> dict[str, Any]:
+    """Return what reports/adoptions.json keeps of the diagnosis that effects are adopted from."""
+    ties = {name: others for name in names if (others := _beside(found.indistinguishable, name))}
+    adopted = {*names, *own}
+    return {
+        "known": dict(known),
+        "ties": ties,
+        "equivalent": {name: _beside(found.equivalent, name) for name in ties},
+        "given": {name: [*on] for name, on in found.conditions.items() if name in adopted},
+    }
 
 
 def _told(
