@@ -14,7 +14,7 @@ import tempfile
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -575,16 +575,21 @@ def flips(rng: random.Random, seconds: float) -> Tally:
                 and command(tally, what, "-C", where, "verify") == 0
             ):
                 tally.add("silent", f"{what}: verify finds nothing")
-            for now in [p for p in where.rglob("*") if p.is_file() and p not in kept]:
-                now.unlink()
-            for one, data in kept.items():
-                if not one.exists() or one.read_bytes() != data:
-                    one.unlink(missing_ok=True)
-                    one.write_bytes(data)
+            _restored(where, kept)
             path.chmod(0o644)
             path.write_bytes(source)
             path.chmod(mode)
     return tally
+
+
+def _restored(where: Path, kept: Mapping[Path, bytes]) -> None:
+    """Make a folder as it was: remove new files, and write those that differ."""
+    for now in [p for p in where.rglob("*") if p.is_file() and p not in kept]:
+        now.unlink()
+    for one, data in kept.items():
+        if not one.exists() or one.read_bytes() != data:
+            one.unlink(missing_ok=True)
+            one.write_bytes(data)
 
 
 def bombs(rng: random.Random, seconds: float) -> Tally:

@@ -86,15 +86,8 @@ def _npz_tables(arrays: Mapping[str, Any], path: Path, rate: float) -> dict[str,
         if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
             continue
         stem = name.removesuffix("_t")
-        fits = [
-            key
-            for key, label in labels.items()
-            if own.ndim == 2 and len(label) == own.shape[1]
-            if not _names_another(key, stem, numbers)
-        ]
-        key = f"{stem}_names" if f"{stem}_names" in fits else next(iter(fits), "")
         table = column_name(stem)
-        named = _columns(own, labels.get(key, []), table)
+        named = _columns(own, _labels(stem, own, labels, numbers), table)
         tables["/" + table] = {"t": t} | columns_by_name(named, path)
     used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
@@ -112,10 +105,18 @@ def _npz_tables(arrays: Mapping[str, Any], path: Path, rate: float) -> dict[str,
     return tables
 
 
-def _names_another(key: str, table: str, numbers: Mapping[str, Any]) -> bool:
-    """Check whether an array of names is called after another table, `other_names`."""
-    other = key.removesuffix("_names")
-    return key.endswith("_names") and other != table and other in numbers
+def _labels(
+    table: str, array: Floats, labels: Mapping[str, list[str]], numbers: Mapping[str, Any]
+) -> list[str]:
+    """Return the array of texts that names an array's columns: `table_names`, else one as long.
+
+    One that is called after another table, `other_names`, names that one's.
+    """
+    count = array.shape[1] if array.ndim == 2 else -1
+    fits = {key: label for key, label in labels.items() if len(label) == count}
+    others = {f"{other}_names" for other in numbers if other != table}
+    free = (label for key, label in fits.items() if key not in others)
+    return fits.get(f"{table}_names") or next(free, [])
 
 
 def _columns(array: Floats, names: list[str], table: str) -> list[tuple[str, str, Floats]]:

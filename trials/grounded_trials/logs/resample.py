@@ -207,10 +207,7 @@ def to_grid(
         gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
         return reports, (*findings_of(reports, late), *stairs, *odd, *gone)
 
-    held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
-    if still and rest is not None:
-        held = np.where(np.isfinite(held), held, rest)
-    assumed = not np.isfinite(held).all()
+    held, assumed = _sent_before(sent, start, dt, rest if still else None)
     if assumed and rest is not None and in_motion(sent, start, rest):
         held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
     return Gridded(
@@ -228,6 +225,22 @@ def to_grid(
         last_ns=min(int(samples[name].t[-1]) for name in states),
         told=told,
     )
+
+
+def _sent_before(
+    sent: Sequence[Samples], start: int, dt: float, rest: Floats | None
+) -> tuple[Floats, bool]:
+    """Return the inputs before a run (m,), NaN where the log tells none, and whether one is.
+
+    Args:
+        sent: the inputs.
+        start: of the run [ns].
+        dt: control interval [s].
+        rest: (m,) inputs at rest, if it stood still before; None otherwise.
+    """
+    held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
+    held = held if rest is None else np.where(np.isfinite(held), held, rest)
+    return held, not np.isfinite(held).all()
 
 
 def begins_early(samples: Samples, grid: Ints) -> float:

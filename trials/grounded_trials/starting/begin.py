@@ -46,6 +46,7 @@ from grounded_trials.starting.kinds import (
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.starting.pushed import with_gain
 from grounded_trials.starting.shapes import has_plane
+from grounded_trials.starting.skeletons import Skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import FILE
@@ -182,51 +183,39 @@ def _begin(
     ask: Ask | None,
     again: tuple[str, ...],
 ) -> Begun:
-    files = log_files(log)
-    if kind_of(files[0]):
-        raise refused("start.no_start", log, why="own")
-    report = inspect_log(log, layout)
-    if report.damage:
-        raise refused("start.damaged", why=report.damage, then=NextCommand("recover", (str(log),)))
-    if all(field.low is None for field in report.numbers):
-        there = [field.path for field in report.numbers]
-        raise refused("start.no_start", log, why="text", names=tuple(there[:NAMED]))
-    numbers = [field for field in report.numbers if field.low is not None]
-    if all(field.low == field.high for field in numbers):
-        raise refused("start.no_start", log, why="still")
-    report, notes = _one_run(report)
-    joints, plain = joint_names(report), None
+    # What the log has, and the model: the user's, or a skeleton of the kind of robot.
+    files, report, notes = _usable(log, layout)
+    joints, stated = joint_names(report), column_units(files[0])
     chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
+    plain = None if own else skeleton(chosen, report, joints, named, stated)
     if own:
-        why, built = "your model", own.bring(folder)
-    else:
-        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
-        built = _model_in(folder, plain.source())
+        why = "your model"
+    built = own.bring(folder) if own else _model_in(folder, plain)
     matched = assigned(report, built.states, built.inputs, built, joints)
-    if not (kind or own or any(g.path for g in matched[0])):
+    if plain and not (kind or any(g.path for g in matched[0])):
         why = f"no number in the log matches a state of kind {chosen}; names are the log's"
-        chosen = "generic"
-        plain = skeleton(chosen, report, joints, named, column_units(files[0]))
-        built = _model_in(folder, plain.source())
+        chosen, plain = "generic", skeleton("generic", report, joints, named, stated)
+        built = _model_in(folder, plain)
     if chosen == "generic" and not own:
         given = {name: one.path for name, one in moving(report).items()}
         matched = assigned(report, built.states, built.inputs, built, joints, given)
         driven = any(one.value for name, one in built.params.items() if name.startswith("gain_"))
         notes = (*notes, *_left_out(report, built), *[TO_COMPLETE] * (not driven))
-    states, inputs = matched
+
+    # Which number is which signal.
+    states, inputs = map(list, matched)
     units = {**built.states, **built.inputs}
     if chosen == "balance" and not own:
-        states = tuple(by_encoders(states, report, joints, built.params["r"].value))
-    if ask is not None:
-        states, inputs = (
-            tuple(_asked(g, ask, report, units) for g in g_) for g_ in (states, inputs)
-        )
+        states = by_encoders(states, report, joints, built.params["r"].value)
+    states, inputs = ([_asked(g, ask, report, units) for g in some] for some in (states, inputs))
     if plain is not None:
         full = with_gain(plain, {g.name: g for g in (*states, *inputs)}, report)
-        built = built if full is plain else _model_in(folder, full.source())
+        built = built if full is plain else _model_in(folder, full)
+
+    # Units, ranges and the control interval.
     ranges = {g.name: g.extent for g in (*states, *inputs)}
     odd = perhaps_degrees((*states, *inputs), built, joints)
-    inputs = tuple(g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs)
+    inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
     slow = () if layout.rate or states_time_unit(files[0]) else _in_seconds(report)
     notes = (*notes, *slow, *(odd[g.name].sentence for g in states if g.name in odd))
     step, whose, note = (
@@ -237,11 +226,9 @@ def _begin(
         ranges |= {
             g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
         }
-    if own:
-        notes = (*notes, *_unused(report, (*states, *inputs)), *_unmeasured(states, built))
-        notes = (*notes, *_turning(built))
-        without = getattr(built.step, "without", ())
-        notes = (*notes, *[found("start.unmoved", *without).sentence] * bool(without))
+    notes = (*notes, *(_on_own(report, states, inputs, built) if own else ()))
+
+    # The files: first without a target, since the log is read as grounded.toml says.
     rates = velocities(built)
     simulated = report.simulated
     table = mapping_toml(states, inputs, simulated=simulated, rates=rates, layout=layout)
@@ -263,13 +250,30 @@ def _begin(
         why=why,
         dt=step,
         horizon=horizon,
-        states=states,
-        inputs=inputs,
+        states=tuple(states),
+        inputs=tuple(inputs),
         target=target,
         start=_start(built, stood, states),
         notes=(*notes, *[note] * bool(note), *more),
         again=again if slow else (),
     )
+
+
+def _usable(log: str | Path, layout: Layout) -> tuple[tuple[Path, ...], LogReport, tuple[str, ...]]:
+    """Return the files of a log, what is in it, and notes; refuse one that tells no motion."""
+    files = log_files(log)
+    if kind_of(files[0]):
+        raise refused("start.no_start", log, why="own")
+    report = inspect_log(log, layout)
+    if report.damage:
+        raise refused("start.damaged", why=report.damage, then=NextCommand("recover", (str(log),)))
+    numbers = [field for field in report.numbers if field.low is not None]
+    if not numbers:
+        there = [field.path for field in report.numbers]
+        raise refused("start.no_start", log, why="text", names=tuple(there[:NAMED]))
+    if all(field.low == field.high for field in numbers):
+        raise refused("start.no_start", log, why="still")
+    return files, *_one_run(report)
 
 
 def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
@@ -283,9 +287,10 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
     return replace(report, topics=(same[0],)), (note,)
 
 
-def _model_in(folder: Path, text: str) -> Model:
-    """Write model.py and load it."""
-    write_atomically(folder / "model.py", text.encode())
+def _model_in(folder: Path, plain: Skeleton | None) -> Model:
+    """Write a skeleton as model.py and load it."""
+    assert plain is not None
+    write_atomically(folder / "model.py", plain.source().encode())
     return model_in(load_module(folder, "model.py"))
 
 
@@ -300,6 +305,16 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
             f"the inputs, such as --inputs {last}"
         )
     return tuple(found)
+
+
+def _on_own(
+    report: LogReport, states: Sequence[Guess], inputs: Sequence[Guess], model: Model
+) -> tuple[str, ...]:
+    """Return notes on what the user's own model and the log lack of each other."""
+    without = getattr(model.step, "without", ())
+    unmoved = [found("start.unmoved", *without).sentence] * bool(without)
+    unused = _unused(report, (*states, *inputs))
+    return (*unused, *_unmeasured(states, model), *_turning(model), *unmoved)
 
 
 def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[str, ...]:
@@ -347,9 +362,9 @@ def _in_seconds(report: LogReport) -> tuple[str, ...]:
     )
 
 
-def _asked(guess: Guess, ask: Ask, report: LogReport, units: Mapping[str, str]) -> Guess:
+def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str, str]) -> Guess:
     """Return an unsure guess as the user answers."""
-    if guess.sure:
+    if guess.sure or ask is None:
         return guess
     path = ask(guess)
     if path == guess.path:

@@ -125,32 +125,27 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         if unit.get(known_as) == "1" != unit[position]:
             unit[known_as] = f"{unit[position]}/s"
 
-    # The equations of the others.
-    per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
-    drives = {s: [followers[s]] if s in followers else inputs for s in states if s not in rates}
-    named_gains = {
-        (s, i): f"gain_{s}" if s in followers else f"gain_{s}_{i}"
-        for s, drive in drives.items()
-        for i in drive
-    }
-    gains = {
-        name: f'{1.0 * (s in followers)}, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'
-        for (s, i), name in named_gains.items()
-    }
-    sums = {
-        s: " + ".join(f"p.{named_gains[s, i]} * a.{i}" for i in drive)
-        for s, drive in drives.items()
-    }
-    equations = [
-        f'"{s}": {rates[s]}' if s in rates else f'"{s}": ({sums[s]} - s.{s}) / p.tau_{s}'
-        for s in states
-    ]
+    # The equations of the others: each lags behind its own command, or behind all inputs.
+    equations, lags, gains = [], dict[str, str](), dict[str, str]()
+    for s in states:
+        if s in rates:
+            equations.append(f'"{s}": {rates[s]}')
+            continue
+        own = (
+            {followers[s]: f"gain_{s}"} if s in followers else {i: f"gain_{s}_{i}" for i in inputs}
+        )
+        sums = " + ".join(f"p.{gain} * a.{i}" for i, gain in own.items())
+        equations.append(f'"{s}": ({sums} - s.{s}) / p.tau_{s}')
+        lags[f"tau_{s}"] = '1.0, "s", 0.01, 100.0'
+        for i, gain in own.items():
+            per = f"/({unit[i]})" if unit.get(i, "1") != "1" else ""
+            gains[gain] = f'{1.0 * (s in followers)}, "{unit.get(s, "1")}{per}", -100.0, 100.0'
     return Skeleton(
         "generic",
         f"Numbers that follow the inputs with a lag: {PLACEHOLDER}",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
-        {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states if s not in rates} | gains,
+        lags | gains,
         equations,
         tuple(s for s in states if unit.get(s) == "rad" and _turns(found[s])),
     )

@@ -19,7 +19,7 @@ from grounded.findings import found as finding
 from grounded.share import Share
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, write_diagnosis
+from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, made_from, write_diagnosis
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
@@ -59,14 +59,6 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
     from grounded_trials.workspace.adoptable import diagnosed_again
-    from grounded_trials.workspace.candidates.search_state import candidate_named
-    from grounded_trials.workspace.next_step import (
-        DIAGNOSE,
-        EXPORT,
-        REPORT,
-        after_diagnosis,
-        left_open,
-    )
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
@@ -122,14 +114,38 @@ def diagnose_in(
         found = found.asking(step, identity)
     elif step is not None:  # why there is no probe
         found = replace(found, findings=(*found.findings, step))
-    if undo := _in_vain(workspace, found):
-        found = found.asking(undo, identity)
-    ran = tuple(trial.id for trial in used + others if trial.candidate)
-    wrong = ran if any(one.log for one in in_the_log(measured)) else ()  # it affects every trial
+    logs = any(one.log for one in in_the_log(measured))  # the fault affects every trial
+    wrong = tuple(trial.id for trial in used + others if trial.candidate and logs)
+    return _with_next(workspace, found, identity, wrong, whole=share.finding is None)
+
+
+def _with_next(
+    workspace: Folder, found: Diagnosis, identity: str, wrong: tuple[str, ...], *, whole: bool
+) -> Diagnosis:
+    """Return a diagnosis with what it asks for and the next command, and write it.
+
+    Args:
+        workspace: the workspace.
+        found: the diagnosis.
+        identity: of the candidate that would separate two tied effects, "" for none.
+        wrong: the trials of candidates whose logs are at fault.
+        whole: whether all trials could be used, if they had been named.
+    """
+    from grounded_trials.workspace.candidates.search_state import candidate_named
+    from grounded_trials.workspace.next_step import (
+        DIAGNOSE,
+        EXPORT,
+        REPORT,
+        after_diagnosis,
+        left_open,
+    )
+
+    undo = _in_vain(workspace, found)
+    found = found.asking(undo, identity) if undo else found
     if wrong:
         found = found.asking(finding("gap.next.fix", *wrong), identity)
-    left = len(diagnosable(workspace)) - len(made.trials)
-    if unasked := found.no_cause and left > 0 and share.finding is None:
+    left = len(diagnosable(workspace)) - len(made_from(found).trials)
+    if unasked := found.no_cause and left > 0 and whole:
         found = found.asking(finding("gap.next.use", stored=left))
     write_diagnosis(workspace.reports, found)  # again, now with the next step
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)

@@ -540,6 +540,11 @@ class _Reading:
     about: int | None = None  # the signal whose unit is not the expected one: 0 or 1
     why: str = ""
 
+    @property
+    def both(self) -> bool:
+        """Whether it says something of the two together."""
+        return self.why == "start.same_unit"
+
 
 def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Iterator[_Reading]:
     """Yield the readings of a position and its rate that agree in size, most plausible first.
@@ -575,7 +580,6 @@ def _followed(
     like, back = signals.follows(q.path, w.path), signals.follows(w.path, q.path)
     by = table.factor(q.name, q.path), table.factor(w.name, w.path)
     slope, size = like.slope * by[1] / by[0], like.correlation
-    stated = [table.stated.unit(one.path) for one in (q, w)]
 
     # Which is the rate of which?
     crossed = back.fits and not (abs(slope - 1) < SAME and size > FOLLOWS)
@@ -586,28 +590,36 @@ def _followed(
         why = found("start.unfollowed", w.name, of=q.path, correlation=size)
         return {w.name: w.because(why, sure=False)} if size else {}
 
-    # In which units?
-    reading = next(_readings(slope, stated, by), None)
-    if reading is None:
-        w = w.because(found("start.times", w.name, of=q.path, slope=slope), sure=False)
-    else:
-        if reading.about is not None:
-            names = pair if reading.why == "start.same_unit" else pair[reading.about :][:1]
-            odd = found(reading.why, *names)
-            q, w = (g.because(odd) if i == reading.about else g for i, g in enumerate((q, w)))
-        q = replace(q, scale=reading.q, sure=q.sure and reading.q == 1)
-        w = replace(w, scale=reading.w * float(np.sign(slope)))
-
-        # Each is as sure as the other if nothing else rivals with it.
-        alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
-        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
-        same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
-        sure = (kind and size > SURELY and same) or (w.sure and slope > 0 and w.scale == 1)
-        q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
-        w = replace(w, sure=w.sure or (q.sure and alone[1]))
+    q, w = _in_units(q, w, like, by, table)
     why = found("start.follows", w.name, of=q.path, correlation=size, sign=int(np.sign(slope)))
     w = w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)
     return {q.name: q, w.name: w}
+
+
+def _in_units(
+    q: Guess, w: Guess, like: Follows, by: tuple[float, float], table: _Table
+) -> tuple[Guess, Guess]:
+    """Return a position and its rate in the units that make them agree, and how sure they are."""
+    stated = [table.stated.unit(one.path) for one in (q, w)]
+    slope = like.slope * by[1] / by[0]
+    reading = next(_readings(slope, stated, by), None)
+    if reading is None:
+        why = found("start.times", w.name, of=q.path, slope=slope)
+        return q, w.because(why, sure=False)
+    if reading.about is not None:
+        names = (q.name, w.name)
+        odd = found(reading.why, *(names if reading.both else names[reading.about :][:1]))
+        q, w = (g.because(odd) if i == reading.about else g for i, g in enumerate((q, w)))
+    q = replace(q, scale=reading.q, sure=q.sure and reading.q == 1)
+    w = replace(w, scale=reading.w * float(np.sign(slope)))
+
+    # Each is as sure as the other if nothing else rivals with it.
+    alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
+    kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
+    same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
+    sure = (kind and like.correlation > SURELY and same) or (w.sure and w.scale == 1)
+    q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
+    return q, replace(w, sure=w.sure or (q.sure and alone[1]))
 
 
 def _by_steps(
