@@ -11,9 +11,9 @@ from facts import holds
 from grounded import Model, Param, Trial
 from grounded.accounts.commands import answers_early, how_inputs_act
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.judge import contradicted, judge
+from grounded.accounts.judge import judge
 from grounded.accounts.sound_trials import sound_trials
-from grounded.accounts.table import DEGREES, Account, Term, accounts, units_of
+from grounded.accounts.table import DEGREES, Account
 from shared_data import needs_data
 
 ROBOT = {name: make() for name, make in ROBOTS.items()}
@@ -98,39 +98,6 @@ def test_an_exchange_in_a_real_log_is_named():
         assert told.account.kind == "exchange" and told.account.touched & {*pair}
 
 
-def rotor(unit):
-    """A drone whose thrust grows with the square of its rotor's speed in a unit."""
-    k = 1.6e-5 / (91.19 if unit == "rpm" else 1.0)
-    return Model(
-        states={"z": "m", "vz": "m/s"},
-        inputs={"rotor": unit},
-        params={"k": Param(k, "m/s^2", std=k / 50)},
-        derivative=lambda s, a, p: {"z": s.vz, "vz": p.k * a.rotor**2 - 9.81},
-    )
-
-
-def held(model, rng, steps=400, dt=0.02):
-    """A run of the rotor in rad/s about a moving height."""
-    x, states, inputs = np.zeros(2), [np.zeros(2)], []
-    for i in range(steps):
-        want = 0.6 * np.sin(0.8 * i * dt) + 0.3 * np.sin(2.1 * i * dt)
-        w = np.sqrt(max(9.81 + 6 * (want - x[0]) - 4 * x[1], 0) / 1.6e-5)
-        x = x + dt * np.array([x[1], 1.6e-5 * w**2 - 9.81])
-        states.append(x)
-        inputs.append([w])
-    noise = np.array([5e-4, 3e-3]) * rng.normal(size=(steps + 1, 2))
-    names = (model.state_names, model.input_names)
-    return Trial(np.array(states) + noise, np.array(inputs), dt, *names)
-
-
-def test_rad_per_second_under_rpm_is_named_by_its_factor():
-    rng = np.random.default_rng(5)
-    with pytest.raises(UnusableTrials) as refused:
-        sound_trials(rotor("rpm"), [held(rotor("rpm"), rng) for _ in range(2)])
-    assert (refused.value.finding.code, refused.value.finding.about) == ("log.unit", ("rotor",))
-    assert judge(rotor("rad/s"), [held(rotor("rad/s"), rng)], range(2)).told == ()
-
-
 def gyro(rng, *, dead=True, steps=600, dt=0.1):
     """A heading that follows a wheel, and a gyro that shows noise alone."""
     model = Model(
@@ -206,23 +173,3 @@ def test_accounts_undo_what_they_name():
     assert both.inputs == pytest.approx(trial.inputs[:, ::-1])
     assert Account("pace", (), 1e-3).mended(trial).dt == pytest.approx(1e-4)
     assert np.isnan(Account("dead", (0,)).mended(trial).states[:, 0]).all()
-
-
-def test_units_of_any_kind_have_others():
-    assert units_of("rad/s")["rpm"] == pytest.approx(9.5493)
-    assert 3.6 in units_of("m/s").values()
-    assert units_of("N") == {"mN": 1e3} and 1e3 in units_of("N m").values()
-    assert units_of("1", 80.0) == {"percent": 100.0} and not units_of("1", 1.0)
-
-
-def test_a_model_with_lengths_as_inputs_is_not_told_that_all_lengths_are_off():
-    model = replace(ROBOT["car"].model, inputs={"throttle": "m/s", "steering": "rad"})
-    table = [one for one in accounts(model) if Term.MOTION in one.terms]
-    assert not any(one.kind == "unit" and {0, 1, 3} <= one.touched for one in table)
-
-
-def test_a_sound_trial_contradicts_the_exchange_of_another(logs):
-    model, sound = ROBOT["car"].model, logs["car"]["sound"].trials[0]
-    swap = Account("exchange", pairs=((4, 5),))
-    assert contradicted(model, sound, range(4), swap)
-    assert not contradicted(model, swap.mended(sound), range(4), swap)

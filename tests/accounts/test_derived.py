@@ -76,14 +76,6 @@ def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted()
     assert np.isnan(found.trials[0].states[:, 1]).all()
 
 
-@pytest.mark.parametrize("noise", [2e-4, 2e-3, 1e-2])
-def test_a_late_sensor_of_its_own_is_still_used(noise):
-    found = preflight(SWING, swung("late", noise))
-    (one,) = (f for f in found.findings if f.signal == "w")
-    assert one.kind == "delay" and abs(one.delay_s - 2 * DT) < 0.1 * DT
-    assert np.isfinite(found.trials[0].states[:, 1]).any()
-
-
 def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted():
     seen = [a_mean("v", "x", 0.04)]
     (late,) = late_as_positions(seen, {"sensor_delay:x": 0.03, "sensor_delay:beam": 0.5}, ())

@@ -10,7 +10,6 @@ from grounded import Model, Param
 from grounded.accounts.commands import how_inputs_act, judge_signs
 from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.sound_trials import sound_trials
-from grounded.effects import Library, wrap
 from grounded.models import arm, cart_pole
 from grounded.trial import Trial
 
@@ -51,19 +50,6 @@ def test_the_sign_of_an_input_is_known_though_friction_is_not_modelled(wired, se
     """With the wrong sign the feedback runs away: the input is at its limit but for 0.3 s."""
     (acts,) = how_inputs_act(AXIS, driven(wired, seed=seed), range(2))
     assert acts.sign * wired >= 0
-
-
-def test_a_robot_less_stable_than_its_model_does_not_seem_to_be_wired_wrongly():
-    """Its commands oppose its motion: without what is linear in the states, the sign is wrong."""
-    (acts,) = how_inputs_act(AXIS, driven(rises=120.0, seconds=10.0), range(2))
-    assert acts.sign >= 0
-
-
-def test_an_input_that_does_not_change_or_is_not_known_has_no_sign():
-    trial = driven()
-    for inputs in (np.ones_like(trial.inputs), np.full_like(trial.inputs, np.nan)):
-        (acts,) = how_inputs_act(AXIS, replace(trial, inputs=inputs), range(2))
-        assert acts.sign == 0
 
 
 def test_the_trial_that_contradicts_the_others_is_named():
@@ -137,24 +123,6 @@ def test_an_input_that_acts_late_is_never_said_to_act_the_other_way_round(plant,
         model, trial = swinging(plant, late, seed, strong, dt, seconds)
         acts = how_inputs_act(model, trial, range(model.n))
         assert min(one.sign for one in acts) >= 0, (late, seed, dt, seconds, acts)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_adopted_lags_begin_where_the_commands_before_left_them(seed):
-    """Begun at 0, a boat's thruster, 0.16 s late with a lag of 0.26 s, acted by 388 or -365 %."""
-    dt, rng = 0.1, np.random.default_rng(seed)
-    model = AXIS
-    for name, values in (("first_order_lag:torque", {"tau": 0.26}), ("delay:torque", {"d": 0.16})):
-        model = wrap(Library().effect(name, model), values, dt)
-    sent = np.repeat(rng.uniform(-0.3, 0.5, 30), 8)[:, None]
-    states = [np.zeros(model.n)]
-    for u in sent:
-        states.append(model.system.step(states[-1][None], u[None], model.values, dt)[0])
-    x = np.array(states)
-    x[:, :2] += [2e-3, 2e-2] * rng.standard_normal((len(x), 2))
-    trial = Trial(x, sent, dt, model.state_names, model.input_names)
-    (acts,) = how_inputs_act(model, trial, range(2))
-    assert acts.sign == 1 and acts.share == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("drag", [0.7, 0.9])

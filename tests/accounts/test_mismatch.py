@@ -110,30 +110,6 @@ def test_kinematic_rows_are_read_off_the_model(model):
     assert found == {"x": ["psi", "u", *across], "y": ["psi", "u", *across], "psi": ["r"]}
 
 
-def test_a_state_without_a_sensor_or_an_uncertain_parameter_makes_no_row():
-    assert [row.i for row in kinematic_rows(BOAT, [0, 1, 2, 3, 5])] == [2]
-    geared = Model(
-        name="geared",
-        states={"x": "m", "w": "rad/s"},
-        inputs={"F": "N"},
-        params={"R": Param(0.1, "m", 0.05, 0.2), "c": Param(0.5, "m")},
-        derivative=lambda s, a, p: {"x": p.R * s.w, "w": a.F - p.c * s.w},
-    )
-    assert kinematic_rows(geared, [0, 1]) == []
-
-
-def test_a_constant_drift_that_was_adopted_leaves_the_rows():
-    drifting = Model(
-        name="drifting",
-        states=dict(BOAT.states),
-        inputs=dict(BOAT.inputs),
-        params={**SCALE, "a": Param(0.1, "m/s", -1.0, 1.0)},
-        angles=("psi",),
-        derivative=lambda s, a, p: {**(rate := moving(s, a, p)), "x": rate["x"] + p.a},
-    )
-    assert [row.i for row in kinematic_rows(drifting, range(6))] == [0, 1, 2]
-
-
 def adrift(x: Array) -> Array:
     """At rest in a current."""
     y = NOISE * np.random.default_rng(0).normal(size=x.shape)
@@ -193,16 +169,6 @@ def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(model, fault, 
     assert error.value.then.arguments == ("t0000", "t0001", "t0002")
 
 
-def test_one_trial_that_is_off_is_named_alone():
-    trials = [*logged(BOAT)[:2], logged(BOAT, times(x=1e3, y=1e3))[2]]
-    with pytest.raises(UnusableTrials) as error:
-        preflight(BOAT, trials)
-    assert error.value.then is not None and error.value.then.arguments == ("t0002",)
-    (one,) = preflight(BOAT, [*trials[:2], logged(BOAT, times(y=-1))[2]]).findings
-    assert (one.signal, one.kind) == ("y", "sign")
-    assert "t0002" in one.finding and one.log == ""
-
-
 def folded(x: Array) -> Array:
     """Return states whose heading was in degrees and was unwrapped as radians."""
     y = np.array(x)
@@ -260,26 +226,3 @@ def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
     found = preflight(BOAT, logged(BOAT, positions_late(by)))
     assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
     assert not delayed(preflight(BOAT, found.trials).findings)
-
-
-@pytest.mark.parametrize("model", [BOAT])
-def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
-    def ahead(x: Array) -> Array:  # an antenna 0.4 m behind the middle
-        y = np.array(x)
-        y[:, 0] -= 0.4 * np.cos(x[:, 2])
-        y[:, 1] -= 0.4 * np.sin(x[:, 2])
-        return y
-
-    def slipping(x: Array) -> Array:  # a log that reads more the more it speeds up
-        y = np.array(x)
-        y[:, 3] += 0.3 * np.gradient(np.convolve(x[:, 3], np.ones(5) / 5, "same"), DT)
-        return y
-
-    def drifting(x: Array) -> Array:  # by as much to its side all the time
-        y = np.array(x)
-        y[1:, 0] += 0.2 * DT * np.cumsum(np.cos(x[:-1, 2]) - np.sin(x[:-1, 2]))
-        y[1:, 1] += 0.2 * DT * np.cumsum(np.sin(x[:-1, 2]) + np.cos(x[:-1, 2]))
-        return y
-
-    for fault in (lambda x: x, ahead, slipping, drifting):
-        assert not delayed(preflight(model, logged(model, fault)).findings)

@@ -8,9 +8,8 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.accounts.ages import bias_of as constant_of
-from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.kinematics import kinematic_rows, turned
-from grounded.accounts.lag import at_samples, lag_between
+from grounded.accounts.kinematics import turned
+from grounded.accounts.lag import at_samples
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
@@ -19,7 +18,6 @@ from grounded.models.pendulum import model as pendulum
 from grounded.places import integrals
 
 DT = 0.02
-GYRO = np.eye(car.n)[car.state_names.index("psi_rate")]
 ARM = Model(
     states={"q": "rad", "w": "rad/s"},
     inputs={"u": "N m"},
@@ -115,21 +113,6 @@ def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(
     assert abs(late - (1.5 - moved_back) * DT) < 0.05 * DT
 
 
-@pytest.mark.parametrize("first", [0])
-def test_a_velocity_computed_from_two_samples_of_its_position_is_no_sensor(first):
-    """Moved back by half a step it made an arm's delay of 20 ms 1.7 ms longer."""
-
-    def fault(y):
-        q = 1e-3 * np.round(y[:, 0] / 1e-3)  # an encoder
-        w = np.diff(q, prepend=q[0]) if first else np.diff(q, append=2 * q[-1] - q[-2])
-        return np.stack([q, np.round(w / DT, 4)], axis=1)
-
-    looked = preflight(ARM, arm(fault))
-    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
-    assert found.signal == "w" and found.corrected
-    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
-
-
 @pytest.mark.parametrize(
     ("w", "noise"), [(lambda x: late(x, 1.5), 0.3), (lambda x: lagged(x, 0.08), 0.0)]
 )
@@ -165,14 +148,6 @@ def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
         assert off.value == pytest.approx(bias, abs=3 * off.std) and off.std < 0.002
 
 
-@pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (0.994, False)])
-def test_a_scale_between_two_sensors_that_agree_is_no_candidate(scale, settled):
-    found = preflight(ARM, arm(columns(w=lambda x: scale * x)))
-    assert not found.findings
-    scales = {"sensor_scale:w", "sensor_scale:q", "rate_gain:q"}
-    assert (scales <= found.settled) is settled and bool(scales & found.settled) is settled
-
-
 def stuck(x):
     out = x.copy()
     out[60:85] = out[60]
@@ -200,71 +175,6 @@ def test_samples_that_show_nothing_become_missing(fault, kind, lost):
     gone = [int(np.isnan(t.states[:, 0]).sum()) for t in found.trials]
     assert max(gone) == pytest.approx(lost, abs=1)  # a turn hides it in the other trial
     assert one.share == pytest.approx(sum(gone) / 402)
-
-
-def dead(x):
-    return np.column_stack([x[:, 0], np.full(len(x), 0.25)])
-
-
-def of_another_axis(x):
-    """A gyro that hardly turns: its noise, about its own small bias."""
-    noise = 0.01 * np.random.default_rng(len(x)).normal(size=len(x))
-    return np.column_stack([x[:, 0], 0.002 + noise])
-
-
-def test_a_velocity_that_is_another_axis_s_noise_is_one_that_shows_nothing():
-    with pytest.raises(UnusableTrials) as stopped:
-        preflight(ARM, arm(of_another_axis))
-    assert (stopped.value.finding.code, stopped.value.finding.about) == ("log.dead", ("w",))
-    trials = arm()
-    trials[1] = replace(trials[1], states=of_another_axis(trials[1].states))
-    found = preflight(ARM, trials)
-    (one,) = (f for f in found.findings if f.kind == "stuck")
-    assert one.signal == "w" and "number 2" in one.finding
-    assert np.isnan(found.trials[1].states[:, 1]).all()
-
-
-ENCODER = 2e-3  # rad a count
-
-
-def sticking_joint(seed):
-    """An arm that dry friction holds now and then: an encoder, its filtered difference (T + 1, 2).
-
-    The difference is 0 to the last digit there, as a log with a few digits has it.
-    """
-    rng, q, w = np.random.default_rng(seed), [0.0], [0.0]
-    while len(q) < 600:
-        for speed in (rng.uniform(0.03, 0.4), 0.0):
-            q += list(q[-1] + np.cumsum(np.full(rng.integers(40, 70), speed * DT)))
-    counts = np.round(np.array(q) / ENCODER) * ENCODER
-    for moved in np.diff(counts):
-        w.append(w[-1] + (moved / DT - w[-1]) / 6)
-    return np.column_stack([counts, np.round(w, 3)])
-
-
-def of_joints(fault=lambda y: y):
-    return [
-        Trial(fault(sticking_joint(k)[:400]), np.zeros((399, 1)), DT, ("q", "w"), ("u",))
-        for k in range(3)
-    ]
-
-
-def test_a_velocity_that_is_0_while_its_encoder_stands_still_is_at_rest():
-    """A bench helicopter's dry friction: "sticks to its last value, up to 0.25 s", and cut out."""
-    found = preflight(ARM, of_joints())
-    assert not {f.kind for f in found.findings} & {"stuck", "saturated"}
-    assert all(np.isfinite(t.states[:, 0]).all() for t in found.trials)
-    assert [f.signal for f in found.findings if f.kind == "smoothed"] == ["w"]  # not as a sensor
-
-
-@pytest.mark.parametrize(("gone", "told"), [([0, 1], ["q", "w"])])
-def test_a_velocity_that_stays_while_its_encoder_moves_or_says_it_does_is_stuck(gone, told):
-    def held(y):
-        y[1:21, gone] = y[1, gone]  # as it speeds up; both: a log that hangs
-        return y
-
-    found = preflight(ARM, of_joints(held)).findings
-    assert [one.signal for one in found if one.kind == "stuck"] == told
 
 
 def test_coarse_missing_and_clipped_samples_are_stated_and_left():
@@ -315,77 +225,6 @@ def test_kinematics_come_from_the_model():
     assert set(names[:2]) == {"x", "y"} and names[2] == "psi"
 
 
-@pytest.mark.parametrize("of_slow", [1.0, 0.94])
-def test_a_size_that_only_chatter_has_is_no_scale(of_slow):
-    """A balancer's torque changed sign every 25 ms: its gyro showed 94.5 % of its pitch's rate."""
-    rng, t = np.random.default_rng(3), 0.01 * np.arange(1000)
-    slow, chatter = 0.3 * np.sin(2.1 * t), np.sin(2 * np.pi * 19.94 * t)
-    a, b = slow + chatter, of_slow * slow + 0.94 * chatter
-    lag = lag_between([tuple(x + 0.01 * rng.standard_normal(1000) for x in (a, b))], 0.01)
-    assert lag.scale < 0.96
-    assert lag.slow == pytest.approx(of_slow, abs=0.01)
-    assert lag.off(0.03) == (of_slow < 1)
-
-
-@pytest.mark.parametrize(("state", "factor"), [(0, np.pi / 180), (1, 180 / np.pi)])
-def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
-    trials = arm()
-    states = np.array(trials[1].states)
-    states[:, state] *= factor
-    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
-    assert [(f.signal, f.kind) for f in found.findings] == [("qw"[state], "degrees")]
-    assert found.findings[0].scale == pytest.approx(factor)
-    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
-
-
-def driven():
-    """Three drives of the car, which carries its heading's rate along."""
-    rng, trials = np.random.default_rng(4), []
-    for _ in range(3):
-        u = 0.4 + 0.2 * np.sin(DT * np.arange(150)[:, None] * rng.uniform(1, 4, 2))
-        states = [np.zeros(car.n)]
-        for one in u:
-            states.append(car.system.step(states[-1][None], one[None], car.values, DT)[0])
-        x = np.array(states) + 1e-4 * rng.standard_normal((151, car.n))
-        trials.append(Trial(x, u, DT, car.state_names, car.input_names))
-    return trials
-
-
-def test_a_gyro_that_is_off_is_told_though_the_model_carries_its_rate_along():
-    biased = [replace(trial, states=trial.states + 0.9 * GYRO) for trial in driven()]
-    (found,) = preflight(car, biased).findings
-    assert (found.signal, found.kind, found.corrected) == ("psi_rate", "offset", False)
-    assert "0.9 rad/s more than the rate of psi" in found.finding
-    assert preflight(car, driven()).findings == ()
-
-
-def test_a_heading_in_degrees_in_one_trial_leaves_the_others_alone():
-    """The car carries its heading's rate along: pooled, one trial made all be in degrees."""
-    trials = driven()
-    x = np.array(trials[1].states)
-    x[:, car.state_names.index("psi")] *= 180 / np.pi
-    found = preflight(car, [trials[0], replace(trials[1], states=x), *trials[2:]])
-    assert [(f.signal, f.kind) for f in found.findings] == [("psi", "degrees")]
-    for mended, trial in zip(found.trials, trials, strict=True):
-        np.testing.assert_allclose(mended.states, trial.states)
-
-
-@pytest.mark.parametrize("wrapped", [True])
-def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
-    """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
-    trials, rng = arm(), np.random.default_rng(3)
-    for k, trial in enumerate(trials):
-        x = np.array(trial.states)
-        x[:, 0] += 0.04 * rng.standard_normal(len(x)) + 3 * (k == 1)
-        if k == 1:
-            x[:, 0] = np.rad2deg(x[:, 0])
-            x[:, 0] = (x[:, 0] + 180) % 360 - 180 if wrapped else x[:, 0]
-        trials[k] = replace(trial, states=x)
-    found = preflight(ARM, trials)
-    assert (found.findings[0].signal, found.findings[0].kind) == ("q", "degrees")
-    assert 0.5 < np.ptp(found.trials[1].states[:, 0]) / np.ptp(arm()[1].states[:, 0]) < 2
-
-
 @pytest.mark.parametrize("factor", [1e3])
 def test_commands_in_another_unit_in_one_trial_are_told(factor):
     trials = arm(friction=0.4)
@@ -424,17 +263,6 @@ def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
         trials.append(Trial(x * [1, 1, unit], sent * u, DT, BEAM.state_names, ("cmd",)))
     found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
     assert found == [("theta", "degrees")] * (unit > 1) + [("cmd", "degrees")] * (sent > 1)
-
-
-def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
-    pushed, free = arm(trials=2)
-    states = [np.array([1.0, 0.0])]
-    for u in (inputs := 1e-3 * pushed.inputs):
-        states.append(ARM.system.step(states[-1][None], u[None], ARM.values, DT)[0])
-    swing = replace(free, states=np.array(states), inputs=inputs)
-    assert not preflight(ARM, [pushed, swing]).findings
-    still = replace(free, states=1e-3 * free.states, inputs=inputs)
-    assert not [f for f in preflight(ARM, [pushed, still]).findings if f.signal == "u"]
 
 
 def test_a_trial_with_stamps_in_milliseconds_stops_the_diagnosis():
@@ -483,24 +311,6 @@ def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
     assert found.log == "scale = 0.10471976" * mended
 
 
-TRUCK = Model(
-    states={"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
-    inputs={"steering": "rad", "push": "m/s^2"},
-    params={"L": Param(0.5, "m", std=0.02)},
-    angles=("psi",),
-    derivative=lambda s, a, p: {
-        "v": a.push - s.v,
-        "x": s.v * np.cos(s.psi),
-        "y": s.v * np.sin(s.psi),
-        "psi": s.v * np.tan(a.steering) / p.L,
-    },
-)
-CROOKED = ("coupling:psi<-v", {"k": 0.04})
-LATE = ("delay:steering", {"d": 0.008})
-PLAY = ("backlash:steering", {"b": 0.02})
-SHORT_OF = ("saturation:steering", {"c": 0.1})
-
-
 def adopted(model, *effects):
     """Return a model with effects, the innermost first."""
     for name, values in effects:
@@ -517,38 +327,6 @@ def run_of(model, shown, inputs, noise):
     x = np.array(states) + noise * rng.standard_normal((len(states), model.n))
     x[:, shown:] = np.nan
     return Trial(x, inputs, DT, model.state_names, model.input_names)
-
-
-@pytest.mark.parametrize("hides", [(LATE, PLAY), (SHORT_OF,)])
-def test_what_an_adopted_effect_hides_of_an_input_is_no_relation_of_sensors(hides):
-    truck = adopted(TRUCK, CROOKED, *hides)
-    assert not integrals(truck)
-    rows = kinematic_rows(truck, range(TRUCK.n))
-    assert [truck.state_names[row.i] for row in rows] == ["x", "y"]
-
-    t = np.arange(400) * DT
-    inputs = np.stack([0.3 * np.sin(1.3 * t), 1.5 + 0.5 * np.sin(0.7 * t)], axis=1)
-    trial = run_of(truck, TRUCK.n, inputs, 1e-3)
-    found = preflight(truck, [trial], hidden=truck.state_names[TRUCK.n :])
-    assert [one.finding for one in found.findings] == []
-
-
-@pytest.mark.parametrize("limit", [0.1])
-def test_an_input_beyond_the_models_own_limits_makes_no_relation_of_sensors(limit):
-
-    def within(s, a, p):
-        steering = np.minimum(np.maximum(a.steering, -limit), limit)
-        return {
-            "v": a.push - s.v,
-            "x": s.v * np.cos(s.psi),
-            "y": s.v * np.sin(s.psi),
-            "psi": s.v * np.tan(steering) / 0.5,
-        }
-
-    limited = replace(TRUCK, derivative=within)
-    assert not integrals(limited)
-    rows = kinematic_rows(limited, range(limited.n))
-    assert [limited.state_names[row.i] for row in rows] == ["x", "y"]
 
 
 ROVER = Model(

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.accounts.time_step import judge_time_step, too_long
+from grounded.accounts.time_step import judge_time_step
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
-from grounded.models.car import model as car
 
 DT = 0.02
 
@@ -46,23 +45,6 @@ def test_a_motor_that_is_too_fast_for_a_step(rate, enough):
     if enough:
         assert found[0].kind == "time step" and f"substeps={enough}" in found[0].advice
         assert not judge_time_step(replace(model, substeps=enough), [run(model)], [0, 1])
-
-
-def test_models_that_take_their_own_steps_are_not_judged():
-    own = motor(280.0)
-    stepped = replace(own, derivative=None, step=lambda s, a, p, dt: {"q": s.q, "w": 0.5 * s.w})
-    assert not judge_time_step(stepped, [run(own)], [0, 1])
-    assert not judge_time_step(own, [run(own)], [])  # nothing is measured
-    rng = np.random.default_rng(0)
-    x, u = rng.uniform(-1, 1, (50, car.n)), rng.uniform(-1, 1, (50, car.m))
-    assert too_long(car, x, u, 0.05) is None
-
-
-def test_a_few_samples_of_a_fall_say_nothing_about_the_others():
-    model = motor(10.0)
-    states = np.array(run(model).states)
-    states[100:103, 1] = 1e6
-    assert too_long(model, states[:-1], run(model).inputs, DT) is None
 
 
 def test_the_verdict_tells_it():

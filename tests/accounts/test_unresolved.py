@@ -1,7 +1,5 @@
 """A trial that becomes too fast for the model's time step is cut there."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -56,12 +54,3 @@ def test_others_are_kept_whole(trials):
     looked = preflight(arm, trials)
     assert not [one for one in looked.findings if one.kind == "unresolved"]
     assert [t.known_steps for t in looked.trials] == [80] * len(trials)
-
-
-def test_a_model_that_steps_by_itself_is_not_judged():
-    def step(s, a, p, dt):
-        return {n: getattr(s, n) for n in arm.states}
-
-    own = replace(arm, derivative=None, step=step)
-    looked = preflight(own, [driven(0, WHIRL), driven(1), driven(2)])
-    assert not [one for one in looked.findings if one.kind == "unresolved"]

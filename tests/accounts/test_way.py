@@ -1,18 +1,15 @@
 """Speeds in other axes or units, and a compass's heading: told by the way that was travelled."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from grounded import Model
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.judge import judge
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.remarks.log_faults import column_faults
 
 DT = 0.1
 STATES = {"u": "m/s", "v": "m/s", "r": "rad/s", "x": "m", "y": "m", "psi": "rad"}
@@ -37,20 +34,6 @@ BOAT = Model(
     inputs={"port": "1", "starboard": "1"},
     angles=("psi",),
     derivative=rates,
-)
-# without a gyro
-PLAIN = Model(
-    name="no gyro",
-    states={name: unit for name, unit in STATES.items() if name != "r"},
-    inputs=dict(BOAT.inputs),
-    angles=("psi",),
-    derivative=lambda s, a, p: {
-        "u": 1.3 * (a.port + a.starboard) - 0.7 * s.u,
-        "v": -2.0 * s.v,
-        "x": s.u * np.cos(s.psi) - s.v * np.sin(s.psi),
-        "y": s.u * np.sin(s.psi) + s.v * np.cos(s.psi),
-        "psi": 0.9 * (a.starboard - a.port),
-    },
 )
 
 
@@ -95,11 +78,6 @@ def compass(x: Array) -> Array:
     return y
 
 
-def without_gyro(trial: Trial) -> Trial:
-    left = [i for i, name in enumerate(NAMES) if name != "r"]
-    return replace(trial, states=trial.states[:, left], state_names=PLAIN.state_names)
-
-
 @pytest.mark.parametrize("trials", [1, 3])
 def test_speeds_in_the_axes_of_the_positions_stop_and_are_no_degrees(trials):
     with pytest.raises(UnusableTrials) as no:
@@ -116,15 +94,6 @@ def test_one_trial_with_speeds_in_other_axes_is_named_alone():
         preflight(BOAT, odd)
     assert stopped.value.finding.code == "log.axes"
     assert stopped.value.then is not None and stopped.value.then.arguments == ("t0002",)
-
-
-@pytest.mark.parametrize("fault", [lambda x: x, times(0.0, "psi"), times(-1, "psi"), compass])
-def test_no_other_axes_are_blamed_for_a_heading(fault):
-    """One that is stuck leaves as little as speeds that it is not to turn, and its gyro differs."""
-    for trial in logged(fault, 4):
-        for model, some in ((BOAT, trial), (PLAIN, without_gyro(trial))):
-            told = judge(model, [some], range(model.n)).told
-            assert not any(one.account.kind == "axes" for one in told)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -163,18 +132,3 @@ def test_speeds_and_positions_in_another_unit_are_named_with_their_scale(unit, f
 def test_a_slip_or_a_scale_of_another_size_is_no_unit(factor):
     for trial in logged(times(factor, "u", "v"), 4):
         assert not {f.kind for f in preflight(BOAT, [trial]).findings} - {"mismatch"}
-
-
-@pytest.mark.parametrize(
-    "fault, code, about",
-    [
-        (in_the_world, "log.axes", ("u", "v")),
-        (times(1.944, "u", "v"), "log.unit", ("u", "v")),
-        (compass, "log.compass", ("psi",)),
-        (lambda x: x, "", ()),
-    ],
-)
-def test_it_is_told_when_a_log_is_taken_in(fault, code, about):
-    w = SimpleNamespace(base_model=BOAT)
-    told = [(one.code, one.about) for one in column_faults(w, logged(fault)[0])]
-    assert told == [(code, about)] * bool(code)

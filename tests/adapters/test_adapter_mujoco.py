@@ -19,7 +19,6 @@ from grounded.adapters.mujoco_files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
 from grounded.model import Model  # noqa: E402
-from grounded.places import integrals  # noqa: E402
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -109,13 +108,6 @@ def test_pendulum_has_the_names_units_angles_and_limits_of_the_file() -> None:
     assert values["motor_gear"] == (3.0, "1", 0.0)
     assert adapter.limits(PENDULUM) == {"motor": (-2.0, 2.0)}
     assert adapter.model(PENDULUM, params={"pole.mass": (0.5, 2)}).params["pole_mass"].high == 2
-
-
-def test_a_motor_whose_control_is_its_force_has_the_unit_of_one() -> None:
-    assert dict(adapter.model(PENDULUM.replace(' gear="3"', "")).inputs) == {"motor": "N m"}
-    assert dict(adapter.model(CART_POLE).inputs) == {"force": "N"}
-    servo = PENDULUM.replace('<motor name="motor"', '<position name="motor" kp="5"')
-    assert dict(adapter.model(servo.replace(' gear="3"', "")).inputs) == {"motor": "1"}
 
 
 def test_pendulum_swings_as_the_equation_says() -> None:
@@ -276,21 +268,6 @@ def test_derivatives_are_those_of_central_differences() -> None:
         np.testing.assert_allclose(one, f_x[0], atol=1e-12)
 
 
-def test_an_unstable_sample_is_not_a_number_and_spoils_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    model = adapter.model(ARM.format(**NOMINAL))
-    x = np.zeros((3, 5))
-    x[1, 0], x[2, 2] = np.inf, 9e8
-    moved = step(model, x, np.zeros((3, 2)))
-    np.testing.assert_array_equal(np.isfinite(moved).all(axis=1), [True, False, False])
-    np.testing.assert_array_equal(moved[0], step(model, x[0], [0.0, 0.0])[0])
-    heavy = adapter.model(PENDULUM, params=("pole.mass",))
-    heavy.system.step(np.zeros((1, 2)), np.zeros((1, 1)), np.array([-5.0]), 0.02)
-    assert not list(tmp_path.iterdir())  # MuJoCo's own log
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -315,13 +292,6 @@ def test_a_step_that_is_no_multiple_a_missing_file_and_a_broken_one(tmp_path: Pa
         adapter.model(tmp_path / "nothing.xml")
     with pytest.raises(GroundedError, match=holding("MJCF", "wrong")):
         adapter.model("<mujoco><wrong/></mujoco>")
-
-
-def test_a_joint_and_its_velocity_are_known_as_such() -> None:
-    """MuJoCo is semi-implicit: positions integrate the new velocity, whatever the step."""
-    found = integrals(adapter.model(ARM.format(**NOMINAL)))
-    assert [(r.i, r.j) for r in found] == [(0, 2), (1, 3)]
-    assert [r.c for r in found] == pytest.approx([1.0, 1.0])
 
 
 def test_a_control_step_with_the_jitter_of_a_log_is_made_exactly() -> None:
@@ -376,48 +346,9 @@ MARKED = """
 </mujoco>"""
 
 
-def test_inputs_of_the_inverse_dynamics_hold_an_arm_at_rest():
-    arm = adapter.model(MARKED.format(mass=1, touches=0), without="unmoved", threads=1)
-    x = np.array([[-1.0, 0.0], [-2.0, 0.0]])
-    u = arm.system.inverse(x, x, arm.values, 0.05)
-    assert np.allclose(arm.system.step(x, u, arm.values, 0.05), x, atol=1e-9)
-    assert np.abs(arm.system.step(x, 0 * u, arm.values, 0.05) - x).max() > 0.1
-
-
-def test_joints_that_no_actuator_can_move_are_no_states():
-    alone = adapter.model(MARKED.format(mass=1, touches=0), without="unmoved", threads=1)
-    assert alone.state_names == ("lift", "lift_vel") and alone.step.without == ("goal",)
-    assert alone.step.ranges == {"lift": (-3.1, -0.2)}
-    whole = adapter.model(MARKED.format(mass=1, touches=0), threads=1)
-    x, u = np.array([[-1.0, 0.5]]), np.array([[1.0]])
-    both = np.array([[-1.0, 0.0, 0.5, 0.0]])
-    after = whole.system.step(both, u, whole.values, 0.05)
-    assert np.array_equal(alone.system.step(x, u, alone.values, 0.05), after[:, ::2])
-    touched = adapter.model(MARKED.format(mass=1, touches=1), without="unmoved", threads=1)
-    assert "goal" in touched.state_names
-
-
 def test_a_body_without_mass_can_carry_a_payload():
     empty = adapter.model(MARKED.format(mass=0, touches=0), params=("tool.mass",), threads=1)
     loaded = adapter.model(MARKED.format(mass=1.5, touches=0), threads=1)
     x, u = np.array([[-1.0, 0.0, 0.5, 0.0]]), np.array([[1.0]])
     by = empty.system.step(x, u, np.array([1.5]), 0.05)
     assert np.allclose(by, loaded.system.step(x, u, loaded.values, 0.05), rtol=1e-12)
-
-
-def test_threads_are_as_many_as_the_processors_that_the_process_may_use(monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda process: {3}, raising=False)
-    assert adapter.model(MARKED.format(mass=1, touches=0)).step.threads == 1
-
-
-def test_slopes_along_the_same_samples_are_taken_once(monkeypatch):
-    arm = adapter.model(MARKED.format(mass=1, touches=0), threads=1)
-    taken = []
-    system, slow = arm.system, arm.system.jacobian
-    monkeypatch.setattr(system, "jacobian", lambda *at: taken.append(at) or slow(*at))
-    x, u = np.array([[-1.0, 0.0, 0.5, 0.0]]), np.array([[1.0]])
-    first = system.linearise(x, u, arm.values, 0.05)
-    again = system.linearise(x.copy(), u.copy(), arm.values, 0.05, smoothing=0.1)
-    assert len(taken) == 1 and all(map(np.array_equal, first, again))
-    x[0, 0] = -1.5
-    assert not np.array_equal(system.linearise(x, u, arm.values, 0.05)[0], first[0])

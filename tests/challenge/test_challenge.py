@@ -190,9 +190,3 @@ def test_what_is_no_challenge_is_said_to_be_none(tmp_path):
         labels = ["--labels", tmp_path] * (command == "score")
         message = said(command, tmp_path, *labels, code=1).err
         assert holds(message, tmp_path, "manifest.json")
-
-
-def test_an_impossible_error_of_parameters_is_refused(tmp_path):
-    words = ["make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "0"]
-    for error in ("-1", "0.6"):
-        assert "0.0<=x<=0.5" in said(*words, "--param-error", error, code=2).err

@@ -5,11 +5,9 @@ import pytest
 
 from cli import grounded
 from grounded.challenge import judge, make, of_crude, summary
-from grounded.challenge.cases import shares_of
 from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
 from grounded.challenge.score import Oracle, share
 from grounded.challenge.systems import SYSTEMS
-from grounded.errors import GroundedError
 
 
 def case_of(system, **about):
@@ -25,25 +23,6 @@ def test_kinked_systems_run_closed_loop_at_a_rate_of_theirs(system):
     assert all((t.inputs >= case.low).all() and (t.inputs <= case.high).all() for t in case.trials)
 
 
-def test_noise_grows_with_the_speed():
-    from dataclasses import replace
-
-    from grounded.challenge.truth import Disturbance, Truth
-
-    model = SYSTEMS["lift"]().model
-    still, kicks = np.zeros(2), []
-    for grows in (None, ("w", 0.1)):
-        truth = Truth(model, disturbance=Disturbance({"w": 0.1}, {}, grows=grows))
-        rng, spread = np.random.default_rng(0), []
-        run = truth.run(rng, lambda t, y: np.array([5.0]), still, np.zeros(1), 200, 0.05)
-        quiet = replace(truth, disturbance=Disturbance({}, {}))
-        for k in range(100, 200):
-            one = quiet.run(rng, lambda t, y: np.array([5.0]), run.states[k], [5.0], 1, 0.05)
-            spread.append(run.states[k + 1, 1] - one.states[1, 1])
-        kicks.append(np.std(spread))
-    assert kicks[1] > 5 * kicks[0]
-
-
 def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
     from grounded.challenge.truth import Truth
     from grounded.effects import Library, scales_of
@@ -56,15 +35,6 @@ def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
     truth, rng = Truth(model, ((drift, {"c": 0.7}),)), np.random.default_rng(0)
     run = truth.run(rng, lambda t, y: np.zeros(2), still[0], np.zeros(2), 3, 0.02)
     np.testing.assert_allclose(run.states[:, model.state_names.index("psi_rate")], 0.7, atol=1e-9)
-
-
-def test_own_systems_are_half_of_a_mixture():
-    share = shares_of(("own", "kinked", "mujoco"))
-    assert sum(share.values()) == pytest.approx(1.0)
-    assert share["car"] + share["pendulum"] + share["aircraft"] == pytest.approx(0.5)
-    assert set(share) == set(SYSTEMS)
-    with pytest.raises(GroundedError, match="no group 'others'"):
-        shares_of(["others"])
 
 
 @pytest.mark.parametrize(
@@ -172,15 +142,6 @@ def test_a_shift_of_a_parameter_is_counted_from_the_crude_value():
     assert of_crude(label | {"param_error": 0.0}, true)["effects"] == effects
 
 
-def test_wrong_places_worse_predictions_and_false_effects_are_counted():
-    assert marks_of("delay:a", ["delay:b"])["wrong_place"]
-    assert not marks_of("delay:a", ["stall:a"])["wrong_place"]
-    assert marks_of("delay:a", ["delay:a"], errors=(1.0, 1.2))["worse"]
-    assert not marks_of("delay:a", ["delay:a"], errors=(1.0, 0.9))["worse"]
-    assert marks_of(None, ["parameter:L"], kind="none")["false_effect"]
-    assert not marks_of(None, ["parameter:L"], kind="none", param_error=0.1)["false_effect"]
-
-
 def test_what_a_rival_explains_as_well_is_not_distinguishable():
     close, ahead = (Oracle(20.0, 1.0, {"delay:a": 20.0}, rival, {"v": 0.5}) for rival in (18, 9))
     marks = [marks_of("delay:a", ["stall:a"], known=close)]
@@ -198,16 +159,6 @@ def test_shares_have_the_interval_of_wilson():
     assert (found["count"], found["of"]) == (17, 18)
     assert found["interval"] == pytest.approx([0.742, 0.990], abs=1e-3)
     assert share([])["share"] is None
-
-
-def test_what_instruments_found_counts_as_the_sensor_that_it_is():
-    label = {"effects": [{"effect": "sensor_lag:w", "params": {}}], "case": "x", "kind": "single"}
-    label |= {"noise": "white", "system": "lift", "param_error": 0.0}
-    found = {"verdict": {"kind": "none", "effects": []}, "indistinguishable": [], "ranking": []}
-    found |= {"gap": {"after": 1.0}, "leftover": []}
-    for kind, first in (("lag", True), ("delay", False)):
-        finding = {"kind": kind, "signal": "w", "corrected": True}
-        assert judge(label, found | {"preflight": [finding]}, None)["first"] is first
 
 
 def test_parameters_that_the_sentence_calls_off_and_ties_count_for_both_of_a_double():

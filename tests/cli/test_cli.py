@@ -219,15 +219,6 @@ def test_exports_hold_the_same_policy_with_units_and_time_base(w, tmp_path):
         np.testing.assert_array_equal(values, [float(row[name]) for row in rows])
 
 
-def test_export_without_a_best_or_into_nowhere(w, tmp_path):
-    none = grounded("-C", w, "export", "best")
-    assert none.code == 1 and holds(none.err, "best") and not list(w.glob("*.json"))
-    step(w)
-    nowhere = grounded("-C", w, "export", "c0001", "-o", tmp_path / "no" / "c.json")
-    assert nowhere.code == 1 and holds(nowhere.err, tmp_path / "no")
-    assert not list(tmp_path.glob("**/*.tmp"))
-
-
 def test_verify_names_what_is_damaged_and_fails(w):
     step(w)
     step(w)
@@ -278,16 +269,3 @@ def test_a_closed_pipe_is_no_traceback(w):
         check=False,
     )
     assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
-
-
-def test_propose_sets_a_promise_beside_what_was_measured(tmp_path, monkeypatch):
-    monkeypatch.chdir(make(tmp_path / "w", "car-turn").folder)
-    for k in range(1, 4):
-        made = grounded("propose", "--json").json
-        shown = grounded("propose")
-        assert shown.code == 0 and f"{made['predicted_utility']:.4g}" in shown.out
-        assert max(map(len, shown.out.splitlines())) <= 80
-        if k > 1:  # the last prediction and what came of it
-            last = grounded("status", "--json").json["history"][-2]
-            assert f"{last['utility']:.4g}" in shown.out
-        assert grounded("learn", "--trials", 1).code == 0

@@ -11,7 +11,7 @@ from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import read_trial
 from reported import DIAGNOSIS, cart, copied
-from workspaces import CONFIG, make
+from workspaces import make
 
 __all__ = ["cart"]
 
@@ -67,16 +67,6 @@ def test_a_mistake_is_named(w, monkeypatch, words, code, named):
 def test_nothing_was_diagnosed_yet(tmp_path):
     done = grounded("-C", make(tmp_path / "w").folder, "adopt", "x:y")
     assert done.code == 1 and plain(done.err).endswith("next: grounded diagnose\n")
-
-
-def test_repeats_say_what_is_waited_for(tmp_path):
-    w = Workspace(
-        make(tmp_path / "w", config=CONFIG.replace("[search]", "[search]\nrepeats = 2")).folder
-    )
-    w.propose()
-    assert w.ingest(w.run().trial_file).verdict == "waiting"
-    assert not w.propose().proposal.is_new
-    assert w.ingest(w.run().trial_file).verdict == "first"
 
 
 def test_the_best_one_is_run_again_by_that_name(w, tmp_path):

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from grounded_cli.console import terminal
-from grounded_cli.console.terminal import field, harmless, remark, table
+from grounded_cli.console.terminal import field, harmless, table
 
 
 def test_a_wide_table_breaks_the_names_of_its_columns():
@@ -19,23 +19,6 @@ def test_a_wide_table_breaks_the_names_of_its_columns():
     assert max(map(len, harmless(narrow).splitlines())) <= 80
 
 
-@pytest.mark.parametrize("text", ["99.7 % of it " * 20, "x" * 200, "", "a-b " * 60])
-def test_a_label_keeps_its_text_together(text):
-    lines = field("gap", text).splitlines()
-    assert lines[0].startswith("gap")
-    assert all(not line.strip().startswith("%") for line in lines)
-    assert " ".join("\n".join(lines).split()) == " ".join(f"gap {text}".split())
-    if "x" * 100 not in text:
-        assert max(map(len, lines)) <= 80
-
-
-def test_a_remark_is_wrapped(capsys):
-    remark("warning", "the run ended after 48 of 60 steps " * 5)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("warning: the run") and max(map(len, lines)) <= 80
-    assert all(line.startswith("  ") for line in lines[1:])
-
-
 @pytest.mark.parametrize("columns", [60, 72, 80])
 def test_a_table_is_as_wide_as_the_terminal(monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", str(columns))
@@ -46,11 +29,6 @@ def test_a_table_is_as_wide_as_the_terminal(monkeypatch, columns):
     wide = harmless(table([("state", *["0.1234567"] * 9)] * 2, [f"name{k}" for k in range(10)]))
     assert max(map(len, wide.splitlines())) <= columns and wide.count("state") > 2
     assert max(map(len, field("gap", "1.5 m off " * 30).splitlines())) <= columns
-
-
-def test_colour_means_something_and_takes_no_room():
-    coloured, plain = table([("c1", "crashed")], ("id", "")), "id\nc1  crashed"
-    assert harmless(coloured) == plain and "\033[1;31mcrashed" in harmless(coloured, coloured=True)
 
 
 def test_a_long_command_says_its_stage_in_a_log_too_now_and_then(capsys, monkeypatch):

@@ -68,14 +68,3 @@ def test_a_drive_keeps_to_limits_and_safety_as_far_as_the_model_may_be_wrong(nam
         run = simulate(replace(task.problem(exact=True), p=p), drive.policy)
         assert (run.states >= task.safety_low).all() and (run.states <= task.safety_high).all()
         assert (run.inputs >= task.low).all() and (run.inputs <= task.high).all()
-
-
-def test_no_drive_stays_where_the_robot_itself_does_not():
-    task = ROBOTS["cart"]
-    moving = replace(task, start=np.array([0.0, 2.9]), safety_high=np.array([0.1, 3.0]))
-    assert design(moving, STEPS, np.zeros(2)) is None
-
-
-def test_what_is_certain_is_no_parameter_of_it():
-    model = replace(cart, params={"mass": Param(1.0), "drag": cart.params["drag"]})
-    assert uncertain(ROBOTS["cart"].with_model(model)) == ("drag",)

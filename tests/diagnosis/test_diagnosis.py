@@ -10,83 +10,12 @@ from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
-from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.parts import Ranked
-from grounded.diagnosis.validation.blame import fewest, loss, still
+from grounded.diagnosis.validation.blame import fewest, still
 from grounded.diagnosis.writer import MOST_EFFECTS, Writer
-from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from small_tasks import DT, plain_task, pushed_cart
-
-
-def random_filter(rng, L=4, B=2, n=2):
-    A = 0.5 * rng.standard_normal((L, B, n, n)) + np.eye(n)
-    Q, R = rng.uniform(0.5, 2, (L, B, n)), rng.uniform(0.5, 2, (L + 1, B, n))
-    d, r = rng.standard_normal((L, B, n, 1)), rng.standard_normal((L + 1, B, n, 1))
-    return A, Q, R, d, r
-
-
-def dense_loglik(A, Q, R, d, r, b):
-    """log p(r_1 .. r_L | r_0) by the joint covariance of everything, one run."""
-    L, n = len(A), A.shape[-1]
-    blocks = L * n
-    mean, cov = np.zeros(blocks), np.zeros((blocks, blocks))
-    m, maps = r[0, b, :, 0], [np.eye(n)]
-    P = [np.diag(R[0, b])]
-    for t in range(L):
-        m = A[t, b] @ m + d[t, b, :, 0]
-        P.append(A[t, b] @ P[-1] @ A[t, b].T + np.diag(Q[t, b]))
-        mean[t * n : t * n + n] = m
-        maps.append(A[t, b])
-    for i in range(1, L + 1):
-        C = P[i]
-        for j in range(i, L + 1):
-            if j > i:
-                C = C @ A[j - 1, b].T
-            cov[(i - 1) * n : i * n, (j - 1) * n : j * n] = C
-            cov[(j - 1) * n : j * n, (i - 1) * n : i * n] = C.T
-        cov[(i - 1) * n : i * n, (i - 1) * n : i * n] += np.diag(R[i, b])
-    e = r[1:, b, :, 0].reshape(-1) - mean
-    return -0.5 * (e @ np.linalg.solve(cov, e) + np.linalg.slogdet(cov)[1])
-
-
-def filter_loglik(A, Q, R, d, r):
-    L, B, n, _ = A.shape
-    g = kalman.gains(kalman.LinearSystem(A, Q, R, np.ones((L + 1, B, n)), R[0]))
-    white, _ = kalman.innovations(g, d, r)
-    return -0.5 * ((white**2).sum() + g.logdet.sum()), g, white
-
-
-def test_the_filter_is_the_joint_normal_law():
-    A, Q, R, d, r = random_filter(np.random.default_rng(0))
-    whole = sum(dense_loglik(A, Q, R, d, r, b) for b in range(2))
-    assert filter_loglik(A, Q, R, d, r)[0] == pytest.approx(whole, rel=1e-9)
-
-
-def test_the_smoother_is_the_gradient_of_the_likelihood():
-    A, Q, R, d, r = random_filter(np.random.default_rng(1))
-    _, g, white = filter_loglik(A, Q, R, d, r)
-    back = kalman.smoother(g, white[..., 0])
-    h = 1e-5
-    for t, b, i in ((0, 0, 0), (2, 1, 1), (3, 0, 1)):
-        for which, score in (
-            (Q, 0.5 * (back.r**2 - back.N)[t, b, i]),
-            (R[1:], 0.5 * (back.u**2 - back.D)[t, b, i]),
-        ):
-            which[t, b, i] += h
-            up = filter_loglik(A, Q, R, d, r)[0]
-            which[t, b, i] -= 2 * h
-            down = filter_loglik(A, Q, R, d, r)[0]
-            which[t, b, i] += h
-            assert score == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-7)
-
-
-def test_whiteness_is_the_chance_that_white_noise_is_as_correlated():
-    white = np.random.default_rng(0).standard_normal((200, 5, 2))
-    white[1:, :, 1] += 0.3 * white[:-1, :, 1]
-    found = whiteness(SimpleNamespace(white=white), np.ones((201, 5, 2)))
-    assert 0.01 < found["0"] <= 1 and found["1"] < 1e-6
 
 
 @pytest.mark.slow
@@ -112,13 +41,6 @@ def test_a_parameter_that_did_not_move_is_not_blamed_for_those_that_did():
     free, left = fewest(H, b, [1, 2])
     assert {*free} == {1, 2} and left < NATS and still(H, b, free) == []
     assert still(np.eye(2), np.array([0.2, 1.2]), [0]) == []  # the other may be none, too
-
-
-def test_of_two_parameters_that_are_one_only_one_is_blamed():
-    H = np.array([[100.0, 99.0], [99.0, 100.0]])
-    b = np.array([0.5, 0.5])
-    assert loss(H, b, [0, 1]) == 0
-    assert loss(H, b, [0]) < 1 < 40 < loss(H, b, [])
 
 
 @pytest.mark.slow

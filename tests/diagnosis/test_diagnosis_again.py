@@ -8,17 +8,12 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.causes import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.intervals import standard_deviations
-from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.parts import Estimate, Made, Ranked, Verdict
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined
@@ -76,53 +71,6 @@ def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     assert now.outset == pytest.approx(then.crude, rel=0.05)  # one ruler, before and after
     assert alone.prediction_error[0].outset == {}
     assert {c.name: c.rms for c in found.where.channels} == now.crude
-
-
-def calibrated(trials):
-    model = axis(1.0)
-    data = prepare(model, trials)
-    predictor = Predictor(data)
-    logs = 2 * np.log(np.array([1e-4, 5e-4]))
-    noise = NoiseModel(Structure(), logs - 4, logs, logs.copy(), np.full(2, -60.0))
-    h = replace(Hypothesis(), shift=np.zeros(data.model.system.k), spread=1.0)
-    fit = refine(predictor, [(h, noise, data.y.copy())], iterations=30, fixed_noise=True)[0]
-    _, half = standard_deviations(predictor, fit, data.folds)
-    scale = model.params["gain"].spread
-    fisher = float(np.sqrt(fit.covariance[0, 0])) * scale
-    return 1.0 + float(fit.hypothesis.shift[0]), half[0] * scale, fisher
-
-
-def test_an_interval_is_as_wide_as_what_is_wrong_along_the_manoeuvre():
-    """Trials of one manoeuvre agree on a gain that an unknown force bends."""
-    value, half, fisher = calibrated(runs(1.5, wave=0.05, alike=True))
-    assert abs(value - 1.5) > 1.96 * fisher  # the noise alone would exclude the truth
-    assert abs(value - 1.5) < half < 0.5
-    value, half, fisher = calibrated(runs(1.5, alike=True))
-    assert abs(value - 1.5) < half < 4 * 1.96 * fisher
-
-
-def test_predictions_start_from_filtered_states_wherever_the_track_lies():
-    trials, quiet = runs(1.5, noise=20.0), runs(1.5, noise=0.0)
-    data = prepare(axis(1.5), trials)
-    predictor = Predictor(data)
-    truth = Predictor(prepare(axis(1.5), quiet)).data.y
-    logs = 2 * np.log(20 * np.array([1e-4, 5e-4]))
-    noise = NoiseModel(Structure(), np.full(2, -30.0), logs, logs.copy(), np.full(2, -60.0))
-    start = [(Hypothesis(), noise, data.y.copy())]
-    (held,) = refine(predictor, start, iterations=1, fixed_noise=True)
-    (risen,) = refine(predictor, start, iterations=20, fixed_noise=True)
-    off = [float(np.std(a[50:] - truth[50:])) for a in (held.track, held.states, risen.states)]
-    assert off[1] < 0.3 * off[0]
-    assert off[1] == pytest.approx(off[2], rel=0.05)
-    errors = [Ruler(predictor).errors(fit).rms[:-1] for fit in (held, risen)]
-    np.testing.assert_allclose(errors[0], errors[1], rtol=0.02)
-
-
-@pytest.mark.parametrize(("name", "same"), [("input_gain:u", True), ("viscous_friction:v", False)])
-def test_a_gain_of_the_input_is_the_parameter_behind_it(name, same):
-    data = prepare(axis(1.0), runs(1.5, trials=2, steps=60))
-    effect = Library().effect(name, data.model, data.scales)
-    assert one_thing(Predictor(data), 0, effect) is same
 
 
 LATE = 0.1  # [s], two steps of an axis

@@ -1,15 +1,11 @@
 """What is searched, and how far, follows from the model and the log."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.limits import knowable
 from grounded.effects import InputFamily, Library, MemoryFamily
 
@@ -96,16 +92,6 @@ def test_a_dead_time_of_many_steps_is_found():
     assert claimed[0].values["d"] == pytest.approx(7.0, abs=0.2)
 
 
-def test_a_value_at_the_end_of_its_scan_is_no_cause():
-    model, trials = flushed(3, 40)
-    data = prepare(model, trials)
-    for effect in Library().candidates(model, data.scales):
-        for q in (q for q in effect.free if q.grid and np.isfinite(q.high)):
-            values = {other.name: 0.5 * max(other.grid, default=0.1) for other in effect.free}
-            assert np.isfinite(price(Predictor(data), effect, values))
-            assert price(Predictor(data), effect, values | {q.name: q.high}) == np.inf
-
-
 def cart(right, turns):
     """Logs of a cart of two wheels under proportional commands, each of which acts 0.3 too far."""
     model = Model(
@@ -142,12 +128,3 @@ def test_of_inputs_that_no_trial_tells_apart_only_all_together_are_blamed(right,
     assert any(len(e.site.targets) == 1 for e in acting) == single
     for effect in acting:
         assert library.effect(effect.name, model, data.scales).site.targets == effect.site.targets
-
-
-def test_inputs_that_are_sent_apart_are_blamed_alone():
-    model, trials = cart(1.0, 0.0)
-    other = np.outer(np.arange(80) == 5, [0.0, 0.1])
-    data = prepare(model, [replace(trial, inputs=trial.inputs + other) for trial in trials])
-    offered = {e.name for e in knowable(data, Library().candidates(model, data.scales))}
-    assert {"input_bias:a", "input_bias:b", "input_gain:a+b"} <= offered
-    assert "input_bias:a+b" not in offered

@@ -9,11 +9,8 @@ from grounded.diagnosis.error_report import Remainder, RulerRow, furthest
 from grounded.diagnosis.errors_told import (
     excess,
     lost_most,
-    noise_unknown,
     objection,
-    open_noise,
     outweighed,
-    states_told,
     telling,
 )
 from grounded.diagnosis.parts import Agreement
@@ -98,19 +95,3 @@ LEFT, WIDE = ([Remainder("x", error=e, floor=1.0)] for e in (1.5, 3.5))
 )
 def test_a_claim_is_contested(given, contested):
     assert bool(objection(*given)) is contested
-
-
-def test_a_noise_of_which_only_a_bound_is_known_is_open():
-    bound = row({"x": 1.0}, {"x": 0.9}, {"x": 0.89}, floor_at_most=True)
-    known = replace(bound, floor_at_most=False)
-    assert open_noise((bound,)) == "x" and noise_unknown(bound, ["x"])
-    assert not open_noise((known,)) and not noise_unknown(known, ["x"])
-    few = row({"x": 0.31}, {"x": 1.6e-3}, {"x": 9.1e-4}, floor_unsure=0.41)
-    assert excess((few,)) is None
-    assert excess((replace(few, floor_unsure=0.0),))[1] == "x"
-
-
-def test_the_states_that_the_task_follows_are_told_first():
-    one = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.1}, {"x": 0.01, "v": 0.1})
-    assert states_told(one) == ["v", "x"] and states_told(one, ["x"]) == ["x", "v"]
-    assert states_told(replace(one, with_effects=one.crude)) == ["x"]  # furthest off for its noise

@@ -66,19 +66,6 @@ def other(**terms):
     return replace(rover, derivative=dynamics)
 
 
-def test_a_friction_of_another_origin_is_no_motors():
-    dragged = other(x=lambda s: 0 * s.v, v=lambda s: -0.5 * s.v, r=lambda s: -2.0 * s.r)
-    assert combined_speeds(dragged)  # forces of the wheels can account for it
-    rudder = replace(rover, inputs={"left": "V", "right": "V", "sail": "N"}, derivative=sailed)
-    assert combined_speeds(rudder) == {}
-
-
-def sailed(s, a, p):
-    """A third input, which no velocity opposes, makes the wheels' shares ambiguous."""
-    rates = moved(s, a, p)
-    return rates | {"v": rates["v"] + a.sail / p.m}
-
-
 def test_the_loss_of_a_wheel_turns_the_robot():
     stiff = wrap(Library().effect(LEFT, rover), {"c": 0.6, "b": 0.0}, DT)
     x = np.array([[0.0, 0.0, 0.0, 0.5, 0.4]])

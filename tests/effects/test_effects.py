@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from grounded import GroundedError, Model, Param, Trial, places
+from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -16,17 +16,14 @@ from grounded.effects import (
     ParamFamily,
     Quantity,
     RateFamily,
-    Scales,
     SensorLagFamily,
     memory_of,
     memory_start,
     scales_of,
     wrap,
 )
-from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.models.cart_pole import model as cart_pole
-from grounded.models.pendulum import model as pendulum
 
 DT = 0.05
 
@@ -141,25 +138,11 @@ def test_an_effect_is_absent_at_its_start(effect):
     )
 
 
-def test_names_of_effects_find_their_way_back():
-    for effect in EFFECTS:
-        again = Library().effect(effect.name, car, sizes(TRIAL))
-        assert again.name == effect.name
-        assert [q.name for q in again.quantities] == [q.name for q in effect.quantities]
-
-
 def test_an_unknown_effect_names_the_nearest():
     with pytest.raises(GroundedError, match="dead_zone"):
         Library().effect("deadzone:throttle", car)
     with pytest.raises(GroundedError, match="throttle"):
         Library().effect("dead_zone:throtle", car)
-
-
-def test_a_library_without_a_family_does_not_offer_it():
-    less = Library().without(["dead_zone"])
-    assert all(e.family.name != "dead_zone" for e in less.candidates(car))
-    with pytest.raises(GroundedError, match="no effect family 'dead_zone'"):
-        less.family("dead_zone")
 
 
 def test_a_third_party_family_is_one_value():
@@ -176,15 +159,6 @@ def test_a_third_party_family_is_one_value():
     assert wrap(effect, {"k": 0.1}, DT).system.how == "compiled"
     with pytest.raises(GroundedError, match="cubic_drag"):
         library.with_families([drag])
-
-
-@pytest.mark.parametrize("model", [aircraft, pendulum], ids=lambda m: m.name)
-def test_other_models_get_their_own_candidates(model):
-    names = [e.name for e in Library().candidates(model)]
-    assert len(names) == len(set(names))
-    assert any(name.startswith("viscous_friction:") for name in names)
-    if model is pendulum:
-        assert not any(name.startswith(("drift_", "side_slip", "slope")) for name in names)
 
 
 def test_a_black_box_model_takes_effects_too():
@@ -246,17 +220,6 @@ def test_a_position_and_its_own_velocity_are_late_together():
     np.testing.assert_allclose(logged[2:, [1, 3]], late[:, [1, 3]], atol=1e-12)
 
 
-def test_only_what_the_rest_could_tell_is_late_together():
-    assert places.late_together(cart_pole) == ["x+x_vel", "theta+theta_vel"]
-    assert not places.late_together(pendulum)  # late as its torque is
-    axes = Model(
-        states={"x": "m", "v": "m/s", "y": "m", "w": "m/s"},
-        inputs={"a": "m/s^2", "b": "m/s^2"},
-        derivative=lambda s, a, p: {"x": s.v, "v": a.a, "y": s.w, "w": a.b},
-    )
-    assert not places.late_together(axes)
-
-
 def test_missing_and_unknown_quantities_are_named():
     effect = Library().effect("dead_zone:throttle", car)
     with pytest.raises(GroundedError, match="no quantity 'width'"):
@@ -271,18 +234,6 @@ def test_the_docs_have_a_row_for_every_family():
     text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
     for family in Library().families:
         assert f"| `{family.name}` |" in text
-
-
-def lag_of(dt, duration):
-    scales = Scales(dt=dt, duration=duration)
-    (tau,) = Library().effect("first_order_lag:steering", car, scales).quantities
-    return tau
-
-
-@pytest.mark.parametrize("dt, steps", [(1e-4, 1000), (0.05, 2), (8.0, 10)])
-def test_lags_are_sought_within_their_bound(dt, steps):
-    tau = lag_of(dt, steps * dt)
-    assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high
 
 
 def test_an_adopted_sensor_lag_is_a_filter():

@@ -14,11 +14,10 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.effects.joint import FAMILIES, has_viscous, like_a_load, pairs_of
+from grounded.effects.joint import FAMILIES, like_a_load, pairs_of
 from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
-from grounded.models.lift import model as lift
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -84,23 +83,6 @@ def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0), k=(0.0, 0.0)):
         )
         found.append(Trial(y, u, DT, arm.state_names, arm.input_names, start_inputs=np.zeros(2)))
     return found
-
-
-def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
-    assert pairs_of(arm) == PAIRS
-    assert pairs_of(pendulum) == ["torque<-omega"]
-    names = [effect.name for effect in Library().candidates(arm)]
-    assert {f"joint_friction:{pair}" for pair in PAIRS} <= set(names)
-    assert {f"joint_spring:{pair}" for pair in SPRINGS} <= set(names)
-    single = [effect.name for effect in Library().candidates(lift)]
-    assert "coupling:w<-z" in single and "joint_spring:volts<-z" not in single
-
-
-def test_viscous_friction_that_the_model_has_is_not_offered_twice():
-    assert has_viscous(pendulum, "torque<-omega")
-    assert not has_viscous(arm, "t1<-w1")
-    effect = Library().effect("joint_friction:torque<-omega", pendulum)
-    assert [q.name for q in effect.free] == ["c"]
 
 
 @pytest.mark.parametrize("w", [-0.3, 0.02, 0.6])

@@ -14,9 +14,6 @@ from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacob
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.effects.medium import turning
-from grounded.models.aircraft import model as aircraft
-from grounded.models.car import model as car
-from grounded.places import body_velocity
 from grounded.search.planner import planner_with
 from small_tasks import plain_task
 
@@ -114,28 +111,6 @@ def adopted(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Model:
     return planner_with(task, parts).plan.model
 
 
-def offered(model: Model) -> set[str]:
-    names = {e.name for e in Library().candidates(model)}
-    return {n for n in names if n.startswith(("current:", "push_world:"))}
-
-
-def test_the_body_velocities_are_found_from_the_models_rates_not_their_names():
-    def other(s: Any, a: Any, p: Any) -> dict[str, Any]:
-        named = {"u": s.fwd, "v": s.side, "r": s.r, "x": s.x, "y": s.y, "psi": s.psi}
-        found = rates(named, a, SIZES)
-        return {"side": found.pop("v"), "fwd": found.pop("u"), **found}
-
-    states = {"side": "m/s", "fwd": "m/s", **{n: STATES[n] for n in ("r", "x", "y", "psi")}}
-    model = Model(states=states, inputs=INPUTS, angles=("psi",), derivative=other)
-    assert body_velocity(model) == ("fwd", "side")
-    assert offered(model) == {"current:fwd+side", "push_world:fwd+side"}
-
-
-def test_they_are_not_offered_where_one_speed_or_no_plane_is():
-    assert not offered(car) and not offered(aircraft)
-    assert not turning(car) and not turning(aircraft)
-
-
 def test_a_product_of_velocities_is_added_to_each_of_the_three_rates():
     """The boat's u' = ... + v r, v' = ... - u r: with added masses, others."""
     assert turning(boat) == ("u", "v", "r")
@@ -148,43 +123,6 @@ def test_a_product_of_velocities_is_added_to_each_of_the_three_rates():
     np.testing.assert_allclose(more["u"], 0.4 * aside * turned, atol=1e-4)
     np.testing.assert_allclose(more["v"], -0.3 * ahead * turned, atol=1e-4)
     np.testing.assert_allclose(more["r"], 0.2 * ahead * aside, atol=1e-4)
-
-
-def test_what_has_no_drag_feels_no_current():
-    """Galileo: it is the same in any medium."""
-    assert offered(boat_of(X=0.0, XX=0.0, Y=0.0)) == {"push_world:u+v"}
-
-
-def test_a_linear_drag_that_is_alike_both_ways_leaves_one_name():
-    """A current is then a push: the data could never tell them apart."""
-    assert offered(boat_of(X=0.7, XX=0.0, Y=0.7)) == {"current:u+v"}
-    assert len(offered(boat)) == len(offered(boat_of(X=0.7, XX=0.0, Y=0.8))) == 2
-
-
-LATER = [("coriolis:u", {"k": -0.9}), PUSH, CURRENT]
-BEFORE = [
-    ("drift_world:x+y", {"a": 0.03, "b": -0.05}),
-    ("sensor_delay:u", {"d": 0.12}),
-    ("delay:thrust", {"d": 0.15}),
-    ("drift_body:x+y", {"a": 0.03, "b": -0.05}),
-]
-
-
-@pytest.mark.parametrize(
-    ("before", "later"), [(BEFORE[0], LATER[2]), (BEFORE[1], LATER[0]), (BEFORE[2], LATER[1])]
-)
-def test_they_are_adopted_in_any_order(before, later):
-    models = [adopted(before, later), adopted(later, before)]
-    assert {*models[0].params} == {*models[1].params}
-    assert body_velocity(models[0]) == ("u", "v") and turning(models[0]) == ("u", "v", "r")
-    names = models[0].state_names
-    x = np.concatenate([TRIALS[0].states[40], np.full(len(names) - 6, 0.3)])[None]
-    order = [names.index(n) for n in models[1].state_names]
-    u = TRIALS[0].inputs[40:41]
-    values = [np.array([m.params[n].value for n in m.params]) for m in models]
-    one = models[0].system.step(x, u, values[0], DT)[:, order]
-    other = models[1].system.step(x[:, order], u, values[1], DT)
-    np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
+from grounded.effects import Library, memory_start, scales_of
 from grounded.effects.memory import shifted
 from grounded.models.car import model as car
 from grounded_trials.workspace.adopted import in_order, planner_of
@@ -20,7 +20,6 @@ DELAY = ("delay:steering", {"d": 2 * DT})
 PART = ("delay:steering", {"d": 2.6 * DT})
 LAG = ("first_order_lag:steering", {"tau": 0.1})
 ZONE = ("dead_zone:steering", {"c": 0.1})
-WEAKER = ("input_gain:steering", {"g": -0.2})
 WEAK = ("input_gain:throttle", {"g": -0.2})
 THROTTLE = ("first_order_lag:throttle", {"tau": 0.1})
 BIAS = ("input_bias:steering", {"b": 0.05})
@@ -117,33 +116,6 @@ def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(pa
     assert near.max() < 0.12  # a probe takes the mean
 
 
-def test_what_is_bent_is_late_by_whole_steps_and_the_step_made_in_parts():
-    plan = planner_of(task(), [{"name": name, **values} for name, values in (LIMIT, PART)]).plan
-    j = car.input_names.index(PART[0].partition(":")[2])
-    assert plan.latency[j] == pytest.approx(2 * DT)
-    plain = planner_of(task(), [{"name": PART[0], **PART[1]}]).plan
-    assert plain.latency[j] == pytest.approx(2.6 * DT) and plain.model.n == car.n
-    known = {n: p for n, p in plan.model.params.items() if n.startswith("delay")}
-    assert known and not any(p.uncertain for p in known.values())
-    both = [("delay:throttle", {"d": 0.3 * DT}), ("dead_zone:throttle", {"c": 0.1}), LIMIT, PART]
-    off = np.abs(adopted(both) - predicted(both, leads=True)).max(axis=0)
-    assert off.max() < 0.015  # inputs that arrive at different times
-
-
-def test_a_delay_acts_last_whenever_it_was_claimed():
-    np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
-
-
-@pytest.mark.parametrize("new", [WEAKER, BIAS, LIMIT, LAG])
-def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
-    old = [{"name": ZONE[0], **ZONE[1]}]
-    model = planner_of(task(), old).plan.model
-    want = predicted((new,), model)
-    found = in_order(old, [{"name": new[0], **new[1]}])
-    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
-    np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
-
-
 def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
     old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
     model = planner_of(task(), old).plan.model
@@ -156,12 +128,6 @@ def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
     assert off < 5e-3 < before / 4  # half a step's kick of the one or the other
     assert by_name[PULL[0]] == {"c": pytest.approx(0.13)}
     assert by_name["viscous_friction:v"] == {"k": 0.1}  # of another rate
-
-
-def test_what_is_wrapped_last_acts_first():
-    families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
-    assert acting_order(families) == [1, 3, 0]
-    assert wrapping_order(families) == [2, 0, 3, 1]
 
 
 def test_the_memory_of_a_trial_follows_what_arrives():

@@ -77,13 +77,3 @@ def test_the_diagnosis_and_the_adopted_model_make_the_same_step(name):
     model = wrap(one, EFFECTS[name], data.dt)
     adopted = model.system.step(*predictor.flat(x, u), model.values, data.dt)
     np.testing.assert_allclose(adopted.reshape(x.shape), diagnosed, atol=1e-12)
-
-
-def test_a_dry_friction_brings_to_rest_and_holds():
-    """At the states where it leads, rest, its second half would vanish."""
-    one, _ = effect("coulomb_friction:u", 0.1)
-    values = {q.name: q.start for q in one.quantities} | {"c": 2.0}
-    model = wrap(one, values, 0.1)
-    still = roll(model, np.zeros((20, 2)), 0.1)[:, 3]
-    assert (np.diff(still) < 1e-12).all() and still[-1] == pytest.approx(0.0, abs=1e-3)
-    assert (still >= -1e-9).all() and still[4] < 0.25 * still[0]  # 2 m/s^2 for 0.4 s of 1 m/s

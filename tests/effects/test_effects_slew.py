@@ -9,9 +9,6 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.models.aircraft import model as aircraft
-from grounded.models.car import model as car
-from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
 
@@ -30,14 +27,6 @@ def limit(model, target="angle"):
     return Library().effect(f"slew_limit:{target}", model)
 
 
-def test_it_applies_to_what_follows_an_input_by_itself():
-    found = {
-        model.name: list(Library().family("slew_limit").targets(model))
-        for model in (car, aircraft, pendulum, servo(0.1))
-    }
-    assert found == {"car": ["delta", "v"], "aircraft": [], "pendulum": [], "servo": ["angle"]}
-
-
 @pytest.mark.parametrize("tau", [0.02, 0.07])
 def test_a_long_way_goes_at_the_limit_and_arrives(tau):
     model = servo(tau)
@@ -49,23 +38,6 @@ def test_a_long_way_goes_at_the_limit_and_arrives(tau):
     np.testing.assert_allclose(x[1:16], 1.5 * DT * np.arange(1, 16), atol=1e-12)
     assert x[-1] == pytest.approx(0.6, abs=1e-3)
     assert np.diff(x).max() <= 1.5 * DT + 1e-12
-
-
-def test_small_moves_are_the_models():
-    model = servo(0.02)
-    fast = wrap(limit(model), {"r": 1.5}, DT)
-    x, u = np.array([[0.1]]), np.array([[0.12]])
-    np.testing.assert_allclose(
-        fast.system.step(x, u, fast.values, DT), model.system.step(x, u, model.values, DT)
-    )
-
-
-def test_a_carried_heading_rate_follows_the_limited_steering_angle():
-    fast = wrap(limit(car, "delta"), {"r": 0.5}, DT)
-    x = np.array([[0.1, 1.0, 0.0, 0.0, 0.3, np.sin(0.1) / 0.15]])
-    after = fast.system.step(x, np.array([[0.9, 0.6]]), fast.values, DT)[0]
-    assert after[0] == pytest.approx(0.1 + 0.5 * DT)
-    assert after[5] == pytest.approx(after[1] * np.sin(after[0]) / 0.15)
 
 
 def test_the_filter_knows_that_a_limited_state_keeps_its_error():

@@ -8,7 +8,7 @@ from grounded import Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.effects import Library, memory_start
+from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded_trials.workspace.adopted import planner_of
 
@@ -50,14 +50,6 @@ def adopted(parts):
     return planner_of(task(), [{"name": name, **values} for name, values in parts]).plan.model
 
 
-def drive(model, one):
-    """States of a wrapped model from the trial's start with its commands, (STEPS + 1, n)."""
-    z = [np.hstack([one.states[0], memory_start(model, car, one)])]
-    for u in one.inputs:
-        z.append(model.system.step(z[-1][None], u[None], model.values, DT)[0])
-    return np.array(z)[:, : car.n]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("parts", BOTH_ORDERS, ids=names)
 def test_a_pair_steps_as_it_was_diagnosed(parts):
@@ -74,17 +66,3 @@ def test_a_pair_steps_as_it_was_diagnosed(parts):
     got = model.system.step(np.hstack([x, clocks]), one.inputs, model.values, DT)[:, : car.n]
     assert (np.abs(got - want).max(axis=0) <= 0.05 * effect + 1e-9).all()
     assert not model.system.note  # it is compiled
-
-
-@pytest.mark.parametrize("parts", BOTH_ORDERS, ids=names)
-def test_the_carried_heading_rate_stays_the_headings(parts):
-    one = trial()
-    x = drive(adopted(parts), one)
-    model = adopted([part for part in parts if ":psi" in part[0]])  # no other turns it
-    h = 1e-5
-    start = np.hstack([x, np.zeros((len(x), model.n - car.n))])
-    u = np.zeros((len(x), 2))  # the heading's rate depends on no command
-    ahead = model.system.step(start, u, model.values, h)
-    rate = (ahead[:, 4] - x[:, 4]) / h
-    drift = (x[:, 5] - rate) - (x[0, 5] - rate[0])
-    assert np.abs(drift[[20, 60]]).max() < 0.01

@@ -8,9 +8,7 @@ from grounded.fit import Fit, fit
 from grounded.model import Model, Param
 from grounded.rollout import simulate
 from grounded.search.improve import refitted
-from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import Reward
 from small_tasks import cart_task
 
 DT, TAU = 0.02, 0.03
@@ -77,16 +75,6 @@ def test_a_filter_of_speeds_is_not_fitted_as_friction():
         assert found.params[name].low < value < found.params[name].high
     assert found.after.names == AXIS.state_names == found.model.state_names
     assert found.helps and {*found.params} == {*TRUE}
-
-
-def test_the_model_that_a_search_plans_with_is_refitted_behind_the_filter_too():
-    trials = runs(count=5, steps=100)
-    still = np.zeros((101, 2))
-    ends = np.full(1, -1.0), np.full(1, 1.0)
-    reward = Reward(np.ones(2), np.ones(2), np.ones(1), np.ones(1))
-    task = Task(AXIS, DT, still, reward, still[0], np.zeros(1), *ends)
-    for name, value in TRUE.items():
-        assert refitted(task, trials).params[name].value == pytest.approx(value, rel=0.05)
 
 
 def test_values_that_predict_worse_are_not_planned_with(monkeypatch):

@@ -111,11 +111,6 @@ def test_what_a_copy_does_not_return_is_computed_here(piece, monkeypatch):
     assert time.monotonic() - began < 10
 
 
-def test_an_exception_is_raised_as_without_copies():
-    with running(Engine(2)), pytest.raises(ZeroDivisionError):
-        each(lambda i: 1 / i, [2, 1, 0, 3])
-
-
 def test_ctrl_c_ends_the_copies(copies):
     def stop():
         if copies:
@@ -133,12 +128,6 @@ def test_without_processes_left_all_is_computed_here(monkeypatch):
     monkeypatch.setattr(os, "fork", refused)
     with running(Engine(3)):
         assert each(slowly, list(range(5))) == [(i, HERE) for i in range(5)]
-
-
-def test_short_pieces_are_computed_here(monkeypatch):
-    monkeypatch.setattr(forked, "WORTH_S", 0.03)
-    with running(Engine(3)):
-        assert each(lambda i: (i, os.getpid()), list(range(5))) == [(i, HERE) for i in range(5)]
 
 
 def test_processors_that_others_use_are_not_idle(monkeypatch, tmp_path):

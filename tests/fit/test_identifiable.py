@@ -10,7 +10,6 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation import limits
-from grounded.diagnosis.validation.limits import _jointly
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.fit import fit
@@ -106,15 +105,6 @@ def test_parameters_that_are_known_only_together_are_written_together():
     assert all(one["jointly"] for one in written)
     (one,) = [one for one in diagnosis.findings if one.code == "model.jointly"]
     assert one.about == ("a", "b")
-
-
-def test_a_direction_that_only_the_prior_sets_is_not_known():
-    model = motor(mass=Param(2.0, std=1.0), gain=Param(3.0, std=1.0))
-    cov = np.array([[0.5, -0.49], [-0.49, 0.5]])  # the sum is known, the difference is not
-    of = (cov, ["mass", "gain"], np.ones(2), model)
-    assert _jointly(*of, {"mass": Estimate(2.4, 0.7), "gain": Estimate(3.4, 0.7)})
-    assert not _jointly(*of, {"mass": Estimate(2.4, 0.7), "gain": Estimate(2.6, 0.7)})
-    assert not _jointly(*of, {})
 
 
 def test_what_is_known_but_for_one_factor_is_adopted_whole(monkeypatch):

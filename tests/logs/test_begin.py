@@ -19,8 +19,7 @@ from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
 from grounded_trials.workspace.candidates.exporting import void_exports
-from grounded_trials.workspace.off_target import rates_beside
-from grounded_trials.workspace.user_files.task_file import equal_weights, read_target, without_range
+from grounded_trials.workspace.user_files.task_file import read_target
 from ros_bags import (
     arm_bag,
     boat_bag,
@@ -227,32 +226,6 @@ def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn):
     assert "your model" in (tmp_path / "w/grounded.toml").read_text().splitlines()[0]
 
 
-@pytest.mark.parametrize("names", ["port,starboard"])
-def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names):
-    found = begin(tmp_path / "w", wheels(names))
-    assert [guess.name for guess in found.inputs] == names.split(",")
-    model = Workspace(tmp_path / "w").base_model
-    units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s", "omega": "rad/s"}
-    assert dict(model.states) == units and model.angles == ("psi",)
-    command = found.then
-    assert grounded("-C", tmp_path / "w", command.verb, *command.arguments).code == 0
-    assert [t.trial.steps > 1000 for t in Workspace(tmp_path / "w").trials()] == [True]
-
-
-@pytest.mark.parametrize("names", ["motor_right,motor_left"])
-def test_a_robot_whose_wheels_have_a_command_each_gets_its_equations(wheels, tmp_path, names):
-    found = begin(tmp_path / "w", wheels(names))
-    assert found.kind == "differential" and not found.unsure
-    model = Workspace(tmp_path / "w").base_model
-    assert sorted(model.input_names) == sorted(names.split(","))
-    at = {name: float("left" in name) for name in model.input_names}  # the left wheel alone
-    u = np.array([[at[name] for name in model.input_names]])
-    x = model.system.step(np.zeros((1, 5)), u, model.values, 0.01)[0]
-    moved = dict(zip(model.states, x, strict=True))
-    assert moved["v"] > 0 > moved["omega"]
-    assert {"gain", "track", "tau_v", "tau_w"} == set(model.params)
-
-
 @pytest.mark.parametrize(("left", "right"), [("/thruster_left", "/thruster_right")])
 def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
     """The word thrust in a topic's name made it a drone, with z, roll and pitch."""
@@ -364,56 +337,6 @@ def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung,
 
 
 # targets
-
-
-@pytest.mark.parametrize("chosen", [False, True])
-def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_path, chosen):
-    (tmp_path / "model.py").write_text(TWO_WHEELS)
-    begin(tmp_path / "w", wheels(), model=tmp_path / "model.py", dt=0.05)
-    w, file = Workspace(tmp_path / "w"), tmp_path / "w/grounded.toml"
-    assert "that of the log" not in file.read_text()
-    before = w.task.reward.state
-    if chosen:
-        file.write_text(file.read_text().replace("state = { v = ", "state = { v = 1"))
-    grounded("-C", w.folder, "target", "circle", "--size", 3)
-    w.forget()
-    names, values = read_target(tmp_path / "w/target.csv")
-    by = dict(zip(names, values.T, strict=True))
-    rates = rates_beside(w.base_model, by)
-    assert {"v", "omega"} & rates == {"v", "omega"} & {*by}
-    new = [
-        max(np.ptp(by[name]), 0.1) ** -2 * (0.1 if name in rates else 1.0)
-        for name in w.base_model.state_names
-    ]
-    now = w.task.reward.state
-    assert now[1:] == pytest.approx((before if chosen else new)[1:], rel=1e-3)
-    assert before[1:] != pytest.approx(new[1:], rel=0.1)
-    assert values[-1, names.index("psi")] == pytest.approx(2 * np.pi)
-    cells = (tmp_path / "w/target.csv").read_text().replace(",", " ").split()
-    assert "-0" not in cells
-
-
-def test_a_column_that_stays_has_the_range_of_its_unit():
-    t = np.linspace(0, 1, 21)
-    units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s"}
-    columns = {"x": 2 * t, "y": 0 * t, "psi": 0 * t, "v": 0.01 * t}
-    weights = equal_weights(columns, units)
-    assert weights == pytest.approx({"x": 0.25, "y": 0.25, "psi": 1.0, "v": 100.0})
-    less = equal_weights(columns, units, ("x", "y"), ("v",))  # a velocity beside its position
-    assert less["v"] == pytest.approx(10.0)
-    for y, as_much in ((3 * t, 3.0), (0.5 * t, 1.8), (0 * t, 9.0)):  # axes of one position
-        both = equal_weights({"x": 9 * t, "y": y, "v": t}, units, ("x", "y"))
-        assert both["x"] == both["y"] == pytest.approx(as_much**-2)
-    assert equal_weights({"x": 5 + 0 * t}, units) == pytest.approx({"x": 0.04})  # a step
-    offset = {"x": 2 * t, "psi": 0.01738 + 0 * t, "y": 0.01 + 0 * t}  # a sensor's: no range
-    by = {"x": 0.25, "psi": 1.0, "y": 0.25}
-    assert equal_weights(offset, units) == pytest.approx(by)
-    assert equal_weights(offset, units, ("x", "y")) == pytest.approx(by)
-    assert without_range(offset, units) == ["psi"]
-    assert without_range({"x": 5 + 0 * t, "v": 0 * t}, units) == ["v"]
-    nearly = {"psi": 0.02591 - 1e-5 * t, "v": 2e-5 * np.sin(3 * t)}  # to 0.0259: it was 100 each
-    assert equal_weights(nearly, units) == pytest.approx({"psi": 1.0, "v": 1.0})
-    assert without_range(nearly, units) == ["psi", "v"]
 
 
 @pytest.mark.parametrize("more", [()])
@@ -595,18 +518,6 @@ def test_an_export_of_a_void_candidate_is_found_where_nobody_changed_it(tmp_path
     changed.write_text(changed.read_text() + "# mine\n")
     assert void_exports(w) == (w.folder / f"{made}.npz",)
     assert void_exports(w, made) == ()
-
-
-@pytest.mark.parametrize("name", ["grip [N]"])
-def test_a_force_is_the_input_if_nothing_looks_like_a_command(tmp_path, name):
-    t = 0.02 * np.arange(500)
-    table = np.column_stack([t, np.sin(t), np.cos(t), 3 * np.sin(2.2 * t)])
-    header = f"t,x,v,{name}"
-    np.savetxt(tmp_path / "cart.csv", table, "%.5f", ",", header=header, comments="")
-    made = grounded("init", tmp_path / "w", "--from", tmp_path / "cart.csv")
-    assert made.code == 0, made.err
-    model = Workspace(tmp_path / "w").base_model
-    assert model.state_names == ("x", "v") and model.input_names == (name.split()[0],)
 
 
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):

@@ -68,11 +68,3 @@ def test_ingest_refuses_an_input_on_the_path_of_a_state(tmp_path, model):
     toml.write_text(toml.read_text().replace(f"{COMMANDS}.data[0]", "/joint_states.position[0]"))
     with pytest.raises(GroundedError, match="input boom_valve and the state boom to the same"):
         Workspace(tmp_path / "w").ingest(log, data=True)
-
-
-def test_a_robot_that_stood_away_from_zero_starts_there(tmp_path, model):
-    begin(tmp_path / "w", excavator(tmp_path / "bag", still=100), model=model)
-    assert Workspace(tmp_path / "w").config.task.start == {"boom": 0.3, "stick": -1.2}
-    moving = tmp_path / "moving"
-    begin(moving, excavator(tmp_path / "bag2"), model=model)
-    assert Workspace(moving).config.task.start == {}

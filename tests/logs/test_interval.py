@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from facts import holds
-from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.starting.begin import begin
-from grounded_trials.starting.interval import changes_every, round_interval
+from grounded_trials.starting.interval import changes_every
 
 MODEL = """from grounded import Model, Param
 
@@ -91,34 +90,3 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     told = [note for note in given.notes if "--dt" in note]
     assert given.dt == 0.02 and len(told) == (every == 1)  # else each command has its steps
     assert all(holds(one, "10 ms", "20 ms", "one in 2", "--dt 0.01") for one in told)
-
-
-@pytest.mark.parametrize("jitter", [0.0, 0.0003])
-def test_changes_that_rows_show_late_tell_their_phase_together(jitter):
-    rng = np.random.default_rng(0)
-    rows = np.arange(0, 4, 0.010) + jitter * rng.standard_normal(400)
-    sent = 0.0173 + 0.025 * np.arange(150)
-    values = np.searchsorted(sent, rows, "right").astype(float)
-    at, late = changes_of(np.round(rows * 1e9).astype(np.int64), values)
-    phase, room = phase_of(at * 1e-9, 0.025, late * 1e-9)
-    assert phase - room - 5e-4 < 0.0173 - 0.025 < phase + 5e-4 and room < 0.0055
-
-
-def test_changes_at_any_time_are_in_no_step():
-    rng = np.random.default_rng(1)
-    rows = np.arange(0, 20, 0.010)
-    values = np.searchsorted(np.sort(rng.uniform(0, 20, 300)), rows, "right").astype(float)
-    at, late = changes_of(np.round(rows * 1e9).astype(np.int64), values)
-    assert phase_of(at * 1e-9, 0.025, late * 1e-9) is None
-
-
-@pytest.mark.parametrize("hz", [2, 7.5, 12, 15, 24, 25, 30, 45, 50, 60, 75, 90, 100, 120, 125, 144])
-def test_the_interval_of_a_loop_is_that_of_its_rows(hz):
-    assert round_interval(1 / hz) == pytest.approx(1 / hz, rel=3e-3)
-
-
-def test_jitter_does_not_make_an_odd_interval():
-    assert [round_interval(0.0333333 * off) for off in (0.98, 1.0, 1.02)] == [0.0333333] * 3
-    assert round_interval(0.0303) == pytest.approx(1 / 33, rel=1e-5)
-    assert (round_interval(1e-5), round_interval(90.0)) == (0.001, 90.0)
-    assert [round_interval(rows) for rows in (0.996, 1.999, 2.5, 10.02)] == [1.0, 2.0, 2.5, 10.0]

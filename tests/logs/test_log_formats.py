@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import npz_records
-from grounded_trials.formats.text_tables import column_units, table_remarks
+from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
@@ -160,15 +160,6 @@ def test_a_damaged_log_is_refused_or_ends_early(tmp_path, kind, capsys):
     assert capsys.readouterr() == ("", "")  # pyulog prints; stdout is for the data of --json
 
 
-def test_decimal_commas_between_semicolons(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("time_ms;x;u\n10,5;0,25;-1\n20,5;1.5;2,0\n")
-    specs = {name: SignalSpec(f"/csv.{name}") for name in ("x", "u")}
-    found = read_signals(path, specs)
-    assert found["x"].values.tolist() == [0.25, 1.5] and found["u"].values.tolist() == [-1.0, 2.0]
-    assert np.diff(found["x"].t).tolist() == [10_000_000]
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -191,47 +182,6 @@ def test_tables_as_a_plc_or_another_language_writes_them(tmp_path, text, encodin
     path.write_text(text.replace("x", "größe"), encoding=encoding)
     found = read_signals(path, {"x": SignalSpec('/csv."größe"')})["x"]
     assert found.values.tolist() == [1, 2] and np.diff(found.t).tolist() == [250_000_000]
-
-
-def test_the_date_of_a_text_is_kept(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("time,x\n2026-11-21 10:05:00.000123+01:00,1\n")
-    found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
-    assert found.t[0] == 1_795_251_900_000_123_000  # `date -ud '2026-11-21 09:05' +%s`
-
-
-def test_units_below_the_names_are_the_columns(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("t;Winkel;u (V)\ns;[Grad];x\n0;1;2\n1;1;2\n")
-    assert column_units(path) == {"/csv.Winkel": "Grad", "/csv.u": "V"} | {"/csv.t": "s"}
-
-
-@pytest.mark.parametrize(
-    "names, row, found",
-    [
-        ("t;x;v", "{};{};{};", True),  # separators at the ends of lines
-        ("t;x;v;", "{};{};{}", True),
-        ("t;x;v;;", "{};{};{};", True),
-        (";t;x;v", "9;{};{};{}", True),  # an index without a name
-        ("t;x;v;w", "{};{};{}", "line 3 has 3 cells, but line 2 names 4"),
-        ("t;x", "{};{};{};", "line 3 has 4 cells, but line 2 names 2"),
-        ("t;x;v;", "9;{};{};{}", "line 3 has 4 cells, but line 2 names 3"),  # x was read as t
-        (";t;x;v", "{};{};{};", "'v' is empty in every row"),  # and here v as x
-    ],
-)
-@pytest.mark.parametrize("comma", [True, False])
-def test_one_name_more_or_less_than_cells_is_no_shift(tmp_path, names, row, found, comma):
-    path = tmp_path / "log.csv"
-    text = "\n".join(["Trace;B", names, *(row.format(0.1 * k, 5.5, 7.5) for k in range(4)), ""])
-    path.write_text(text.replace(".", ",") if comma else text)
-    specs = {name: SignalSpec(f"/csv.{name}") for name in ("x", "v")}
-    if found is not True:
-        with pytest.raises(GroundedError, match=found):
-            read_signals(path, specs)
-        return
-    signals = read_signals(path, specs)
-    assert [signals[n].values.tolist() for n in specs] == [[5.5] * 4, [7.5] * 4]
-    assert not table_remarks(path)
 
 
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):

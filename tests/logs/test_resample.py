@@ -91,14 +91,6 @@ def test_where_a_run_began_is_told_by_the_samples_before_it() -> None:
     assert np.nanstd(told) < 0.5 * np.std(rows) and abs(np.nanmean(told)) < 0.003
 
 
-def test_a_start_in_motion_or_after_few_samples_is_the_first_row() -> None:
-    swings = noisy(lambda t: np.sin(5 * t), 1)
-    assert not grid(swings, command(0.7)).start_states
-    assert not grid(noisy(np.ones_like, 1), command(-0.3)).start_states  # 4 samples before
-    slow = grid(noisy(lambda t: 0.2 * t, 3), command(0.7)).start_states  # drifts at one speed
-    assert slow["x"] == pytest.approx(0.14, abs=0.02)
-
-
 def test_scale_offset_and_unwrapping() -> None:
     def wrapped_degrees(t: np.ndarray) -> np.ndarray:
         return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)
@@ -203,23 +195,6 @@ def test_the_span() -> None:
     assert late.late_s == pytest.approx(0.495, abs=0.001) and "late" in late.warnings[0]
 
 
-def held(change: float, phase: float) -> Series:
-    """A command that changes every so often, first at `phase`, logged at 200 Hz from 0 on."""
-    t = np.arange(0.0, 2.0, 0.005)
-    return series(t, np.floor((t - phase) / change + 1e-9), SignalSpec("/u.data", "log"))
-
-
-@pytest.mark.parametrize("phase", [0.02, 0.035])
-def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
-    u = held(0.05, phase)
-    found = grid(pose(np.sin), u, rest=np.zeros(1))
-    assert found.moved_s == pytest.approx(phase, abs=1e-6) and found.warnings == ()
-    t = phase + 0.05 * np.arange(len(found.states))
-    np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-5)
-    assert found.inputs[:39, 0].tolist() == list(range(39))
-    assert grid(pose(np.sin), u).moved_s == 0  # a candidate's run begins with its first command
-
-
 def driven(rows: np.ndarray, every: float, **spec: object) -> Series:
     """A command that a driver changes at any row, at least so many seconds apart, at 100 Hz."""
     rng, t = np.random.default_rng(2), np.arange(0.0, 20.0, 0.025)
@@ -258,13 +233,6 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
         return
     times = 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)
-
-
-def test_a_start_after_a_reset_is_not_led_to_from_before_it() -> None:
-    reset = noisy(lambda t: np.where(t < 0.2, 8.0, 0.0), 6)
-    assert not grid(reset, command(0.5)).start_states  # seven samples after it
-    told = grid(reset, command(0.9)).start_states
-    assert told["x"] == pytest.approx(0.0, abs=0.03)
 
 
 def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -37,22 +36,6 @@ def test_the_tip_is_where_the_angles_say(model, state, tip):
     np.testing.assert_allclose(body.path(np.array([state]))[0], [tip[0], 0.0, tip[1]], atol=1e-12)
 
 
-@pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model])
-def test_links_hang_together(model):
-    body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
-    ends = []
-    for part, (origin, turned) in zip(body.parts, body.poses(states), strict=True):
-        np.testing.assert_allclose(
-            turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12
-        )
-        np.testing.assert_allclose(np.linalg.det(turned), 1.0)
-        if part.shape == "capsule":
-            ends.append((origin, origin + part.size[1] * turned[:, :, 2]))
-    for (_, end), (start, _) in pairwise(ends):
-        np.testing.assert_allclose(end, start, atol=1e-12)
-    np.testing.assert_allclose(ends[-1][1], body.path(states), atol=1e-12)
-
-
 @pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model, lift.model])
 def test_a_motion_is_the_body_seen_from_the_side(model):
     body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
@@ -77,10 +60,6 @@ def test_a_motion_is_the_body_seen_from_the_side(model):
         np.testing.assert_allclose([line[0] for line in links], np.array(poses)[: len(links), ::2])
         np.testing.assert_allclose(links[-1][1], tip[[0, 2]], atol=1e-9)
     assert motion(body, np.full((3, model.n), np.nan), 0.1) is None
-
-
-def test_what_has_no_length_has_no_unit():
-    assert [_body(one.model).unit for one in (pendulum, cart_pole, lift, arm)] == ["m"] * 3 + [""]
 
 
 @pytest.mark.parametrize(

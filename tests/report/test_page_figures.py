@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from grounded.diagnosis.error_report import Credit, RulerRow
@@ -24,9 +24,7 @@ from grounded.figures.figure import (
     Figure,
     Panel,
     log_ticks,
-    loss_ticks,
     rgb,
-    thinned,
 )
 from grounded.figures.interactive import PAPER, plotted
 from grounded.model import Model
@@ -37,40 +35,13 @@ from grounded.search.planner import Planner
 from grounded.trial import Trial
 from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import png
-from grounded_trials.report.figures.runs import all_figures, error_figure, input_figure
+from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
 from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(2, 6000), st.integers(0, 10_000), st.booleans())
-def test_thinning_keeps_ends_peaks_and_breaks(count, seed, broken):
-    rng = np.random.default_rng(seed)
-    x = np.linspace(0, 400, count)
-    y = np.cumsum(rng.normal(0, 2, count))
-    if broken:
-        y[count // 3 : count // 2] = np.nan
-    kept = thinned(x, y, 800)
-    assert len(kept) <= 810 and kept[0] == 0 and kept[-1] == count - 1
-    assert (np.diff(kept) > 0).all()
-    if np.isfinite(y).any():
-        assert np.nanmax(y[kept]) == np.nanmax(y)
-        assert np.nanmin(y[kept]) == np.nanmin(y) or broken
-    assert np.isnan(y).any() == np.isnan(y[kept]).any()
-
-
-def test_loss_axes_put_better_higher_and_space_by_ratio():
-    curve = Curve(np.arange(3.0), np.array([-100.0, -10.0, -1.0]), "best", "b")
-    panel = Panel("p", "x", "y", (curve,), loss=True)
-    assert panel.height(curve.y).tolist() == pytest.approx([-2.0, -1.0, 0.0])
-    low, high = panel.ranges()[1]
-    ticks = loss_ticks(low, high)
-    assert ticks == sorted(ticks) and 2 <= len(ticks) <= 5
-    assert plotted(panel)["layout"]["yaxis"]["ticktext"] == [f"{t:g}" for t in ticks]
 
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
@@ -89,14 +60,6 @@ def test_pictures_are_drawn_in_their_colours(cart):
         assert image.width >= 900 and image.height >= 300
         colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 24) or ()}
         assert (0, 114, 178) in colours, figure.name
-
-
-def test_scenes_of_car_aircraft_and_cart(cart, car):
-    plane = scene_of(gathered(car).task.model)
-    assert plane.names == ("x", "y") and plane.heading is not None and plane.spatial
-    air = scene_of(many_flights(1).task.model)
-    assert air.names == ("east", "north", "altitude") and air.map and len(air.attitude) == 3
-    assert not scene_of(gathered(cart).task.model).spatial
 
 
 @pytest.mark.parametrize(
@@ -179,15 +142,6 @@ def test_results_plot_what_the_page_shows(cart):
         assert len(drawn.data) >= len(titles)
     traces = findings.best.candidate.plot().data
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
-
-
-def test_held_commands_are_drawn_as_steps(cart):
-    findings = gathered(cart)
-    (panel,) = input_figure(findings).panels
-    for curve in panel.curves:
-        assert curve.style == "steps" and len(curve.y) == findings.task.horizon + 1
-        assert curve.y[-1] == curve.y[-2]
-    assert {t["line"]["shape"] for t in plotted(panel)["data"]} == {"hv"}
 
 
 # of linear RGB: how two kinds of colour blindness see it (Machado et al., 2009), and XYZ

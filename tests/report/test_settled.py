@@ -12,7 +12,6 @@ from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import parameter_table
-from grounded_trials.workspace.adoptable import better_model
 from grounded_trials.workspace.adopting import tied_when_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import set_in_model
@@ -135,48 +134,6 @@ def test_a_value_that_rests_on_a_parameter_is_told_with_it_everywhere(folder):
     assert ["radius" in text for text in adopted_in(w)["clauses"]] == [True, True]
     set_in_model(w.config.file, params={"mass": 1.5})  # as a fit does, which tells it
     assert ["radius" in text for text in adopted_in(w)["clauses"]] == [True, False]
-
-
-@pytest.mark.parametrize("name", ["parameter:mass", f"parameter:{K}"])
-def test_a_parameter_that_was_blamed_is_in_the_model_as_diagnosed_once(folder, name):
-    set_in_model(folder / "grounded.toml", effects=[DRAG])
-    blamed = {"effect": name, "claimed": True, "evidence": 9.0}
-    blamed["params"] = {"d": {"value": 0.1, "std": 0.02, "unit": "1/m"}}
-    w = written(
-        folder,
-        verdict={"kind": "several", "effects": [FRICTION, name], "sentence": "Two."},
-        ranking=[DIAGNOSIS["ranking"][0], blamed],
-        parameters={},
-        diagnosed=MADE | {"adopted": [DRAG], "nominal": {"mass": 1.0, K: 0.2}},
-    )
-
-    def as_diagnosed() -> str:
-        found = gather(Folder(folder))
-        better = better_model(Folder(folder), found.diagnosis)
-        assert not found.lost and better is not None
-        return better.planner.fingerprint
-
-    before = as_diagnosed()
-    w.adopt(FRICTION, name)
-    assert as_diagnosed() == Folder(folder).planner.fingerprint == before
-    found = gather(Folder(folder))
-    assert found.since.missing == () and set(found.since.adopted) == {FRICTION, name}
-
-
-def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(folder):
-    w = written(folder)
-    w.adopt(FRICTION)
-    model = Folder(folder).config.model
-    now = {"adopted": [dict(e) for e in model.effects], "params": dict(model.params)}
-    row = ROW | {"outset": ROW["crude"], "crude": ROW["with_effects"]}
-    written(folder, verdict=NONE, **EMPTY, prediction_error=[row], diagnosed=MADE | now)
-    findings = gather(Folder(folder))
-    assert not findings.since.changed and findings.settled.gained.facts["before"].value == 0.25
-    # a gain needs the values that were diagnosed
-    text = w.config.file.read_text()
-    w.config.file.write_text(re.sub(r"k = 0\.3\b", "k = 0.7", text))
-    settled = gather(Folder(folder)).settled
-    assert settled is not None and not settled.gained
 
 
 @pytest.mark.parametrize("value", [0.05, -0.05])

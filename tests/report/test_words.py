@@ -2,10 +2,9 @@
 
 import pytest
 
-from grounded.result import measured, measured_alike
+from grounded.result import measured_alike
 from grounded_trials.wording import (
     labelled,
-    per_second,
     percent,
     shown,
     with_unit,
@@ -16,22 +15,6 @@ def test_the_unit_one_is_not_printed():
     assert shown("1") == "" and shown("m/s") == "m/s"
     assert with_unit("0.146", "1") == "0.146" and with_unit("0.3", "m") == "0.3 m"
     assert labelled("throttle", "1") == "throttle" and labelled("v", "m/s") == "v [m/s]"
-
-
-@pytest.mark.parametrize(
-    ("unit", "rate"),
-    [
-        ("1", "1/s"),
-        ("rad", "rad/s"),
-        ("rad/s", "rad/s^2"),
-        ("m/s^2", "m/s^3"),
-        ("V", "V/s"),
-        ("N m", "N m/s"),
-        ("kg/h", "kg/h per s"),
-    ],
-)
-def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
-    assert per_second(unit) == rate
 
 
 @pytest.mark.parametrize(
@@ -50,22 +33,6 @@ def test_a_rate_has_the_unit_of_its_state_per_second(unit, rate):
 )
 def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (0.17, "m", "170 mm"),
-        (2.0, "m", "2.0 m"),
-        (4e-4, "m", "0.40 mm"),
-        (3e-6, "rad", "3.0 µrad"),
-        (0.3, "rad/s", "0.30 rad/s"),
-        (3e-4, "V", "3.0e-04 V"),
-        (0.0, "m", "0 m"),
-    ],
-)
-def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
-    assert measured(value, unit) == text
 
 
 @pytest.mark.parametrize(

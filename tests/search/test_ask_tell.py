@@ -56,21 +56,6 @@ def test_a_search_goes_on_from_its_candidates_and_trials(search):
     assert numbers([half.ask()]) == numbers([search.candidates[2]])
 
 
-def test_learning_stops_at_a_first_trial_whose_heading_is_in_degrees():
-    """Headings logged in degrees stop the search at the first trial."""
-    heading = TASK.model.state_names.index(str(TASK.model.roles["heading"]))
-
-    def in_degrees(candidate):
-        trial = run(candidate)
-        states = np.array(trial.states)
-        states[:, heading] = np.rad2deg(states[:, heading])
-        return replace(trial, states=states)
-
-    with pytest.raises(gr.GroundedError):
-        gr.learn(TASK, in_degrees, OPTIONS)
-    assert gr.learn(TASK, in_degrees, gr.SearchOptions(max_trials=2), check=False).trials
-
-
 @pytest.mark.slow
 def test_a_search_goes_on_with_effects_that_have_a_memory():
     """An adopted delay becomes latency, a lag a memory state of the planning model."""
@@ -95,13 +80,6 @@ def test_a_search_goes_on_with_effects_that_have_a_memory():
     assert begun.adopt({}, {name: value}).planner.plan.model.params[name].value == value
     with pytest.raises(gr.GroundedError, match="spede"):
         begun.adopt({"delay:spede": {"d": 0.06}})
-
-
-def test_the_best_policy_is_that_of_the_best_candidate(search):
-    assert gr.Search(TASK).policy is None
-    best = max(search.standing.history, key=lambda tried: tried.utility)
-    assert search.best.candidate is best.candidate and search.policy is best.candidate.policy
-    assert search.best.utility == search.standing.utilities[-1]
 
 
 @pytest.mark.parametrize(
@@ -150,17 +128,6 @@ def test_the_front_door_opens_at_once():
     code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())
-
-
-def test_a_short_gap_is_bridged_as_in_a_workspace():
-    """A single NaN among 151 samples does not count as a crash."""
-    search = gr.Search(TASK, OPTIONS)
-    trial = run(search.ask())
-    states = np.array(trial.states)
-    states[5, 0] = np.nan
-    search.tell(replace(trial, states=states))
-    assert np.isfinite(search.standing.history[0].utility)
-    assert np.isnan(search.trials[0].states[5, 0])
 
 
 def test_what_a_user_gets_wrong_in_python_is_said():

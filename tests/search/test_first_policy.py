@@ -11,7 +11,7 @@ from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import filled_target, first_guess
-from grounded.search.first_policy import cautious, first_policy
+from grounded.search.first_policy import first_policy
 from grounded.solve import ddp
 from small_tasks import cart_task, rover_task
 
@@ -50,29 +50,6 @@ def test_heading_and_speed_are_read_off_the_path():
     moving = expected[:, 1] > 0.3
     assert np.abs(x[moving, 4] - expected[moving, 4]).max() < 0.1  # not off by a turn either
     assert np.abs(np.diff(x[:, 4])).max() < 0.5
-
-
-def test_the_start_heading_decides_which_turn():
-    task = car_task("circle", car.model)
-    start = np.array(task.start)
-    start[4] = 2 * np.pi
-    blind = np.array(task.target)
-    blind[:, 4] = np.nan
-    reward = replace(task.reward, state=np.array([0, 1.0, 10.0, 10.0, 0, 0]))
-    x, _ = filled_target(replace(task, target=blind, reward=reward, start=start))
-    assert abs(x[0, 4] - 2 * np.pi) < 0.1
-
-
-def test_caution_does_not_hang_on_the_unit_of_an_input():
-    """After a crash, the smallest weight on changes depends on the input's unit (percent here)."""
-    task = car_task(NAMES[0], car.model)
-    plain = replace(task.reward, input_change=np.zeros(task.model.m))
-    task = replace(task, reward=plain)
-    fine = cautious(replace(task, low=-np.ones(2), high=np.ones(2)), 1).reward.input_change
-    wide = cautious(replace(task, low=-100 * np.ones(2), high=100 * np.ones(2)), 1)
-    free = cautious(replace(task, low=np.full(2, -np.inf), high=np.full(2, np.inf)), 1)
-    np.testing.assert_allclose(wide.reward.input_change, fine / 1e4)
-    np.testing.assert_allclose(free.reward.input_change, fine)
 
 
 def no_plan(**function):

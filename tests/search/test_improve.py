@@ -25,9 +25,8 @@ from grounded.search.planner import model_fingerprint
 from grounded.search.step.directions import damped, direction
 from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
-from grounded.trial import Trial
 from shared_data import SUPPORT
-from small_tasks import cart_task, drive, other, plain_task, rover, rover_task
+from small_tasks import cart_task, drive, other, plain_task, rover_task
 
 PAPER = {"turn": 0.97, "circle": 0.88}  # section 5.2
 
@@ -234,35 +233,3 @@ def test_the_fingerprint_follows_the_model_and_nothing_else():
         rover_task(smoothing=0.06),
     )
     assert len({model_fingerprint(t) for t in (task, *others)}) == 4
-
-
-def test_refit_plans_with_parameters_from_all_trials():
-    task, candidates, trials = story("rover")
-    asked = []
-
-    def refit(given, all_trials):
-        asked.append((given, len(all_trials)))
-        return other(task.model)
-
-    made = propose(task, candidates, trials, SearchOptions(refit=True), refit=refit).candidate
-    assert [n for _, n in asked] == [2]
-    plain = propose(task, candidates, trials, SearchOptions()).candidate
-    assert np.abs(made.policy.feedforward - plain.policy.feedforward).max() > 1e-6
-    assert isinstance(trials[0], Trial)
-
-
-@pytest.mark.parametrize("name", ["car", "far"])
-def test_the_fingerprint_is_the_same_without_a_compiler(name, monkeypatch):
-    """Rounding differences between machines do not change a model's fingerprint."""
-    from grounded.compile.run import jit
-
-    make = {
-        "car": lambda: car_task("circle", replace(car.model)),
-        "far": lambda: rover_task(model=replace(rover), start=np.array([1e4, -2e4, 30.0])),
-    }[name]
-    compiled = make()
-    here = model_fingerprint(compiled)
-    monkeypatch.setattr(jit, "trouble", lambda: "switched off")
-    plain = make()
-    assert model_fingerprint(plain) == here
-    assert type(plain.model.system) is not type(compiled.model.system)

@@ -2,9 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
-from grounded.effects import Library, wrap
 from grounded.search.planner import planner_with, predicted
 from small_tasks import DT, speed_rover, speed_rover_task
 
@@ -20,13 +17,3 @@ def test_a_limit_below_the_width_of_smoothing_is_planned_through():
         found.append(predicted(planner.plan.problem(exact=True), policy).utility)
     assert 0.7 * DT < 0.05  # a step of the limit, the width
     assert found[0] > 1.02 * max(found) and found[0] > -0.25
-
-
-def test_what_a_limit_takes_off_is_nothing_within_it():
-    model = wrap(Library().effect("dead_zone:linear", speed_rover()), {"c": 0.2}, DT)
-    x = np.tile([0.0, 0.0, 0.0, 0.3, 0.0], (5, 1))
-    u = np.column_stack([[-0.5, -0.1, 0.0, 0.2, 0.7], np.zeros(5)])
-    plain = speed_rover()
-    left = np.column_stack([[-0.3, 0.0, 0.0, 0.0, 0.5], np.zeros(5)])
-    want = plain.system.step(x, left, plain.values, DT)
-    np.testing.assert_allclose(model.system.step(x, u, model.values, DT), want, atol=1e-15)

@@ -1,6 +1,5 @@
 """Options given in Python are checked as those in grounded.toml and on the command line."""
 
-import numpy as np
 import pytest
 
 import grounded as gr
@@ -26,11 +25,6 @@ from grounded.diagnosis.diagnose import DiagnosisOptions
 def test_wrong_options_of_a_search(given, facts):
     with pytest.raises(gr.GroundedError, match=holding(*facts)):
         gr.SearchOptions(**given)
-
-
-def test_numbers_of_numpy_are_options():
-    options = gr.SearchOptions(repeats=np.int64(2), tolerance=np.float32(0.5), refit=np.bool_(1))
-    assert options.repeats == 2
 
 
 @pytest.mark.parametrize(

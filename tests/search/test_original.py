@@ -8,7 +8,6 @@ import pytest
 
 from grounded.plant import Plant
 from grounded.search.improve import propose
-from grounded.search.original import Promises, promises
 from grounded.search.planner import Planner, planner_with
 from grounded.search.scatter import PIECES
 from grounded.search.step.step_size import SearchOptions
@@ -75,23 +74,6 @@ def step(
     return SimpleNamespace(
         candidate=made, accepted=accepted, lost=accepted is False and lost, **fields
     )
-
-
-def test_promises_are_counted_for_each_model():
-    history = (
-        step("c1", "", "crude", float("nan"), -10.0),
-        step("c2", "c1", "crude", 4.0, -7.0),
-        step("c3", "c2", "better", 2.0, -100.0, accepted=False),  # loses at most what it promised
-        step("c4", "c2", "better", 1.0, -4.0),  # gains at most what it promised
-        step("c5", "c4", "better", 2.0, -3.0, of_original=True),
-        step("c6", "c5", "better", 2.0, -1.0, accepted=None),  # awaits its trial
-        step("c7", "c5", "better", 9.0, -300.0, accepted=False, doubtful=True),  # no promise
-    )
-    adopted, original = promises(history, "better")
-    assert adopted == Promises(3.0, -1.0)
-    assert original == Promises(6.0, 4.0)
-    assert Promises().share == 1.0
-    assert adopted.broken and not original.broken and not Promises().broken
 
 
 def test_a_run_that_was_stopped_on_its_path_broke_no_promise():

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from grounded.search.feedback.oscillation import between_limits, limit_cycle
+from grounded.search.feedback.oscillation import between_limits
 from grounded.search.improve import propose
 from grounded.search.step.step_size import SearchOptions
 from small_tasks import drive
@@ -26,14 +26,3 @@ def test_an_input_that_is_at_both_limits_for_long_swings_between_them():
     for inputs, expected in ((noisy, False), (np.sign(noisy), True), (np.abs(noisy) * 9, False)):
         trial = SimpleNamespace(inputs=np.clip(inputs, -1.0, 1.0))
         assert between_limits(SimpleNamespace(trials=[trial]), task) == expected
-
-
-def test_noise_about_an_input_that_is_off_lastingly_is_no_limit_cycle():
-    """An arm that sags under a load does not get gentler gains: it would sag more."""
-    task = SimpleNamespace(low=np.array([-20.0]), high=np.array([20.0]))
-    plan = np.linspace(0.0, 0.5, 80)[:, None]
-    made = SimpleNamespace(predicted_inputs=plan)
-    noise = np.tile([0.4, -0.4], 40)[:, None]
-    for held, expected in ((0.0, True), (5.0, False)):
-        trial = SimpleNamespace(inputs=plan + noise + held, steps=80)
-        assert limit_cycle(SimpleNamespace(candidate=made, trials=[trial]), task) == expected

@@ -49,17 +49,3 @@ def test_a_planner_remembers_what_earlier_policies_feed_back(late):
     assert planner.feeding_back([policy]) is planner
     bare = Planner(TASK, TASK)
     assert bare.as_given and bare.feeding_back([policy]).as_given and not play.as_given
-
-
-@pytest.mark.parametrize("width", [0.05, 0.5])
-def test_gains_do_not_vanish_within_a_play(late, width):
-    planner, policy = late
-    play = with_play(width)
-    made, _ = play.first_policy()
-    own, other = (np.abs(one.gain[:, :, :3]) for one in (made, policy))
-    assert np.median(own[:, 1, 2]) == pytest.approx(np.median(other[:, 1, 2]), rel=0.1)
-    assert own.max() < 2 * other.max()
-    assert play.plan.model.params[play.plays[0]].value == width
-    assert play.engaged.model.params[play.plays[0]].value == 0.0
-    assert play.loosened(play.plan.problem()) is not None
-    assert planner.engaged is planner.plan and planner.loosened(planner.plan.problem()) is None

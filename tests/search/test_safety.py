@@ -44,13 +44,6 @@ def test_a_gain_beyond_reason(made):
     assert len(found) == 1
 
 
-def test_a_search_that_stops_for_a_gain_does_not_speak_of_safety(monkeypatch):
-    monkeypatch.setattr("grounded.search.safety.MAX_GAIN", 1e-3)
-    found = propose(cart_task(), [], [], SearchOptions())
-    assert found.standing.ending == "gains too large" and found.candidate is None
-    assert [one.code for one in found.findings] == ["plan.gain"]
-
-
 def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
     low, high = np.array([-np.inf, -np.inf]), np.array([0.9, np.inf])
     task = cart_task(safety_low=low, safety_high=high)
@@ -58,32 +51,6 @@ def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
     assert proposal.candidate is None and proposal.standing.phase == "stopped"
     assert proposal.findings == proposal.standing.findings
     assert [one.code for one in proposal.findings] == ["plan.outside_safety"]
-
-
-def test_a_bound_that_is_just_kept_is_no_objection(made):
-    top = float(made.predicted_states[:, 0].max())
-    low = np.full(2, -np.inf)
-    kept = cart_task(safety_low=low, safety_high=np.array([top, np.inf]))
-    assert not objections(kept, made)
-    crossed = cart_task(safety_low=low, safety_high=np.array([np.nextafter(top, 0), np.inf]))
-    assert len(objections(crossed, made)) == 1
-
-
-def test_only_steps_that_this_model_has_foretold_say_how_far_runs_stray(made):
-    """A miss of 1.2 m with other gains does not make [safety] refuse all further steps."""
-    task = cart_task(safety_low=np.full(2, -9.0), safety_high=np.full(2, 9.0))
-    names = task.model.state_names, task.model.input_names
-    ran = Trial(
-        made.predicted_states + np.array([0.5, 0.0]), made.predicted_inputs, task.dt, *names
-    )
-    for way, model, expected in [
-        ("", made.model, 0.5),
-        ("own plan", made.model, 0.0),
-        ("", "other", 0),
-    ]:
-        step = replace(made, base="c0001", way=way)
-        history = [Tried(step, (ran,), (-1.0,), True)]
-        assert spread(task, history, model).size[:, 0].max() == pytest.approx(expected)
 
 
 def test_the_run_that_most_of_the_spread_comes_from_is_named(made):

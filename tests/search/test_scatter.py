@@ -6,23 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from grounded.frozen import resampled_noise, white_noise
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Tried
-from grounded.search.certainty import in_doubt
-from grounded.search.difference import Difference
 from grounded.search.improve import propose
 from grounded.search.scatter import (
     PIECES,
     Repeats,
-    by_pieces,
     noise_cost,
     sensor_noise,
-    with_errors,
 )
 from grounded.search.standing import standing
 from grounded.search.step.step_size import SearchOptions
-from small_tasks import cart_task, drive, other
+from small_tasks import cart_task, drive
 
 
 def runs(pieces, cost=10.0):
@@ -46,14 +41,6 @@ def test_intervals_from_two_repeats_hold_as_often_as_they_say():
     assert np.quantile(least, 0.01) > 0.2 > 10 * np.quantile(width, 0.01)
 
 
-def test_noise_in_one_piece_has_no_more_degrees_of_freedom_than_repeats():
-    pieces = np.zeros((3, PIECES))
-    pieces[:, 1] = [0.1, -0.2, 0.3]
-    found = Repeats([one := runs(pieces)]).near(one.utility)
-    assert found.freedom == pytest.approx(2.0)
-    assert found.variance == pytest.approx(np.var(one.utilities, ddof=1))
-
-
 def test_what_costs_much_more_says_nothing_and_copies_count_where_all_agree():
     tame, wild = runs(np.ones((2, PIECES)) * [[0.1], [0.2]]), runs(np.eye(PIECES)[:2] * 90, 400.0)
     near = Repeats([tame, wild]).near(tame.utility)
@@ -62,32 +49,6 @@ def test_what_costs_much_more_says_nothing_and_copies_count_where_all_agree():
     assert Repeats([tame, copies]).near(-9.0) == near
     alone = Repeats([copies]).near(copies.utility)
     assert (alone.variance, alone.freedom > 0) == (0.0, True)
-
-
-def test_one_number_serves_the_table_the_gain_and_the_doubt():
-    rng = np.random.default_rng(3)
-    first, best = runs(rng.normal(size=(2, PIECES)), 12.0), runs(rng.normal(size=(2, PIECES)))
-    history = with_errors([first, best])
-    between = Difference(*history, history)
-    error, freedom = between.error, between.freedom
-    each = Repeats(history).near(best.utility)
-    assert freedom == each.freedom
-    assert [t.standard_error for t in history] == [pytest.approx(each.error(2))] * 2
-    assert error == pytest.approx(2**0.5 * each.error(2))
-    for by, doubt in ((1.9, True), (2.1, False)):
-        off = by * np.sqrt(each.variance * (1 / 2 + 1))
-        loser = Tried(best.candidate, (None,), (best.utility - off,), False)
-        assert in_doubt(cart_task(), history[1], loser, history, 9) is doubt
-
-
-def test_pieces_sum_to_the_utility():
-    task = cart_task()
-    plant = Plant(other(task.model), noise=Noise(process={"v": 0.02}))
-    made = propose(task, [], [], SearchOptions()).candidate
-    ran = [drive(task, plant, made, seed) for seed in range(3)]
-    found = by_pieces(task, ran)
-    assert found.shape == (3, PIECES)
-    np.testing.assert_allclose(found.sum(axis=1), [task.utility(one) for one in ran])
 
 
 def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
@@ -113,18 +74,3 @@ def test_what_noise_in_a_log_costs_is_no_doubt_in_the_model():
     assert more.noise_cost == pytest.approx(noise_cost(task, policy, sensor_noise(runs[:3], 2)))
     each = [float(noise_cost(task, policy, sensor_noise([run], 2))) for run in runs[:3]]
     assert min(each) < more.noise_cost < max(each)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_the_noise_of_an_interpolated_log_is_all_of_it(share):
-    rng = np.random.default_rng(3)
-    t = 0.05 * np.arange(401)
-    seen = 0.02 * rng.standard_normal((401, 8))
-    log = (1 - share) * seen[:-1] + share * seen[1:] + np.sin(t[:-1])[:, None]
-    true = 0.02 * np.hypot(1 - share, share)
-    np.testing.assert_allclose(np.median(resampled_noise(log)), true, rtol=0.08)
-    smooth = np.sin(3 * t)[:, None]  # nothing but motion
-    assert resampled_noise(smooth)[0] == white_noise(smooth)[0] < 1e-3
-    gaps = np.where(np.arange(400)[:, None] % 9, log, np.nan)
-    np.testing.assert_allclose(np.median(resampled_noise(gaps)), true, rtol=0.2)
-    assert resampled_noise(np.full((9, 1), np.nan))[0] == 0.0

@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facts import holding
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
-from grounded.search.planner import fixed_draws, model_fingerprint
+from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step.step_size import OTHER_WAY, SearchOptions
 from grounded.trial import Trial, mean_trial
@@ -261,19 +260,6 @@ def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
     assert last.candidate is None and last.standing.phase == "stopped"
 
 
-def test_a_candidate_made_from_a_discarded_loss_gives_way_to_the_one_that_lost():
-    story = Story().add().add(cut)
-    made = story.propose().candidate
-    assert made.seen == tuple(trial.id for trial in story.trials) and len(made.seen) == 2
-    story.candidates += [made] * (made not in story.candidates)
-    wrong = story.trials.pop()
-    again = story.propose()
-    assert not again.is_new and again.candidate is story.candidates[1]
-    assert again.standing.history[-1].void and again.standing.history[-1].gone == (wrong.id,)
-    story.trials.append(wrong)
-    assert story.propose().candidate is made  # restored
-
-
 @pytest.mark.parametrize(("off", "repeats", "least"), [(0.3, 1, -1.35)])
 def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
     """The robot starts slightly (or far) off s_0. With the exact start: from -1.349 to -0.881."""
@@ -293,14 +279,6 @@ def test_max_trials_ends_the_search():
     story = Story(max_trials=3).add().add().add()
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "stopped"
-
-
-def test_repeats_that_do_not_fit_any_more_are_not_begun():
-    story = Story(max_trials=5, repeats=3).add().add().add()
-    last = story.propose()
-    assert last.candidate is None and last.standing.phase == "stopped"
-    with pytest.raises(GroundedError, match=holding("repeats", "3", "2")):
-        SearchOptions(repeats=3, max_trials=2)
 
 
 def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
@@ -328,19 +306,6 @@ def test_trials_of_no_candidate_are_ignored():
         replace(story.trials[0], candidate="x"),
     ]
     assert story.now.utilities == before.utilities and story.now.trials == 1
-
-
-def test_the_order_of_stored_trials_decides_nothing():
-    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
-    story = Story(plant=noisy, repeats=2)
-    for _ in range(4):
-        story.add()
-    made = story.propose().candidate
-    turned = propose(story.task, story.candidates[:2], list(reversed(story.trials)), story.options)
-    assert turned.standing.utilities == pytest.approx(story.now.utilities)
-    np.testing.assert_allclose(
-        turned.candidate.policy.feedforward, made.policy.feedforward, atol=1e-9
-    )
 
 
 def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
@@ -459,23 +424,3 @@ def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
     assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
     for trial in found.trials:
         assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()
-
-
-@pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])
-def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
-    """A run may be a thousand times worse than predicted although its loop is stable."""
-    story = Story(TASK, PLANT)
-    plan = story.propose().candidate.predicted_inputs
-    wave = np.ptp(plan) * np.sign(np.sin(np.pi * times * (np.arange(len(plan)) + 0.5) / len(plan)))
-    story.add(lambda trial: bad(replace(trial, inputs=plan + wave[:, None])))
-    second = story.propose().candidate
-    assert second.way == made
-    if made:
-        first = story.candidates[0].policy.gain
-        assert np.abs(second.policy.gain).mean() < 0.5 * np.abs(first).mean()
-        story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost and is not tried again
-        assert [c.way for c in story.candidates].count("gentler gains") == 1
-
-
-def test_fingerprints_are_taken_where_numpys_generator_would_draw():
-    assert (fixed_draws(3000) == np.random.default_rng(0).random(3000)).all()

@@ -1,11 +1,8 @@
 """Trim: inputs and free states for which the model follows the prescribed motion."""
 
 import numpy as np
-import pytest
 
-from grounded.experiments.car_tasks import car_task, target
-from grounded.models import car
-from grounded.search.first_guess import filled_target, trim
+from grounded.search.first_guess import trim
 from small_tasks import cart, cart_task, rover, rover_task
 
 
@@ -19,15 +16,6 @@ def test_a_cart_that_follows_a_known_motion_needs_the_force_of_newton():
     assert np.abs(moved - x[1:]).max() < 2e-3
 
 
-def test_limits_are_kept():
-    task = cart_task(low=np.array([-0.2]), high=np.array([0.2]))
-    t = 0.05 * np.arange(41)
-    _, u = trim(
-        task, np.column_stack([1 - np.cos(3 * t), 3 * np.sin(3 * t)]), np.array([True, True])
-    )
-    assert u.min() >= -0.2 and u.max() <= 0.2 and np.ptp(u) == pytest.approx(0.4)
-
-
 def test_a_dead_zone_does_not_hold_it_back():
     """At zero input the slope is zero, so the trim also starts from other inputs."""
     task = rover_task(past=np.zeros(2))
@@ -36,17 +24,3 @@ def test_a_dead_zone_does_not_hold_it_back():
     moved = rover.system.step(task.target[:-1], u, rover.values, 0.05)
     assert np.abs(moved - task.target[1:]).max() < 3e-3
     np.testing.assert_array_equal(x, task.target[:-1])
-
-
-def test_a_steady_turn_of_the_car_is_trimmed():
-    """Steering angle and throttle of a circle: delta = atan(L / R), v_ss = v."""
-    task = car_task("circle", car.model)
-    x, u = filled_target(task)
-    values = {k: p.value for k, p in car.model.params.items()}
-    late = slice(100, 190)
-    assert np.abs(x[late, 0] - np.arctan(values["L"])).max() < 0.02
-    steering = np.arctan(values["L"]) / values["a1"]
-    throttle = (1.4 - values["a3"] * steering - values["b2"]) / values["a2"]
-    np.testing.assert_allclose(u[late, 0], steering, atol=0.05)
-    np.testing.assert_allclose(u[late, 1], throttle, atol=0.05)
-    np.testing.assert_allclose(x[:, 1:5], target("circle")[:, 1:5], atol=1e-9)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
@@ -109,36 +108,6 @@ def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
     ):
         edit(w.folder, **{"limits": ""} | given)
         assert not assumed(w)
-
-
-FAN = """
-from grounded import Model, Param
-
-def rate(s, a, p):
-    return {"h": s.v, "v": 9.81 * (s.fan / 2700 - 1) - 2 * s.v, "fan": (56 * a.pwm - s.fan) / p.lag}
-
-model = Model(states={"h": "m", "v": "m/s", "fan": "rpm"}, inputs={"pwm": "%"},
-              params={"lag": Param(0.3, "s")}, derivative=rate)
-"""
-
-
-def test_a_start_that_another_state_would_hold_is_told_with_it(tmp_path):
-    w = blank(tmp_path / "w", FAN, safety="h = [0.15, 0.9]", limits="pwm = [0, 100]")
-    w.target({"h": np.linspace(0.2, 0.6, 101)})
-    proposed = Workspace(w.folder).propose()
-    assert proposed.standing.ending == "not allowed" and proposed.then.verb == "propose"
-    assert any("fan = 2700, pwm = 48.21" in note for note in proposed.notes)
-    edit(w.folder, start="{ h = 0.2, fan = 2700, pwm = 48.21 }")
-    assert Workspace(w.folder).propose().candidate is not None
-    heavier = '{name = "offset:v", c = -0.981}'  # a tenth more to carry
-    edit(w.folder, start="{ h = 0.2 }", effects=heavier)
-    (note,) = assumed(w)
-    assert "fan = 2970, pwm = 53.04" in note
-
-
-def test_a_workspace_in_a_folder_of_this_one_is_named(sled):
-    done = grounded("-C", sled.folder.parent, "status")
-    assert done.code == 1 and f"{sled.folder}\n" in done.err
 
 
 def test_a_candidate_as_proposed_runs_like_its_export(sled, tmp_path):

@@ -1,6 +1,5 @@
 """A real system that repeats itself to the last bit: the search ends, by `learn` and by hand."""
 
-import os
 import sys
 
 import pytest
@@ -66,22 +65,6 @@ def test_run_and_ingest_by_hand_end_too_and_an_old_file_is_no_repeat(workspace):
         files.append(ran.trial_file)
     assert workspace.propose().candidate is None
     assert workspace.status().standing.trials == len(files)
-
-
-def test_the_same_bytes_written_anew_are_the_repeat_that_is_waited_for(workspace):
-    config = workspace.folder / "grounded.toml"
-    config.write_text(config.read_text().replace("max_trials = 12", "max_trials = 12\nrepeats = 3"))
-    workspace.propose()
-    first, second = workspace.run().trial_file, workspace.run().trial_file
-    assert first.read_bytes() == second.read_bytes()
-    one = workspace.ingest(first)
-    now = second.stat().st_mtime_ns + 10**9
-    os.utime(second, ns=(now, now))
-    two = workspace.ingest(second)
-    assert not two.known and two.sha256 == one.sha256 and two.trial != one.trial
-    assert one.trial in two.warnings[-1]
-    assert workspace.status().standing.phase == "propose"  # two exact ones stand for three
-    assert workspace.verify().damaged == ()
 
 
 def test_learn_stops_at_a_trial_in_other_units_and_goes_on_where_it_is_asked_again(workspace):

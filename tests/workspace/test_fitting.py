@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
 from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError, NextCommand
 from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis, usable_ids
+from grounded_trials.workspace.last_diagnosis import usable_ids
 from reported import diagnosed
 from workspaces import make
 
@@ -98,24 +97,6 @@ def test_values_that_predict_worse_are_never_written(misled):
     assert misled.config.file.read_text() == before
 
 
-def test_trials_of_before_a_change_of_the_robot_can_be_left_out(tmp_path):
-    w = logs(tmp_path / "w", [1.0] * 4 + [1.4] * 4)
-    newer = ("t0005", "t0006", "t0007", "t0008")
-    mixed, found = w.fit(), w.fit(trials=newer)
-    assert mixed.trials == tuple(usable_ids(w)) and found.trials == newer
-    assert mixed.fit.params["mass"].value < 1.35
-    assert found.fit.params["mass"].value == pytest.approx(1.4, rel=0.02)
-    assert found.to_json()["trials"] == list(newer)
-    assert found.then == NextCommand("fit", ("--trials", ",".join(newer), "--apply"))
-    w.fit(trials=newer, apply=True)
-    assert w.base_model.params["mass"].value == pytest.approx(1.4, rel=0.02)
-    with pytest.raises(GroundedError) as unknown:
-        w.fit(trials=["T0005", "t0009"])
-    assert holds(str(unknown.value), "t0009", "t0001", "t0008")
-    empty = grounded("-C", w.folder, "fit", "--trials", ",")
-    assert empty.code == 1 and "--trials" in empty.err
-
-
 def test_the_fit_after_a_diagnosis_of_some_trials_is_of_the_same_trials(misled):
     some = ["t0001", "t0004", "t0005", "t0006"]
     claimed(misled, named=some)
@@ -139,14 +120,3 @@ def test_a_fit_in_vain_is_not_asked_for_again(misled):
     claimed(misled)
     (misled.reports / "fit.json").write_text("[")
     assert misled.status().then == NextCommand("fit")
-
-
-@pytest.mark.parametrize(("value", "adopted"), [(1.2, True), (1.4, False)])
-def test_another_value_than_was_claimed_was_not_adopted(misled, value, adopted):
-    claimed(misled)
-    text = misled.config.file.read_text()
-    told = f'file = "model.py"\nparams = {{ mass = {value} }}'
-    misled.config.file.write_text(text.replace('file = "model.py"', told, 1))
-    w = Workspace(misled.folder)
-    since = since_diagnosis(w, read_diagnosis(w.reports), usable_ids(w))
-    assert since.changed and since.adopted == ("parameter:mass",) * adopted

@@ -81,15 +81,6 @@ def test_a_flipped_optimum_and_a_flipped_result_of_a_study_are_not_read(w, tmp_p
     assert "seed 1" not in store and len(store) == 0
 
 
-def test_every_flipped_byte_of_a_note_is_found(w):
-    (note, *_) = sorted(w.store.folder.glob("n*.json"))
-    data = note.read_bytes()
-    note.chmod(0o644)
-    for k in range(0, len(data), 31):
-        note.write_bytes(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :])
-        assert [one.file for one in w.verify().damaged] == [str(note)], k
-
-
 @pytest.mark.parametrize("which", [-1])
 def test_a_deleted_trial_is_found_the_last_one_too(w, which):
     w.propose()  # this hand-out has seen the last trial
@@ -148,14 +139,6 @@ def test_a_slow_propose_does_not_replace_what_was_handed_out(w, monkeypatch):
     mine = w.propose()
     assert mine.candidate.id == quick[1] and not mine.proposal.is_new
     assert w.candidate_bytes(quick[1]) == quick[2] and w.verify().damaged == ()
-
-
-def test_a_hand_out_is_recorded_once(w):
-    identity = w.propose().candidate.id
-    count = len(w.notes.store.list())
-    w.propose()
-    assert len(w.notes.store.list()) == count
-    assert set(w.noted.handed) == {"c0001", "c0002", identity}
 
 
 def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):

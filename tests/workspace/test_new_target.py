@@ -66,23 +66,6 @@ def test_the_old_target_is_kept(w):
     assert w.config.task.horizon == 20
 
 
-CART = """
-from grounded import Model
-
-model = Model(states={"x": "mm", "v": "mm/s"}, inputs={"u": "mm/s^2"},
-              derivative=lambda s, a, p: {"x": s.v, "v": a.u})
-"""
-
-
-@pytest.mark.parametrize("size", [180.0, 1800.0])
-def test_weights_of_large_ranges_are_not_taken_for_chosen_ones(tmp_path, size):
-    w = blank(tmp_path / "w", CART)
-    for far in (size, 1.0):
-        w.target({"x": far * LINE})
-        w.forget()
-        assert w.task.reward.state[0] == pytest.approx(far**-2, rel=1e-4)
-
-
 PLATE = """from grounded import Model
 model = Model(states={"T": "degC", "x": "m"}, inputs={"heater": "%"}, params={},
     derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20), "x": 0.01 * a.heater})

@@ -10,19 +10,18 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import Ending, ended
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
-from grounded_trials.wording import folded, placed, rendered
+from grounded_trials.wording import placed, rendered
 from grounded_trials.workspace import fitting
 from grounded_trials.workspace.adoptable import diagnosed_again
 from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import read_diagnosis, since_diagnosis
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
 from grounded_trials.workspace.user_files.config import set_in_model
 from recorded import LOGGED, record
@@ -207,22 +206,6 @@ def test_a_manoeuvre_is_drawn_before_the_first_plan(tmp_path):
     assert following(w.folder) == "propose"
 
 
-def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.learn(2)
-    w.propose()
-    assert following(w.folder) == "run"
-    w.reports.mkdir(exist_ok=True)
-    diagnosed(w.folder, diagnosed=taken_in(1, 2))
-    assert following(w.folder) == "adopt viscous_friction:v"
-    found = gather(Folder(w.folder))
-    assert found.standing.phase == "await-trial"
-    assert rendered(found.then) == "grounded adopt viscous_friction:v"
-    assert found.next_command == rendered(found.then, str(w.folder))
-    w.learn(1)  # a later trial outdates it
-    assert "adopt" not in following(w.folder)
-
-
 def test_a_search_that_doubts_its_model_is_diagnosed_after_two_runs(tmp_path, monkeypatch):
     w = Workspace(make(tmp_path / "w").folder)
     w.learn(1)
@@ -274,21 +257,6 @@ def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_a
     assert w.ingest(log, data=True).then == DIAGNOSE == w.status().then
 
 
-def test_without_the_effects_of_its_diagnosis_a_model_is_diagnosed_before_it_plans(tmp_path):
-    w = Workspace(make(tmp_path / "w").folder)
-    w.learn(2)
-    w.reports.mkdir(exist_ok=True)
-    effect = {"name": "viscous_friction:v", "k": 0.1}
-    made = taken_in(1, 2) | {"adopted": [effect]}
-    diagnosed(w.folder, diagnosed=made)
-    assert following(w.folder) == "diagnose"
-    diagnosed(w.folder, diagnosed=made, verdict=NONE, ranking=[])
-    assert following(w.folder) == "propose"
-    diagnosed(w.folder, diagnosed=made)
-    set_in_model(w.config.file, effects=[effect | {"k": 0.2}])
-    assert following(w.folder) == "propose"
-
-
 # after a search
 
 
@@ -334,44 +302,7 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
     assert following(w.folder) == then
 
 
-@pytest.mark.parametrize("left", [{"look_for": 5}, {}])
-def test_what_left_more_to_be_found_is_diagnosed_again_once_it_is_adopted(w, monkeypatch, left):
-    over = ended(w.status().standing, Ending.NOTHING_PROMISED)
-    monkeypatch.setattr(
-        "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: over
-    )
-    seen = taken_in(*range(1, len(w.trials()) + 1))
-    diagnosed(w.folder, diagnosed=seen, verdict=one_effect("viscous_friction:v")["verdict"] | left)
-    w.adopt("viscous_friction:v")
-    assert following(w.folder) == ("diagnose" if left else "export best --runner")
-
-
-def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(w):
-    then = {"name": "delay:force", "d": 0.01}
-    made = {"trials": [], "adopted": [then], "params": {}}
-    verdict = {"kind": "effect", "effects": ["delay:force"], "sentence": "Later still."}
-    found = Diagnosis.from_json(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
-    assert found.open([then]) == ("delay:force",)
-    assert found.open([then | {"d": 0.03}]) == ()
-    assert since_diagnosis(w, found, []).changed  # the cart has no effect at all
-    for d, adopted in ((0.03, ("delay:force",)), (0.01, ())):
-        set_in_model(w.config.file, effects=[then | {"d": d}])
-        since = since_diagnosis(Folder(w.folder), found, [])
-        assert (since.changed, since.adopted) == (bool(adopted), adopted)
-
-
 # how commands are printed
-
-
-def test_a_long_command_is_broken_where_a_shell_allows_it():
-    names = [f"first_order_lag:input_number_{k}" for k in range(6)]
-    command = " ".join(["grounded adopt", *names])
-    text = folded(command)
-    assert max(map(len, text.splitlines())) <= 80
-    assert shlex.split(text.removeprefix("next: ").replace("\\\n", " ")) == command.split()
-    assert folded("grounded run") == "next: grounded run"
-    quoted = folded("grounded -C 'my own folder' " + command.removeprefix("grounded "))
-    assert shlex.split(quoted.replace("\\\n", " "))[3] == "my own folder"
 
 
 @pytest.mark.slow

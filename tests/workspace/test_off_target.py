@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import off_target_of, position_axes, reaches, traded
+from grounded_trials.workspace.off_target import off_target_of
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -41,12 +40,6 @@ def task(state=(0, 0, 0, 0), terminal=(0, 0, 0, 0)):
 def run(states):
     names = (ROVER.state_names, ROVER.input_names)
     return Trial(states, np.zeros((len(states) - 1, 2)), DT, *names)
-
-
-def test_a_height_that_is_part_of_the_position_counts_once():
-    plane = replace(ROVER, roles={"position": ("x", "y"), "altitude": "y"})
-    assert position_axes(plane) == position_axes(ROVER) == [0, 1]
-    assert position_axes(replace(ROVER, roles={**ROVER.roles, "altitude": "v"})) == [0, 1, 3]
 
 
 def off(x=0.0, y=0.0, psi=0.0, steps=H):
@@ -86,20 +79,6 @@ def test_an_error_at_the_end_has_its_standard_error():
     assert exact.end_std == pytest.approx(0.0, abs=1e-12)
 
 
-def test_where_something_is_to_be_reached_the_end_is_told_without_a_weight_of_its_own():
-    goal = replace(task(ALONG), start=np.array([-1.0, 0.0, 0.0, 0.0]))
-    states = off(0.5)
-    states[-1, :2] = 0.003, 0.004
-    position, _ = off_target_of(goal, [run(states)])
-    assert position.rms > 0.4 and position.end == pytest.approx(0.005)
-    s = np.linspace(0, 1, H + 1)
-    way = np.zeros((H + 1, 4))
-    way[:, 0] = 10 * s**3 - 15 * s**4 + 6 * s**5
-    assert reaches(goal) and not reaches(task(ALONG))  # which is to stay
-    assert not reaches(replace(goal, target=np.outer(s, [1.0, 0, 0, 0])))  # and one to go on
-    assert reaches(replace(goal, start=np.zeros(4), target=way))
-
-
 def test_a_run_that_ended_early_has_no_end_and_a_lost_one_no_line():
     states = off(0.5, steps=10)
     (position,) = off_target_of(task(terminal=END), [run(states)])
@@ -134,19 +113,3 @@ def test_propose_says_how_far_the_predicted_run_is_off(cart, tmp_path):
     told = next(one for one in proposed.off_target if one.what == "x")
     assert told.rms == pytest.approx(np.sqrt(np.mean(error**2))) and told.most == error.max() > 0
     assert proposed.to_json()["off_target"][0]["what"] == "x"
-
-
-def test_a_better_candidate_that_is_farther_off_says_what_it_gained_by():
-    here = task(state=(1, 1, 0, 0))
-    rough = np.tile([[1.0, 0.0], [0.0, 1.0]], (H // 2, 1))
-
-    def tried(name, far, inputs):
-        states = off(far)
-        states[0] = 0.0  # all began at the start
-        trial = Trial(states, inputs, DT, ROVER.state_names, ROVER.input_names)
-        made = SimpleNamespace(id=name, predicted_states=np.zeros((H + 1, 4)))
-        return SimpleNamespace(candidate=made, trials=(trial,), utility=here.utility(trial))
-
-    before, best = tried("c0001", 0.01, rough), tried("c0002", 0.02, 0 * rough)
-    assert best.utility > before.utility and traded(here, best, before).facts["inputs"]
-    assert traded(here, tried("c0003", 0.01, 0 * rough), before) is None

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
@@ -82,21 +81,3 @@ def test_a_probe_that_fails_costs_no_diagnosis(diagnosed, monkeypatch, caplog):
     assert caplog.records[-1].exc_info[0] is KeyError  # the traceback of our mistake is not lost
     kept = read_diagnosis(w.reports)
     assert kept is not None and kept.next_trial == found.next_trial
-
-
-def test_one_trial_that_knows_most_is_not_believed_alone():
-    rng, count = np.random.default_rng(0), 4
-    root = rng.standard_normal((count, 3, 3))
-    groups = root @ root.swapaxes(1, 2) + np.eye(3)
-    groups[-1] *= 30
-    total, draws = groups.sum(axis=0), []
-    for _ in range(600):
-        s = np.array([np.linalg.cholesky(G) @ rng.standard_normal(3) for G in groups])
-        s -= groups @ np.linalg.solve(total, s.sum(axis=0))  # at the top they add up to zero
-        left = [np.linalg.solve(total - G, own) for G, own in zip(groups, s, strict=True)]
-        draws.append((count - 1) / count * np.square(left).sum(axis=0))
-    std = foretold(groups, np.zeros((3, 3)))
-    np.testing.assert_allclose(std, np.sqrt(np.mean(draws, axis=0)), rtol=0.12)
-    assert (std > 1.5 * np.sqrt(np.diag(np.linalg.inv(total)))).all()
-    twice = foretold(np.concatenate([groups, groups[-1:]]), np.zeros((3, 3)))
-    assert (twice < 0.7 * std).all()

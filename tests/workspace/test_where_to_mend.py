@@ -72,14 +72,6 @@ def test_a_late_sensor_of_our_own_trials_is_mended_in_the_program(w):
     assert shown[0]["advice"] == one.advice
 
 
-def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(w):
-    foreign(w)
-    assert found_in(w).log.startswith("delay_s = 0.1") and found_in(w).advice
-    toml = w.config.file
-    toml.write_text(toml.read_text().replace("[task]\n", "[task]\nfeedback = false\n"))
-    assert not found_in(w).advice
-
-
 def test_a_delay_is_not_removed_from_logs_that_the_model_has(w):
     foreign(w)
     edit(w.folder, effects='{ name = "sensor_delay:v", d = 0.1 }')
@@ -100,13 +92,6 @@ def test_one_message_is_late_as_a_whole(tmp_path, topic, alone):
     toml = w.folder / "grounded.toml"
     toml.write_text(f"{toml.read_text()}\n[log.state]\n{rows}")
     assert one_message(Folder(w.folder)) == (() if alone else ("x", "y", "psi"))
-
-
-def test_sensors_that_nothing_is_held_against_are_named(w):
-    trial = late()
-    own(w, replace(trial, states=trial.states * [1.0, np.nan]))
-    found = grounded("-C", w.folder, "diagnose", "--instruments", "--json").json
-    assert found["unheld"] == ["x"]
 
 
 @pytest.mark.parametrize(
@@ -145,11 +130,3 @@ def test_an_offset_that_is_found_adds_to_that_of_log(w, has, mended):
     compass = Finding("v", "turns the other way", "sign", log="scale = -1, offset = 1.5")
     (one,) = where_to_mend(w, [used], [compass])
     assert keys_of(one.log) == mended
-
-
-@pytest.mark.parametrize("entry", ["[log.state.v]\ndelay_s = 0.02", "[log.input.force]\nscale = 2"])
-def test_an_entry_of_log_without_a_path_is_an_error(w, entry):
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text() + entry)
-    with pytest.raises(GroundedError, match=holding("path")):
-        _ = Folder(w.folder).config

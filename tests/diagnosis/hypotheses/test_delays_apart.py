@@ -7,7 +7,6 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.variations import varied
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.claims import _restated
 from grounded.effects import Library
 from grounded.model import Model
 from grounded.trial import Trial
@@ -52,19 +51,3 @@ def delays(late: tuple[float, float]) -> dict[str, float]:
 def test_a_command_that_is_later_than_another_gets_a_delay_of_its_own():
     found = delays((0.03, 0.05))
     assert found == pytest.approx({"delay:throttle": 0.03, "delay:steer": 0.05}, abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    "name, other, rest, same",
-    [
-        ("delay:b", "delay:a+b", {"delay:a"}, True),
-        ("delay:b", "delay:a+b", set(), False),
-        ("delay:b", "delay:a+b", {"first_order_lag:a"}, False),
-        ("first_order_lag:b", "delay:a+b", {"delay:a"}, False),
-        ("delay:b", "delay:b+c", {"delay:a"}, False),
-    ],
-)
-def test_a_delay_of_all_beside_a_further_one_of_the_others_says_nothing_else(
-    name, other, rest, same
-):
-    assert _restated(name, other, rest) is same

@@ -89,16 +89,6 @@ def test_three_effects_that_cancel_are_refused(turned, change, refused):
         assert not turned.cancelling(h.minus(name))
 
 
-def test_less_friction_than_modelled_pays_as_a_parameter_does(turned):
-    by_name = {effect.name: effect for effect in turned.candidates}
-    effect = by_name["viscous_friction:w"]
-    more, less = (turned.price(effect, {"k": k}) for k in (3.9, -3.9))
-    damping = -effect.free[0].low
-    assert damping == pytest.approx(1 / 0.12, rel=0.01)
-    assert less - more == pytest.approx(0.5 * (3.9 / damping / 0.2) ** 2)
-    assert turned.price(effect, {"k": -0.1}) == pytest.approx(more, abs=0.1)
-
-
 @pytest.mark.parametrize("family", ["viscous_friction", "coulomb_friction", "quadratic_drag"])
 def test_less_friction_than_modelled_is_said_so(turned, family):
     effect = {effect.name: effect for effect in turned.candidates}[f"{family}:w"]

@@ -8,11 +8,10 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.hypotheses.variations import swapped, variations, varied
+from grounded.diagnosis.hypotheses.variations import variations, varied
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
-from grounded.effects.joint import has_viscous
 
 FRICTION, K, TAU, DT = 0.35, 0.88, 0.06, 0.02
 MOTOR = Model(
@@ -73,37 +72,6 @@ def fitted(search, *effects, start=(-0.1, 0.01)):
     return search.refined([search.fresh(h)], 30)[0]
 
 
-def test_a_gain_and_a_lag_together_are_the_viscous_part():
-    assert has_viscous(MOTOR, "volt<-w")
-    lagged = replace(MOTOR, params={**MOTOR.params, "K": Param(1.0, "rad/s/V")})
-    assert not has_viscous(lagged, "volt<-w")
-    assert "b" in Library().effect(JOINT, MOTOR).fixed
-
-
-def test_a_value_at_its_bound_stops_no_fit_of_the_others(search):
-    """b >= 0 ties with K and tau: clipped after the step, it made the step lead down."""
-    joint = search.joints["w"]
-    free = tuple(replace(q, fixed=False) if q.name == "b" else q for q in joint.quantities)
-    told, tied = (
-        fitted(search, (effect, {"c": 0.35, "b": 0.0}), start=(-0.02, 0.02))
-        for effect in (joint, replace(joint, quantities=free))
-    )
-    shifts = [fit.hypothesis.shift for fit in (told, tied)]
-    assert np.abs(shifts[1] - [-0.02, 0.02]).max() > 1e-3
-    assert shifts[0] == pytest.approx([K - 1.0, TAU - 0.05], rel=0.1)
-
-
-def test_what_holds_the_plain_friction_as_a_case_is_compared_with_it(search):
-    effects = {e.name: e for e in search.candidates}
-    assert JOINT not in effects
-    loaded = fitted(search, (effects[LOADED], {"c": 0.31, "k": 0.2}), start=(0.09, 0.015))
-    better = varied(search, loaded)
-    assert search.score(better) > search.score(loaded)
-    assert better.hypothesis.names == (JOINT,)
-    assert better.hypothesis.values[0]["c"] == pytest.approx(FRICTION, rel=0.03)
-    assert better.hypothesis.shift[0] == pytest.approx(K - 1.0, rel=0.2)
-
-
 def test_a_friction_that_holds_a_joint_takes_the_place_of_one_that_does_not(search):
     """A motor that a knob turned to and fro: a time constant of 0.073 +- 0.0003 s, truly 0.070 s.
 
@@ -116,15 +84,6 @@ def test_a_friction_that_holds_a_joint_takes_the_place_of_one_that_does_not(sear
     assert held.hypothesis.names == (JOINT,)
     assert search.score(held) > search.score(fit) + 20
     assert held.hypothesis.values[0]["c"] == pytest.approx(FRICTION, rel=0.03)
-
-
-def test_what_a_swap_gives_gets_constants_of_its_own(search):
-    effects = {e.name: e for e in search.candidates}
-    fit = fitted(search, (effects["coulomb_friction:w"], {"c": 5.2}))
-    search.fits = {key: one for key, one in search.fits.items() if key[2] != (LOADED,)}
-    swapped(search, fit)
-    (loaded,) = (f for f in search.of_size(1) if f.hypothesis.names == (LOADED,))
-    assert loaded.hypothesis.values[0]["width"] != effects[LOADED].fixed["width"]
 
 
 def test_two_names_of_one_friction_are_compared_with_one(search):

@@ -1,13 +1,10 @@
 """What the scan hands on: faint values, other places; what is too brief to be claimed."""
 
-import math
-
 import numpy as np
 import pytest
 
 from grounded import Model, Param
 from grounded.diagnosis.hypotheses import scan
-from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.scan import between, elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
@@ -49,25 +46,6 @@ def test_fits_start_from_every_local_maximum_of_the_scan():
     assert found == ({"d": grid[7]}, {"d": grid[0]})
 
 
-def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
-    t = np.arange(60) * 0.05
-    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
-    data = prepare(pendulum, [trial, trial])
-    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
-    effect = Library().effect("delay:torque", pendulum, data.scales)
-    assert search.price(effect, {"d": 0.0005}) == math.inf
-    assert search.price(effect, {"d": 0.02}) < 20
-
-
-def test_a_rate_that_no_command_asks_for_is_no_limit():
-    t = np.arange(60) * 0.05
-    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
-    data = prepare(pendulum, [trial, trial])
-    effect = Library().effect("rate_limit:torque", pendulum, data.scales)
-    for r, beyond in ((0.9, []), (1.2, [effect.name])):
-        assert no_limits(data, Hypothesis().plus(effect, {"r": r})) == beyond
-
-
 def test_a_late_position_is_tried_with_a_filter_of_its_own():
     rng, trials = np.random.default_rng(3), []
     for _ in range(3):
@@ -93,27 +71,6 @@ def test_a_late_position_is_tried_with_a_filter_of_its_own():
     assert fit.hypothesis.values[0]["d"] == pytest.approx(0.05, abs=0.015)
 
 
-@pytest.mark.parametrize(
-    ("name", "sound", "absurd"),
-    [
-        ("input_fade:torque", {"k": -0.1}, {"k": -4.94}),
-        ("sensor_scale:theta", {"k": 0.5}, {"k": 1.81}),
-        ("input_gain:torque", {"g": 1.0}, {"g": 5.0}),
-        ("viscous_friction:omega", {"k": 5.0}, {"k": 1.04e136}),
-        ("coulomb_friction:omega", {"c": 5.0}, {"c": 81.0}),
-    ],
-)
-def test_absurd_sizes_are_not_claimed(name, sound, absurd):
-    t = np.arange(60) * 0.05
-    states = 2 * np.sin(0.05 * np.arange(61))[:, None] * [1.0, 1.0]
-    trial = Trial(states, np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
-    data = prepare(pendulum, [trial, trial])
-    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
-    effect = Library().effect(name, pendulum, data.scales)
-    assert search.price(effect, sound) < 20
-    assert search.price(effect, absurd) == math.inf
-
-
 def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
     model = Model(
         states={"w": "rad/s"},
@@ -124,22 +81,6 @@ def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
     names = [effect.name for effect in Library().candidates(model)]
     assert "rate_gain:w" not in names and "offset:w" in names
     assert "rate_gain:omega" in [effect.name for effect in Library().candidates(pendulum)]
-
-
-def test_the_dry_friction_of_one_motion_is_claimed_once():
-    """Beside a friction that grows with the load, the constant one passed for a second cause."""
-    t = np.arange(200) * 0.05
-    u = np.sin(t)[:, None]
-    states = pendulum.system.march(np.zeros((1, 2)), u[:, None], pendulum.values, 0.05)[:, 0]
-    trial = Trial(states, u, 0.05, ("theta", "omega"), ("torque",))
-    data = prepare(pendulum, [trial, trial])
-    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
-    loaded = Library().effect("load_friction:torque<-omega", pendulum, data.scales)
-    h = Hypothesis().plus(loaded, {"c": 0.1, "b": 0.0, "k": 0.1})
-    fit = search.refined([search.fresh(h)], 1)[0]
-    names = {look.effect.name for look in search.shortlist(fit, 100)}
-    assert "viscous_friction:omega" in names
-    assert not names & {"coulomb_friction:omega", "joint_friction:torque<-omega"}
 
 
 def test_a_scan_of_a_few_runs_at_a_time_is_that_of_all_at_once(monkeypatch):

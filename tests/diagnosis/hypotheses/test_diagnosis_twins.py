@@ -8,7 +8,7 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, moving, swap, twins
+from grounded.diagnosis.hypotheses.lookalike import moving, twins
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -101,25 +101,6 @@ def search():
         friction = next(f for f in found.of_size(1) if f.hypothesis.names == names[:1])
         found.calibrated(friction)
     return found
-
-
-def test_a_look_alike_is_fitted_in_its_place_to_the_end(search):
-    best = next(
-        f
-        for f in search.fits.values()
-        if f.hypothesis.names == ("viscous_friction:w",) and f.hypothesis.spread > 0
-    )
-    (best,) = search.refined([best], 25)
-    search.fits = {k: f for k, f in search.fits.items() if "input_gain:c" not in k[2]}
-    alike = lookalikes(search.predictor, best, search.candidates)
-    assert "input_gain:c" in [one.like for one in alike]
-    swap(search, replace(best, hypothesis=replace(best.hypothesis, spread=0.0)), alike)
-    assert not any("input_gain:c" in k[2] for k in search.fits)  # nothing was calibrated
-    swap(search, best, alike)
-    found = [f for k, f in search.fits.items() if k[2] == ("input_gain:c",)]
-    top = max(found, key=search.score)
-    assert top.hypothesis.values[0]["g"] == pytest.approx(-0.12, abs=0.01)
-    assert top.settled and abs(search.score(top) - search.score(best)) < 12
 
 
 @pytest.mark.slow

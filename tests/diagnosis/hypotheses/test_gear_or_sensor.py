@@ -5,10 +5,9 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import related
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
-from grounded.places import levelled, only_read
+from grounded.places import levelled
 
 STICK = Model(
     name="stick",
@@ -20,19 +19,6 @@ STICK = Model(
         "stick_rate": (p.k * a.valve - s.stick_rate) / 0.15,
     },
 )
-
-
-def names(model, *without):
-    return {effect.name for effect in Library().without(without).candidates(model)}
-
-
-def test_the_scale_of_a_sensor_is_offered_and_no_gain_that_equals_it():
-    assert only_read(STICK) == {"stick": "stick_rate"} and not only_read(pendulum)
-    assert "sensor_scale:stick" in names(STICK) and "rate_gain:stick" not in names(STICK)
-    assert "rate_gain:stick" in names(STICK, "sensor_scale")
-    assert "rate_gain:theta" in names(pendulum)  # gravity feels the true angle
-    gyro, encoder = (Library().effect(f"sensor_scale:{n}", STICK) for n in ("stick_rate", "stick"))
-    assert related(gyro, encoder)  # a gyro that reads too much is compared with it
 
 
 def test_a_wrong_zero_of_a_sensor_may_be_another_level():

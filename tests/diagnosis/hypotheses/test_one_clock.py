@@ -10,7 +10,6 @@ from grounded import Model
 from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.lookalike import one_clock
 from grounded.effects import Library
-from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
@@ -31,22 +30,6 @@ def found(model, *names, shown=None):
 def test_a_delay_of_every_command_is_one_of_every_sensor(model):
     (one,) = found(model, f"delay:{'+'.join(model.input_names)}")
     assert one.like == f"sensor_delay:{'+'.join(model.state_names)}"
-
-
-def test_a_part_that_hangs_on_nothing_else_is_late_by_itself():
-    (one,) = found(AXES, "delay:G")
-    assert one.like == "sensor_delay:y+vy"
-    (hidden,) = found(AXES, "delay:G", shown=("x", "vx", "y"))
-    assert hidden.states == ("y",)
-    (back,) = found(AXES, "sensor_delay:y", shown=("x", "vx", "y"))
-    assert back.like == "delay:G" and back.inputs == ("G",)
-
-
-def test_one_command_of_several_or_some_sensors_are_something_else():
-    assert not found(car, f"delay:{car.input_names[0]}")
-    assert not found(pendulum, "sensor_delay:omega") and not found(pendulum, "dead_zone:torque")
-    (one,) = found(pendulum, "sensor_delay:omega", shown=("omega",))  # the only one that there is
-    assert one.like == "delay:torque"
 
 
 def late(steps: int, seed: int = 0, count: int = 240) -> Trial:

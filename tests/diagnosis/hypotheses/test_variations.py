@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.hypotheses.orders import first, orders
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.variations import reordered, variations, varied
 from grounded.diagnosis.likelihood.data import prepare
@@ -55,23 +54,6 @@ def hypothesis(search, *parts):
     return h
 
 
-def test_only_orders_that_change_an_input_are_tried(search):
-    limit, fade = (LIMIT, {"r": RATE}), (WEAKER, {"k": FADE})
-    (other,) = orders(search.predictor, hypothesis(search, fade, limit))
-    assert other.names == (LIMIT, WEAKER)
-    assert other.values[0]["r"] == RATE
-    gain, late = ("input_gain:a", {"g": -0.2}), (DELAY, {"d": 0.04})
-    assert not orders(search.predictor, hypothesis(search, fade, gain, late))  # they commute
-    elsewhere = ("dead_zone:b", {"c": 0.1})
-    assert not orders(search.predictor, hypothesis(search, elsewhere, fade))
-    (early,) = first(search.predictor, hypothesis(search, fade, limit))
-    assert early.names == (LIMIT, WEAKER)
-    assert not first(search.predictor, hypothesis(search, fade, gain))
-    pull = ("coulomb_friction:v", {"c": 0.1})
-    (other,) = orders(search.predictor, hypothesis(search, fade, pull, limit))
-    assert other.names == (LIMIT, "coulomb_friction:v", WEAKER)
-
-
 def test_effects_found_in_the_wrong_order_are_put_right(search):
     wrong = hypothesis(search, (WEAKER, {"k": FADE}), (LIMIT, {"r": RATE}))
     (fit,) = search.refined([search.fresh(wrong)], 25)
@@ -86,14 +68,6 @@ def test_effects_found_in_the_wrong_order_are_put_right(search):
 def names_of(search, *parts):
     """Return the effects of all variations of a set, each in its order."""
     return [h.names for h in variations(search, hypothesis(search, *parts))]
-
-
-def test_one_effect_of_all_inputs_replaces_one_for_each(search):
-    delays = (DELAY, {"d": 0.04}), ("delay:b", {"d": 0.06})
-    h = hypothesis(search, delays[0], (WEAKER, {"k": FADE}), delays[1])
-    found = {one.names: one.values for one in variations(search, h)}
-    assert found[WEAKER, "delay:a+b"][1]["d"] == pytest.approx(0.05)
-    assert not names_of(search, delays[0], (WEAKER, {"k": FADE}))
 
 
 def test_a_set_is_rivalled_by_those_that_blame_fewer_inputs(search):

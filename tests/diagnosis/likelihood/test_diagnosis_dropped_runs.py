@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood import data as diagnosis_data
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ruler import Ruler, _uneven, repeated
+from grounded.diagnosis.validation.ruler import Ruler
 from small_tasks import DT, pushed_cart
 
 STEPS = 450  # three runs of 150 steps
@@ -36,15 +36,6 @@ def known(monkeypatch):
     assert predictor.data.time[0, :].tolist().count(0.0) == 3  # the beginnings of 0, 1 and 3
     assert len(predictor.data.valid) == 7
     return predictor, SimpleNamespace(hypothesis=Hypothesis(), states=predictor.data.y), found
-
-
-def test_the_runs_of_a_session_are_all_kept(known, monkeypatch):
-    predictor, _, trials = known
-    monkeypatch.setattr(diagnosis_data, "SESSION", 16)
-    data = prepare(predictor.data.model, trials)
-    assert data.skipped == 0 and len(data.valid) == 12
-    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 4.5 * 150 * data.model.n**2 * 4)
-    assert prepare(predictor.data.model, trials).skipped == 8  # too much memory for all
 
 
 def test_of_long_data_two_runs_of_one_candidate_are_kept_from_their_beginning(known):
@@ -73,33 +64,6 @@ def test_short_repeats_say_nothing_of_longer_trials_and_little_of_long_horizons(
         floor, unsure = ruler.scatter(fit, [[0, 1]])
         assert np.isfinite(floor[:-1]).all() and np.isfinite(floor[-1]).all() == whole
         assert unsure[0] < unsure[len(ruler.steps) - 1] < unsure[-1]
-
-
-def test_noise_that_differs_from_moment_to_moment_is_less_sure():
-    """A ball on a beam: 5.0, 3.3, 4.9 and 2.6 mm by four diagnoses, stated as sure to 8 %."""
-    rng = np.random.default_rng(0)
-    even = rng.standard_normal((80, 1)) ** 2
-    uneven = even * np.where(np.arange(80) % 8, 0.1, 10.0)[:, None]
-    same, other = (_uneven([(1.0, one, np.ones((1, 1)))])[0] for one in (even, uneven))
-    assert same == pytest.approx(1 / np.sqrt(2 * 80), rel=0.4) and other > 2 * same
-    assert _uneven([(0.25, even, np.ones((1, 1)))])[0] == pytest.approx(2 * same, rel=0.05)
-    assert _uneven([(1.0, even[:1], np.ones((1, 1)))])[0] == 0.0  # tells nothing
-
-
-def test_a_repeat_in_another_unit_is_no_noise(known):
-    predictor, _, trials = known
-    odd = replace(trials[2], states=57.3 * trials[2].states)
-    some = Predictor(prepare(predictor.data.model, [trials[0], odd, trials[2]]))
-    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
-    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1, 2]])[0], 0.0, atol=1e-9)
-    assert Ruler(some).scatter(fit, [[0, 1]]) is None
-
-
-def test_repeats_are_found_by_candidate_or_by_their_commands(known):
-    predictor, _, trials = known
-    assert repeated(trials, predictor.data, len(trials)) == [[0, 2], [1, 3]]
-    named = [replace(t, candidate="c0001" if k in (0, 1) else "") for k, t in enumerate(trials)]
-    assert [0, 1] in [group[:2] for group in repeated(named, predictor.data, len(trials))]
 
 
 def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):

@@ -1,6 +1,5 @@
 """Standard deviations from the information: right where it is regular, honest where it is not."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,17 +9,11 @@ from grounded import Model, Param, Trial, diagnose
 from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import (
-    between_samples,
-    between_steps,
     fisher,
     standard_deviations,
 )
 from grounded.diagnosis.validation.blame import moved_parameters
-from grounded.diagnosis.validation.limits import counted_once
-from grounded.effects import Library
-from grounded.models.car import model as car
 
 
 @pytest.mark.parametrize("seed", [0])
@@ -40,11 +33,6 @@ def test_what_the_data_do_not_determine_is_not_certain():
     found = fisher(G)
     assert found[2] == pytest.approx(0.2)
     assert found[0] > 1e3 and found[1] > 1e12
-
-
-def test_an_unknown_that_nothing_depends_on_is_unknown():
-    found = fisher(np.diag([4.0, 0.0]))
-    assert found[0] == pytest.approx(0.5) and found[1] > 1e100
 
 
 def test_correlated_innovations_hold_less_information():
@@ -98,34 +86,6 @@ def test_of_two_parameters_that_hide_each_other_one_stays():
     assert 2 in left and len(left) == 2
 
 
-def test_a_trial_that_differs_by_rounding_counts_once():
-    rng = np.random.default_rng(1)
-    x, u = np.cumsum(rng.standard_normal((31, 1)), axis=0), rng.standard_normal((30, 1))
-    x[7] = np.nan
-    names = {"state_names": ("x",), "input_names": ("u",)}
-
-    def counted(factor):
-        return counted_once([Trial(x, u, 0.1, **names), Trial(x * factor, u, 0.1, **names)])
-
-    for factor in (1.0, 1 + 1e-13):
-        kept, told = counted(factor)
-        assert len(kept) == 1 and [one.code for one in told] == ["model.copy"]
-    assert len(counted(1 + 1e-6)[0]) == 2
-
-
-def test_a_delay_between_two_steps_makes_a_lag_beside_it_uncertain():
-    """The mean of two steps spreads a signal by p (1 - p) dt^2, which the lag lacks then."""
-    one = Hypothesis()
-    for name, values in (("first_order_lag:throttle", 0.28), ("sensor_delay:v", 0.14)):
-        effect = Library().effect(name, car)
-        one = one.plus(effect, {effect.free[0].name: values})
-    both = between_steps(one, 0.1, 4)
-    assert both.tolist() == pytest.approx([0.24 * 0.01 / 0.56] * 2 + [0.0] * 2)
-    assert not between_steps(one, 0.07, 2).any()  # two whole steps
-    assert not between_steps(one.minus("first_order_lag:throttle"), 0.1, 1).any()
-    assert not between_steps(one.minus("sensor_delay:v"), 0.1, 1).any()
-
-
 def lagging(samples, late=0.05, grid=0.05, tau=0.1):
     """A motor's speed logged every `samples` [s], its commands sent every `grid` [s]."""
     rng, h = np.random.default_rng(0), 1e-3
@@ -164,18 +124,3 @@ def test_a_delay_is_no_surer_than_states_between_two_samples(samples):
     d, least = row.params["d"], max(log.interpolated_s, 1e-5)
     assert row.effect == "sensor_delay:w" and abs(d.value - 0.05) < 2 * d.std
     assert least <= d.std < least + 1e-3
-
-
-def test_states_between_two_samples_make_times_alone_uncertain():
-    one = Hypothesis()
-    for name, values in (("first_order_lag:throttle", 0.28), ("input_gain:steering", 0.1)):
-        effect = Library().effect(name, car)
-        one = one.plus(effect, {effect.free[0].name: values})
-    x = np.random.default_rng(0).standard_normal((40, car.n))
-    trial = Trial(x, x[1:, : car.m], 0.05, car.state_names, car.input_names)
-    data = replace(prepare(car, [trial]), interpolated_s=0.003)
-    assert between_samples(one, data, 2).tolist() == [0.003, 0.0]
-    assert not between_samples(one, prepare(car, [trial]), 2).any()
-    units = [p.unit for p in car.params.values() if p.spread]
-    whole = between_samples(one, data, 2 + len(units))
-    assert [bool(v) for v in whole[2:]] == [unit in ("s", "1/s") for unit in units]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from grounded.challenge.cases import make
-from grounded.diagnosis.hypotheses.explored import no_limits, price
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise, sensitivities, step_jacobian
@@ -100,17 +99,6 @@ def test_a_carried_heading_rate_is_limited_with_the_heading(cars):
     np.testing.assert_allclose(adopted, after, atol=1e-4)
 
 
-def test_without_the_effects_slope_it_would_be_another(cars):
-    _, data = cars
-    predictor = Predictor(data)
-    h = Hypothesis().plus(effect(data, "coupling:psi<-v"), {"k": 0.36})
-    names = data.model.state_names
-    with_it, alone = (step_jacobian(predictor, one, data.y) for one in (h, Hypothesis()))
-    change = (with_it - alone)[..., names.index("psi"), names.index("v")]
-    assert change.max() == pytest.approx(0.36 * data.dt, rel=0.01)
-    assert change.min() > 0.7 * 0.36 * data.dt  # less where v itself decays within a step
-
-
 def test_a_threshold_of_the_model_has_a_slope(cars):
     case, data = cars
     model = case.model
@@ -128,21 +116,3 @@ def test_a_threshold_of_the_model_has_a_slope(cars):
     track = np.tile(x[0], (*data.y.shape[:2], 1))
     d = linearise(Predictor(near), replace(drag, spread=1.0), track, whole=True)[1]
     assert d[..., 2 + stall].any()  # also beside effects
-
-
-def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):
-    _, data = cars
-    predictor, zone = Predictor(data), effect(data, "dead_zone:steering")
-    wide = price(predictor, zone, {"c": 0.3})
-    steady = np.full_like(data.commands, 0.6)
-    steady[..., 0] += 0.2 * data.commands[..., 0]
-    driven = Predictor(replace(data, commands=steady))
-    assert price(driven, zone, {"c": 0.1}) == pytest.approx(wide - np.log(zone.places))
-
-
-def test_a_limit_of_a_rate_is_not_below_the_rates_in_the_log(cars):
-    _, data = cars
-    limit, i = effect(data, "slew_limit:v"), data.model.state_names.index("v")
-    fastest = np.abs(np.diff(data.y[..., i], axis=0)).max() / data.dt
-    for r, refuted in ((0.0, [limit.name]), (1e-3, [limit.name]), (fastest, [])):
-        assert no_limits(data, Hypothesis().plus(limit, {"r": r})) == refuted

@@ -7,15 +7,13 @@ import pytest
 
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.validation.limits import knowable
 from grounded.diagnosis.validation.prediction_error import errors, horizon, normalised
 from grounded.effects import Library
 from grounded.filter import kernels
 from grounded.filter.augmented import Delayed, coloured
-from grounded.filter.kalman import Adjoint, LinearSystem, gains, innovations, smoother
+from grounded.filter.kalman import LinearSystem, gains, innovations, smoother
 from grounded.models.cart_pole import model as cart_pole
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -155,71 +153,6 @@ def test_smoother_gives_the_slope_of_the_likelihood(case):
         step = np.zeros(problem.N + n)
         step[at] = 1e-4
         assert slope == pytest.approx((loglik(step) - loglik(-step)) / 2e-4, rel=1e-4, abs=1e-3)
-
-
-def _trials(lengths, dt=0.02):
-    rng = np.random.default_rng(1)
-    found = []
-    for T in lengths:
-        states = np.cumsum(rng.standard_normal((T + 1, 2)), axis=0)
-        states[7, 1] = np.nan
-        names = pendulum.state_names, pendulum.input_names
-        found.append(Trial(states, rng.standard_normal((T, 1)), dt, *names))
-    return found
-
-
-@pytest.mark.parametrize("whole", [0, 2])
-def test_a_moved_log_crosses_the_runs_of_a_trial_but_not_its_end(whole):
-    data = prepare(pendulum, _trials([450, 230]))  # several runs a trial, of unequal length
-    effect = Library().effect("sensor_delay:omega", pendulum, data.scales)
-    h = Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt})
-    delays = delays_of(h, data)
-    assert delays.whole == (whole,) and delays.part == pytest.approx([0.25])
-    y, seen = delays.samples()
-    ends = np.cumsum(data.lengths + 1) - 1
-    valid = np.concatenate([np.ones_like(data.valid[:, :1]), data.valid], axis=1)
-    for b in range(len(data.valid)):
-        for s in range(y.shape[0]):
-            source = data.state_at[b, s] + whole
-            there = valid[b, s] and source <= ends[data.trial_of[b]]
-            there = there and np.isfinite(data.states[source, 1])
-            assert seen[s, b, 1] == there
-            if there:
-                assert y[s, b, 1] == data.states[source, 1]
-    assert (y[..., 0] == data.y[..., 0]).all() and (seen[..., 0] == data.seen[..., 0]).all()
-    # values of samples go with them, and come back
-    assert (delays.aligned(data.y)[..., 1] == y[..., 1])[seen[..., 1] > 0].all()
-    weight = np.random.default_rng(0).uniform(0.5, 2.0, data.seen[1:].shape)
-    log = np.zeros(2)
-    moved = delays.noise(NoiseModel(Structure(), log, log, log, log, weight, weight)).weight_v
-    back = delays.restored(Adjoint(moved, moved, moved, moved))
-    same = back.u[..., 1] == weight[..., 1]
-    lost = data.seen[1:, :, 1].sum() - seen[1:, :, 1].sum()
-    assert lost == whole * data.count
-    assert (~same)[data.valid.T > 0].sum() == whole * data.count
-    assert (back.u[..., 0] == weight[..., 0]).all()
-
-
-@pytest.mark.parametrize("whole", [2])
-def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_drifts(whole):
-    data = prepare(pendulum, _trials([250, 120]))
-    effect = Library().effect("sensor_delay:omega", pendulum, data.scales)
-    delays = delays_of(Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt}), data)
-    log, L, B = np.log([0.5, 1.0]), len(data.time), len(data.valid)
-    noise = NoiseModel(Structure(), log, log - 1, log, log)
-    white, weight = np.zeros((L, B, 2)), np.full((L, B, 2), 1e-9)
-    still = np.zeros((L + 1, B, 2))
-    found = delays.before(noise, None, still, white, weight)
-    t, exact = np.arange(whole + 1), 0.0
-    S = np.minimum(t[1:, None], t[1:]) * 1.0 + np.exp(-1) * (np.eye(whole) + 1)
-    for run in delays.first:
-        missed = (data.y[1 : whole + 1] - data.y[0])[:, run, 1]
-        exact -= 0.5 * (missed @ np.linalg.solve(S, missed) + np.linalg.slogdet(S)[1])
-    assert list(delays.first) == [0, 2] and found == pytest.approx(exact)
-    certain = np.ones((L, B, 2))  # samples that are far more likely than these
-    assert delays.before(noise, None, still, white, certain) == pytest.approx(
-        max(exact, -1.0 * whole * 2)
-    )
 
 
 def hanging(late, trials=4, steps=200, dt=0.025):

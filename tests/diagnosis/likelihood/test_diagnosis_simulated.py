@@ -9,7 +9,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.likelihood.simulated import NEAR, Slopes, simulated
+from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.diagnosis.validation.limits import limits
 from grounded.effects import Library
 from grounded.model import Model, Param
@@ -41,31 +41,6 @@ def data_of():
     names = MODEL.state_names, MODEL.input_names
     runs = [Trial(x + 0.01 * rng.standard_normal(x.shape), u + k, 0.02, *names) for k in range(2)]
     return prepare(MODEL, runs)
-
-
-def test_slopes_are_taken_anew_where_a_track_moved():
-    asked = []
-
-    def take(x, u):
-        asked.append(len(x))
-        return x[:, :, None] * np.ones((1, 1, 2)), u[:, None, :] * np.ones((1, 2, 1))
-
-    unit = np.ones(2), np.ones(1), np.ones(1)
-    x, u, p = np.zeros((5, 2)), np.ones((5, 1)), np.ones(1)
-    whole = Slopes(unit)
-    one, other = whole.following(), whole.following()
-    first = one.at(take, x, u, p, False)
-    assert asked == [5] and other.at(take, x, u, p, False) is first and asked == [5]
-    near = x + 0.5 * NEAR
-    assert one.at(take, near, u, p, False)[0] is first[0] and asked == [5]
-    near[3] += 1.0
-    found = one.at(take, near, u, p, False)
-    assert asked == [5, 1] and (found[0][3] == near[3][:, None]).all()
-    assert (found[0][[0, 1, 2, 4]] == 0).all() and (first[0] == 0).all()
-    one.at(take, near, u, p + 1.0, False)
-    assert asked == [5, 1, 5]
-    whole.at(take, x + 0.5 * NEAR, u, p, False)  # by itself it keeps what is the same, no more
-    assert asked == [5, 1, 5, 5]
 
 
 def test_columns_by_slopes_are_those_of_steps(monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
-from grounded.diagnosis.likelihood.groups import Signals, folds
+from grounded.diagnosis.likelihood.groups import folds
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 
@@ -55,13 +55,6 @@ def test_trials_of_one_motion_in_one_condition_are_a_group(trials, groups):
     assert [group.trials for group in prepare(MODEL, trials).groups] == groups
 
 
-def test_a_group_says_which_levels_set_it_apart():
-    found = prepare(MODEL, [trial(lambda t, a=a: a) for a in (0.2, 0.4, 0.2)]).groups
-    assert all(group.differs_in == ("u",) for group in found)
-    one = Signals(["u"], [np.ones((50, 1))], [""])
-    assert one.groups()[0].differs_in == ()
-
-
 @pytest.mark.parametrize(
     ("group", "steps", "levels", "expected"),
     [
@@ -77,13 +70,6 @@ def test_a_fold_is_a_group_or_part_of_one_that_holds_most(group, steps, levels, 
     assert folds(np.array(group), np.arange(len(group)), steps, own).tolist() == expected
 
 
-def test_many_groups_make_few_folds_and_pieces_of_a_log_stay_apart():
-    many = np.arange(100)
-    assert len(set(folds(many, many, np.ones(100), many < 0).tolist())) == 20
-    one = np.zeros(30, int)
-    assert len(set(folds(one, one, np.ones(30), one < 0).tolist())) == 30
-
-
 def test_a_coefficient_that_only_what_is_held_out_shows_predicts_nothing_there():
     data = prepare(MODEL, [trial(slow), trial(fast)])
     effect = Library().effect("viscous_friction:v", MODEL, data.scales)
@@ -93,15 +79,3 @@ def test_a_coefficient_that_only_what_is_held_out_shows_predicts_nothing_there()
     fit = Fitted(h, None, data.y, 0, 0, 0, gram, score, zero, zero, data.y, data.y)
     shifts = leave_one_out(fit, np.array([0, 1]))
     np.testing.assert_allclose(shifts[:, 0], [-0.7, 0.0], atol=1e-3)
-
-
-@pytest.mark.parametrize(("before", "told"), [(0.0, None), (0.6, None), (0.6, 0.1)])
-def test_the_input_before_a_log_is_what_its_first_samples_fit(before, told):
-    first = 0.6 if before else 0.0  # at rest under the first command, or hit by it as a step
-    x, states = np.array([0.0, first]), [np.array([0.0, first])]
-    for _ in range(60):
-        x = x + DT * np.array([x[1], (0.6 if len(states) > 6 or before else 0.0) - x[1]])
-        states.append(x)
-    start = None if told is None else np.array([told])
-    one = Trial(np.array(states), np.full((60, 1), 0.6), DT, ("x", "v"), ("u",), start_inputs=start)
-    assert prepare(MODEL, [one]).held[0, 0] == (before if told is None else told)

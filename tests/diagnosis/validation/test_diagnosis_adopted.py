@@ -15,19 +15,16 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import linearise
-from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.decide import Doubtful, one_group
 from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import Library, LossFamily, RateFamily, memory_of, memory_start, wrap
+from grounded.effects import Library, LossFamily, RateFamily, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.documents import write_document
-from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, read_diagnosis
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.next_step import to_adopt
 from small_tasks import DT, pushed_cart
 
@@ -83,27 +80,6 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
     assert 0.8 < found.gap.after < 1.2
     text = json.dumps(found.to_json())
     assert memory[0] not in text.replace("first_order_lag_u_tau", "")
-
-
-def test_an_effect_on_an_input_moves_what_an_adopted_lag_begins_with():
-    model, runs = lagging(0.0, trials=2)
-    held = (0.8, -0.5)
-    runs = [replace(r, start_inputs=np.array([u])) for r, u in zip(runs, held, strict=True)]
-    better, lifted, memory = adopted(model, runs)
-    data = prepare(better, lifted, hidden=memory)
-    predictor, gain = Predictor(data), Library().effect("input_gain:u", better, data.scales)
-    h, i = Hypothesis().plus(gain, {"g": -0.3}), better.state_names.index(memory[0])
-    begun = predictor.begun(h)
-    assert predictor.begun(Hypothesis()) is None and len(data.valid) == 4  # two of each trial
-    twin = wrap(gain, {"g": -0.3}, DT)
-    for k, run in enumerate(lifted):
-        (want,) = memory_start(twin, model, run)
-        first, later = np.flatnonzero(data.trial_of == k)
-        assert begun[first, i] + data.y[0, first, i] == pytest.approx(want) == 0.7 * held[k]
-        assert not begun[later].any()
-        _, _, r = linearise(predictor, h, data.y)
-        assert r[0, first, i, :2] == pytest.approx([-0.3 * held[k], held[k]])
-    assert not np.delete(begun, i, axis=1).any()
 
 
 def test_an_effect_of_every_run_is_not_unconfirmed_because_one_log_is_long():
@@ -279,41 +255,6 @@ def test_adopt_lists_the_values_of_adopted_effects_that_it_rewrites(tmp_path):
     assert "k of viscous_friction:omega 0.3000 -> 0.3500 1/s" in out
     out = " ".join(grounded("-C", tmp_path / "ws", "adopt", "--undo").out.split())
     assert "k of viscous_friction:omega 0.3500 -> 0.3000 1/s" in out
-
-
-def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
-    """What a smoother made of a state in one log says nothing of the others' measurements."""
-    assert grounded("init", tmp_path / "ws", "--example", "pendulum").code == 0
-    rng = np.random.default_rng(0)
-    for k in range(3):
-        states = rng.standard_normal((41, 2))
-        if k == 1:
-            states[10:20, 1] = np.nan
-        run = Trial(states, rng.standard_normal((40, 1)), 0.02, ("theta", "omega"), ("torque",))
-        meta = {"kind": "data"} | ({"estimated": "omega"} if k == 2 else {})
-        path = tmp_path / f"log{k}.mcap"
-        write_trial(path, run, meta)
-        done = grounded("-C", tmp_path / "ws", "ingest", "--data", path)
-        assert done.code == 0, done.err
-    workspace = Folder(tmp_path / "ws")
-    assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
-    used = chosen(workspace).trials
-    known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in used]
-    assert known == [[41, 41], [41, 31], [41, 0]]
-
-
-def test_a_trial_that_diverged_counts_up_to_there():
-    states = np.zeros((11, 2))
-    run = Trial(states, np.zeros((10, 1)), 0.1, ("a", "b"), ("u",))
-    assert run.known_steps == 10
-    states = states.copy()
-    states[7:, 1] = 1e200
-    assert replace(run, states=states).known_steps == 6
-    states[4:] = np.nan
-    assert replace(run, states=states).known_steps == 3
-    inputs = run.inputs.copy()
-    inputs[2] = np.nan
-    assert replace(run, inputs=inputs).known_steps == 2
 
 
 LATE, FILTER = 0.1, 0.07

@@ -1,16 +1,12 @@
 """A parameter that is known only together with one that is held says so."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation import claims as claims_of
-from grounded.diagnosis.validation.blame import Blame
 from grounded.effects import Library
 
 DT = 0.05
@@ -60,12 +56,6 @@ def test_a_gain_follows_the_mass_that_is_held(found):
     assert one.about == ("k",) and one.facts["rests"] == ("m",)
 
 
-def test_table_and_document_say_it(found):
-    again = type(found).from_json(found.to_json())
-    assert [one.given for one in again.identifiable] == [one.given for one in found.identifiable]
-    assert again.conditions["k"] == ("m",) and again == found
-
-
 def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
     model, trials = motor(2)
     known = {"m": Param(1.0, "kg"), "k": Param(1.0, "N/V", std=0.05)}
@@ -77,24 +67,3 @@ def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
     assert one.about == ("k",) and "k = 1.15" in said.verdict.causes[0]
     again = type(said).from_json(said.to_json())
     assert again.parameters["k"].stopped == "prior"
-
-
-@pytest.mark.parametrize(
-    ("off", "named"),
-    [
-        ({"m": 4.0, "k": 0.5, "b": 1.5}, {"m"}),  # the others by no more than trials do
-        ({"m": 1.9, "k": 0.5, "b": 1.5}, {"m", "k", "b"}),  # together, if none is alone
-    ],
-)
-def test_what_trials_disagree_about_by_as_much_is_not_off(off, named):
-    model, _ = motor(1)
-    sizes = [off[name] for name in model.param_names]
-    estimates = {
-        name: Estimate(param.value + 0.1 * size, 0.1, None, param.unit)
-        for (name, param), size in zip(model.params.items(), sizes, strict=True)
-    }
-    claims = SimpleNamespace(data=SimpleNamespace(model=model), parameters=lambda: estimates)
-    blamed = [Blame(i, 9.0) for i in range(3)]
-    kept = claims_of.Claims._known(claims, blamed)
-    assert {model.param_names[one.index] for one in kept} == named
-    assert claims_of.Claims._known(claims, []) == ()

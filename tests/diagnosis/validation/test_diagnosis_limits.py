@@ -7,9 +7,7 @@ import pytest
 from test_diagnosis_unmeasured import swings
 
 from grounded import GroundedError, Model, Param, Trial
-from grounded.accounts.finding import Finding
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
     joints_without_input,
@@ -17,7 +15,6 @@ from grounded.diagnosis.validation.limits import (
     limits,
     still_states,
     switches,
-    with_measured_filters,
 )
 from grounded.effects import Library
 from grounded.effects.wrap import wrap
@@ -81,57 +78,6 @@ def test_how_much_a_switch_is_on_is_not_doubted():
     assert not switches(prepare(pendulum, swings()))
 
 
-ARM = Model(
-    name="arm",
-    states={
-        **dict.fromkeys(("q1", "q2", "q3"), "rad"),
-        **dict.fromkeys(("w1", "w2", "w3"), "rad/s"),
-    },
-    inputs={"u1": "N m", "u2": "N m", "u3": "N m"},
-    derivative=lambda s, a, p: {
-        **{f"q{k}": s[f"w{k}"] for k in (1, 2, 3)},
-        **{f"w{k}": 4 * a[f"u{k}"] - 2 * s[f"w{k}"] for k in (1, 2, 3)},
-    },
-)
-
-
-def two_of_three(late=3, trials=2, steps=120):
-    """An arm of which the first joint stands still; the others' commands arrive some steps late."""
-    rng, found = np.random.default_rng(4), []
-    for _ in range(trials):
-        u = np.repeat(rng.uniform(-1, 1, (steps // 8, 3)), 8, axis=0) * [0.0, 1.0, 1.0]
-        states = [np.zeros(6)]
-        for k in range(steps):
-            sent = u[max(k - late, 0)][None] * (k >= late)
-            states.append(ARM.system.step(states[-1][None], sent, ARM.values, 0.02)[0])
-        noise = np.array([0, 1e-4, 1e-4, 0, 1e-3, 1e-3]) * rng.standard_normal((steps + 1, 6))
-        found.append(Trial(np.array(states) + noise, u, 0.02, ARM.state_names, ARM.input_names))
-    return found
-
-
-def test_a_joint_effect_is_offered_of_the_inputs_that_move():
-    data = prepare(ARM, two_of_three())
-    all_of_them = Library().candidates(ARM, data.scales)
-    names = [e.name for e in knowable(data, all_of_them)]
-    families = ("delay", "first_order_lag", "input_gain", "dead_zone", "rate_limit")
-    assert {f"{family}:u2+u3" for family in families} <= {*names}
-    assert len(names) == len({*names}) and not any("u1" in name for name in names)
-    (late,) = (e for e in all_of_them if e.name == "delay:u1+u2+u3")
-    assert Library().effect("delay:u2+u3", ARM, data.scales).site.targets == ("u2", "u3")
-    assert [e.name for e in knowable(data, [late], [late.name])] == [late.name]  # it is adopted
-    with pytest.raises(GroundedError, match="delay:"):
-        Library().effect("delay:u3+u2", ARM)
-    with pytest.raises(GroundedError, match="delay:"):
-        Library().effect("delay:u2+u4", ARM)
-
-
-def test_all_that_stands_still_takes_one_sentence():
-    (said,) = limits(prepare(ARM, two_of_three())).findings
-    assert said.about == ("u1", "q1", "w1")
-    (said,) = limits(prepare(pendulum, list(stuck(swings(), 0, 1)))).findings
-    assert said.about == ("theta", "omega")
-
-
 def test_a_model_that_is_no_number_at_a_measured_state_says_where():
     tank = Model(
         states={"h": "m"},
@@ -146,14 +92,6 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
     with pytest.raises(GroundedError, match=r"trial t0001, t = 1\.7 s, h = -0\.004") as raised:
         diagnose(tank, trials)
     assert "np.maximum" in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("dt", "expected"), [(0.02, [0.05, 0.1, 0.3]), (0.1, [0.1, 0.3]), (2.0, [2.0, 4.0, 12.0])]
-)
-def test_coloured_noise_is_offered_however_slow_the_system_is(dt, expected):
-    trials = [replace(trial, dt=dt) for trial in swings(2, 40)]
-    assert HypothesisSearch(prepare(pendulum, trials), ()).taus == pytest.approx(expected)
 
 
 def hanging(s, a, p):
@@ -185,17 +123,3 @@ def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(cl
         found = joints_without_input(model, claimed)
         assert bool(found) == said
         assert all(name in one.about for one in found for name in claimed if "input" not in name)
-
-
-def test_a_filter_that_sensors_show_alone_is_held():
-    tau = Param(0.05, "s", 0.0, 0.6, 0.025)
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "m/s^2"},
-        params={"sensor_lag_v_tau": tau, "k": Param(1.0, "1", 0.5, 2.0)},
-        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u},
-    )
-    seen = with_measured_filters(model, [Finding("v", "is filtered", "lag", 0.05)])
-    assert seen.params["sensor_lag_v_tau"].spread == 0 < tau.spread
-    assert seen.params["sensor_lag_v_tau"].value == 0.05 and seen.params["k"].spread > 0
-    assert with_measured_filters(model, [Finding("x", "is filtered", "lag", 0.05)]) is model

@@ -8,7 +8,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
     without_others,
 )
-from grounded.effects import Library, wrap
+from grounded.effects import Library
 
 DT, STEPS = 0.05, 120
 WAVE, OMEGA = 0.4, 2.0
@@ -52,20 +52,3 @@ def test_numbers_of_an_adopted_wave_are_held_where_one_motion_is_repeated(speeds
     data = prepare(model, trials, np.zeros(1))
     held = without_others(data, ["periodic:v"], Library())
     assert [held.params[name].spread > 0 for name in ("k", *names)] == [True] + [free] * 3
-
-
-def test_an_adopted_delay_of_two_sensors_as_one_is_not_asked_for_again():
-    model = Model(
-        states={"x": "m", "v": "m/s", "beam": "rad"},
-        inputs={"u": "rad"},
-        params={"tau": Param(0.1, "s", std=0.1)},
-        derivative=lambda s, a, p: {"x": s.v, "v": s.beam, "beam": (a.u - s.beam) / p.tau},
-        name="ball",
-    )
-    late = wrap(Library().effect("sensor_delay:x+v", model), {"d": 0.06}, DT)
-    t = np.arange(STEPS + 1) * DT
-    y, u = np.full((STEPS + 1, late.n), np.nan), np.sin(t[:-1, None])
-    y[:, :3] = np.sin(t[:, None] + np.arange(3))
-    trials = [Trial(y, u + i, DT, late.state_names, ("u",)) for i in range(2)]
-    data = prepare(late, trials, np.zeros(1))
-    assert without_others(data, ["sensor_delay:x+v"], Library()) is data.model

@@ -60,16 +60,6 @@ def test_noise_with_its_outliers_comes_to_its_variance():
     assert r < 0.6 * (v**2).mean() and noise.plain.weight_v == 1.0
 
 
-def test_a_copy_counts_once():
-    model, trials = pushed_cart(trials=1)
-    same = [replace(t, id=f"t{k}") for k, t in enumerate(repeats_of(trials[0], 3))]
-    alone, beside = diagnose(model, same), diagnose(model, [*same, replace(same[0], id="t9")])
-    assert (beside.trials, beside.kind) == (3, alone.kind) and not beside.leftover
-    assert beside.prediction_error[-1].noise_floor == alone.prediction_error[-1].noise_floor
-    (one,) = [one for one in beside.findings if one.code == "model.copy"]
-    assert one.about == ("t9",) and one.facts["first"] == "t0"
-
-
 def test_a_trial_beside_itself_confirms_nothing():
     model, trials = pushed_cart(friction=0.4, trials=1)
     few = DiagnosisOptions(library=Library((Library().family("coulomb_friction"),)))

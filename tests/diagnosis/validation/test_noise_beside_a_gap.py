@@ -53,25 +53,3 @@ def test_the_smaller_bound_is_the_noise_of_a_state_with_a_gap(monkeypatch, left)
     assert sure.tolist() == ([False, True] if left else [False])
     row = RulerRow(1.0, False, found.units, floor_from=source)
     assert row.floor_bound is bool(left) and not row.floor_at_most
-
-
-@pytest.mark.parametrize(
-    ("differences", "fitted", "noise"),
-    [
-        (0.018, 0.019, 0.018),  # two repeats may scatter less than the sensor does
-        (0.018, 0.011, 0.016),  # a motion that bends within few samples is no noise
-        (0.011, 0.018, 0.016),  # nor is what the model misses within a step
-        (0.040, 0.040, 0.026),  # no noise is above what predictions reach
-    ],
-)
-def test_no_reading_is_predicted_better_than_its_sensor_is(monkeypatch, differences, fitted, noise):
-    monkeypatch.setattr(measured, "repeated", lambda *_: [[0, 1]])
-    found = measuring(())
-    for run in found.trials:
-        run.states, run.noise = np.zeros((40, 2)), lambda: np.array([differences, 0.004])
-    plain = SimpleNamespace(measurement=lambda steps: np.full((steps + 1, 1, 2), fitted**2))
-    found.best = SimpleNamespace(noise=SimpleNamespace(plain=plain))
-    found.sensors = lambda: Measured.sensors(found)
-    floor, source = Measured.noise_floor(found)
-    assert floor[1] == pytest.approx([noise, 0.0168]) and source == "repeats"
-    assert np.isnan(floor[2]).all()  # of whole trials, repeats alone tell it

@@ -1,6 +1,5 @@
 """A drone's log as mavros writes it: body velocities in the odometry, an attitude as command."""
 
-import numpy as np
 import pytest
 
 import ros_bags
@@ -40,23 +39,6 @@ def test_a_drone_that_turns_has_its_yaw_as_a_state(tmp_path):
     assert by["yaw_command"].path == f"{COMMAND}.orientation.@rpy.yaw"
     model = model_in(load_module(tmp_path / "w", "model.py"))
     assert model.angles == ("yaw",)
-
-
-def test_the_skeleton_predicts_its_own_drone(tmp_path):
-    """The skeleton's equations are those of the bag: right signs, at a yaw of 80 degrees."""
-    bag = ros_bags.drone_bag(tmp_path / "bag")
-    begin(tmp_path / "w", bag)
-    model = model_in(load_module(tmp_path / "w", "model.py"))
-    names = [f"{ODOMETRY}.pose.pose.position.{a}" for a in "xyz"]
-    names += [f"{ODOMETRY}.@world_velocity.{a}" for a in "xyz"]
-    names += [f"{ODOMETRY}.pose.pose.orientation.@rpy.{a}" for a in ("roll", "pitch")]
-    names += [f"{COMMAND}.orientation.@rpy.{a}" for a in ("roll", "pitch")]
-    names += [f"{COMMAND}.thrust"]
-    read = read_signals((next(bag.glob("*.db3")),), {n: SignalSpec(n) for n in names})
-    columns = np.column_stack([read[n].values for n in names])
-    states, inputs = columns[:, :8], columns[:, 8:]
-    after = model.system.step(states[:-1], inputs[:-1], model.values, 0.02)
-    assert np.abs(after - states[1:]).max(axis=0) == pytest.approx(np.zeros(8), abs=0.02)
 
 
 def test_the_velocity_in_the_world_needs_an_odometry(tmp_path):

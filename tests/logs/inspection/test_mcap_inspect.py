@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import io
-import json
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from facts import holding
 from grounded.errors import GroundedError
@@ -123,50 +119,8 @@ def test_twins() -> None:
     assert twins.opposite and twins.correlation < -0.999
 
 
-@pytest.mark.parametrize("step", [0.00153, 0.0044, 1e-7])
-def test_a_sensor_that_comes_in_steps_has_no_smaller_deviation(tmp_path: Path, step: float) -> None:
-    t = np.arange(1000) * 0.02
-    rng = np.random.default_rng(0)
-    true = 0.05 * np.sin(0.8 * t) * (t > 3)
-    beam = np.round(step * np.round(true / step), 7 if step < 1e-6 else 5)
-    x = 0.1 * np.cos(t) + rng.normal(0, 1e-3, len(t))
-    columns = np.column_stack([t, x, beam, true])
-    np.savetxt(tmp_path / "h.csv", columns, "%.7f", ",", header="t,x,beam,volt", comments="")
-    report = inspect_log(tmp_path / "h.csv")
-    states, inputs = by_name(report, ["x", "v", "beam"], ["volt"])
-    measured = tomllib.loads(mapping_toml(states, inputs))["estimate"]["measured"]
-    assert 0.8e-3 < measured["x"] < 1.3e-3
-    low, high = (0.95 * step / np.sqrt(12), step) if step > 1e-6 else (1e-6, 1e-4)
-    assert low < measured["beam"] < high
-
-
 @needs_data
 @pytest.mark.parametrize(("bag", "named"), [("yx3bag", "0.930 s"), ("flybag", "/cf_command")])
 def test_the_crazyflie_bags_defects_are_found(bag: str, named: str) -> None:
     report = inspect_log(data("crazyflie_p4_ros2_mcap", f"{bag}.mcap"))
     assert any(named in remark for remark in report.remarks), report.remarks
-
-
-@pytest.mark.parametrize(
-    ("others", "found"),
-    [
-        ([], "motor_voltage"),
-        (["motor_voltage_rate"], "motor_voltage"),
-        (["pump_voltage"], ""),
-        (["voltage"], "voltage"),
-    ],
-)
-def test_a_command_that_has_an_input_s_word_in_its_name_is_that_input(tmp_path, others, found):
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("/cart/command", "json", 0)
-    for i in range(50):
-        known = {"steering_angle": np.sin(i), "motor_voltage": i % 7}
-        body = json.dumps(known | dict.fromkeys(others, i % 5)).encode()
-        writer.add_message(channel, i * 10**8, body, i * 10**8)
-    writer.finish()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(stream.getvalue())
-    _, (_, voltage) = by_name(inspect_log(path), [], ["steering", "voltage"])
-    assert voltage.path.rpartition(".")[2] == found and voltage.sure == bool(found)

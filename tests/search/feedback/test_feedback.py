@@ -12,11 +12,11 @@ from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.making import About, Maker, begun_at
+from grounded.search.making import About, Maker
 from grounded.search.planner import Planner, model_fingerprint
 from grounded.search.standing import standing
 from grounded.search.step.step_size import SearchOptions
-from grounded.trial import Trial, mean_trial
+from grounded.trial import Trial
 from grounded.utility import Reward
 from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.off_target import began_elsewhere
@@ -66,27 +66,6 @@ def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
     _, plain = first_policy(planner.plan)
     _, followed = planner.first_policy()
     assert followed.cost < plain.cost - 0.2
-
-
-def test_the_noise_of_a_first_sample_is_no_motion():
-    task = cart_task()
-    rows = [begun(task, noise=0.02, seed=seed) for seed in range(3)]
-    assert np.abs(np.mean([run.states[0] for run in rows], axis=0) - task.start).max() > 0
-    found = begun_at(task, rows, begun(task).states)
-    assert np.allclose(found.states[0], task.start)
-    assert np.array_equal(found.states[1:], mean_trial(rows).states[1:])
-    away = begun_at(task, [begun(task, off=0.1, noise=0.02)], begun(task).states).states[0]
-    assert away[0] > 0.05  # where it really began elsewhere, that is kept
-
-
-def test_a_run_begins_where_the_samples_before_it_tell():
-    task = cart_task()
-    run = begun(task, off=0.1, noise=0.02)
-    told = replace(run, start_states={"x": 0.12})
-    assert told.began[0] == 0.12 and told.began[1] == run.states[0, 1]
-    assert begun_at(task, [told], begun(task).states).states[0, 0] == pytest.approx(0.12)
-    near = begun_at(task, [replace(run, start_states={"x": 0.001})], begun(task).states)
-    assert near.states[0, 0] == task.start[0]
 
 
 def test_the_noise_of_a_filtered_speed_is_no_start_elsewhere():

@@ -7,8 +7,7 @@ import pytest
 
 from grounded.policy import z_difference
 from grounded.rollout import for_late_samples, simulate
-from grounded.search.candidate import Tried
-from grounded.search.feedback.sample_age import different, planned_age, run_ages, sample_age
+from grounded.search.feedback.sample_age import sample_age
 from grounded.search.improve import propose
 from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial
@@ -48,25 +47,6 @@ def test_the_age_is_found_from_commands_and_states(age, seed):
     assert found == pytest.approx(age, abs=0.003 if seed is None else 0.005)
 
 
-@pytest.mark.parametrize("share", [0.4, 0.9])
-def test_the_age_is_found_in_a_run_that_was_stopped(share):
-    task = rover_task()
-    made = first(task)
-    stopped = driven(task, made, 0.04).until(round(share * task.horizon))
-    assert sample_age(task, made, [stopped]) == pytest.approx(0.04, abs=0.004)
-    padded = replace(stopped, states=stopped.whole(task.horizon).states)
-    padded = replace(padded, inputs=stopped.whole(task.horizon).inputs)
-    assert sample_age(task, made, [padded]) == sample_age(task, made, [stopped])
-    assert sample_age(task, made, [stopped.until(2)]) == 0.0
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_fresh_samples_have_no_age_though_logs_are_noisy(seed):
-    task = rover_task()
-    made = first(task)
-    assert sample_age(task, made, [driven(task, made, 0.0, seed)]) == 0.0
-
-
 def test_a_model_that_replays_a_trial_replays_it_with_its_policy_on_old_samples():
     """The policy on fresh samples ran elsewhere in the grounded model than on the robot."""
     task = rover_task()
@@ -85,20 +65,3 @@ def test_a_policy_for_late_samples_runs_as_planned():
     again = simulate(late, for_late_samples(planned, late))
     np.testing.assert_allclose(again.states, fresh.states, atol=1e-6)
     assert np.abs(simulate(late, planned).states - fresh.states).max() > 0.01
-
-
-def test_a_plan_is_for_the_mean_age_if_it_differs_from_run_to_run():
-    task = rover_task()
-    made = first(task)
-
-    def tried(*ages):
-        trials = tuple(driven(task, made, age) for age in ages)
-        return Tried(made, trials, tuple(task.utility(one) for one in trials), accepted=True)
-
-    steady, other = tried(0.014, 0.016), tried(0.002)
-    alone = sample_age(task, made, steady.trials)
-    assert planned_age(task, steady, run_ages(task, [steady])) == alone
-    ages = run_ages(task, [steady, other])
-    assert ages == pytest.approx([0.014, 0.016, 0.002], abs=0.003)
-    assert planned_age(task, steady, ages) == pytest.approx(np.mean(ages))
-    assert not different(task, 0.010, 0.0145) and different(task, 0.010, 0.016)  # dt is 50 ms

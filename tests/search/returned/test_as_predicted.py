@@ -45,22 +45,3 @@ def test_a_column_farther_from_the_prediction_is_told_whatever_its_size(made, by
     if abs(by) > 100 or abs(by) < 0.01 or by == -1:
         names, factor = said(made, wrong)
         assert names == ("v",) and factor * by == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("factor", [0.8, 1.1])
-def test_a_factor_of_the_commands_is_told_where_it_explains_all_of_a_small_difference(made, factor):
-    task, own, _ = made
-    exact = own.predicted_run
-    wrong = multiplied(exact, ["force"], factor)
-    names, by = units(task, wrong, own, follows(own.policy, wrong, 1))
-    assert names == ("force",) and by == pytest.approx(1 / factor, rel=0.01)
-
-
-def test_a_real_motion_opposite_to_a_small_predicted_one_is_no_wrong_sign(made):
-    """Only where the model's motion also contradicts the sign it is one."""
-    *_, run = made
-    x = np.array(run.states)
-    x[:, 1] *= -1
-    x[:, 0] = x[0, 0] + np.cumsum(np.r_[0.0, x[:-1, 1]]) * run.dt  # it really went the other way
-    other = replace(run, states=x, inputs=-run.inputs)
-    assert said(made, other) == ((), 1.0)

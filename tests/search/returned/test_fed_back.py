@@ -1,7 +1,6 @@
 """Units that all columns of a run share, shown by the commands that the policy sent."""
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,18 +62,6 @@ def test_lengths_in_another_unit_are_found_though_all_columns_agree(units, named
     assert gr.learn(
         TASK, lambda c: robot(c, units), gr.SearchOptions(max_trials=1), check=False
     ).trials
-
-
-@pytest.mark.parametrize(("noise", "late"), [(0.0, 0), (0.01, 0), (0.0, 2), (0.05, 1)])
-def test_noise_and_late_samples_are_no_other_unit(noise, late):
-    candidate = gr.Search(TASK).ask()
-    assert found(TASK, candidate, robot(candidate, 1.0, noise, late)) == ((), 1.0)
-
-
-def test_an_open_loop_run_shows_no_unit():
-    task = replace(TASK, feedback=False)
-    candidate = gr.Search(task).ask()
-    assert found(task, candidate, robot(candidate, 1e3)) == ((), 1.0)
 
 
 def test_tell_warns_of_the_first_trial_only_and_keeps_it():

@@ -52,19 +52,6 @@ def test_a_trial_that_is_not_its_candidate_s_run(change, facts):
     assert len(search.trials) == 1
 
 
-def test_a_later_trial_is_checked_too_and_the_earlier_ones_are_kept():
-    def turned(candidate):
-        trial = run(candidate)
-        return trial if candidate.id == "c0001" else scaled(trial, 1, -1)
-
-    with pytest.raises(gr.TrialRefused, match=holding("c0002", "turn")) as refused:
-        gr.learn(TASK, turned, gr.SearchOptions(max_trials=3))
-    search = refused.value.search
-    assert len(search.trials) == 1 and search.ask().id == "c0002"
-    search.tell(run(search.ask()))
-    assert len(search.trials) == 2
-
-
 def test_runs_of_their_candidates_under_noise_are_no_reason_to_warn():
     rng, search = np.random.default_rng(0), gr.Search(TASK)
     with warnings.catch_warnings():
@@ -81,20 +68,6 @@ def test_a_crash_is_reported():
         search.tell(run(search.ask()).until(30))
     assert holds(search.standing.sentence, "c0001", "crashed")
     assert search.standing.history[0].verdict() == "crashed"
-
-
-def test_a_trial_of_another_order_or_interval_says_what_differs():
-    search = gr.Search(TASK)
-    trial = run(search.ask())
-    names = trial.state_names
-    for change, facts in (
-        ({"state_names": names[::-1]}, (*names, "order")),
-        ({"state_names": ("a", *names[1:])}, ("a", "states")),
-        ({"dt": 0.1}, ("dt", "0.1 s", "0.05 s")),
-    ):
-        with pytest.raises(gr.GroundedError, match=holding(*facts)) as refused:
-            search.tell(replace(trial, **change))
-        assert "(" not in str(refused.value)
 
 
 def test_adopted_values_must_lie_within_the_bounds():

@@ -8,13 +8,13 @@ import pytest
 from grounded.model import Model
 from grounded.plant import Plant
 from grounded.search.ask_tell import Search, learn
-from grounded.search.candidate import BY_STEP, Tried
+from grounded.search.candidate import BY_STEP
 from grounded.search.feedback.margin import worse_costs
 from grounded.search.planner import Planner, predicted
 from grounded.search.step.by_step import PRICES, Told, worth
 from grounded.search.step.corrected import Corrected, runs
 from grounded.search.step.mispredictions import Seen, seen
-from grounded.search.step.step_size import SearchOptions, Step
+from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive
 
@@ -124,38 +124,3 @@ def assert_same_runs(found, expected):
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one.states, other.states, atol=1e-9)
         np.testing.assert_allclose(one.inputs, other.inputs, atol=1e-8)
-
-
-def losing(search: Search, count: int, **changes: object) -> list[Tried]:
-    """Return the history with steps from the best one that lost, their runs a little off."""
-    now = search.standing
-    best = now.incumbent
-    found = list(now.history)
-    for k in range(count):
-        bump = 0.1 * np.sin(np.linspace(0, 3 + 3 * k, TASK.horizon))[:, None]
-        policy = replace(
-            best.candidate.policy, feedforward=best.candidate.policy.feedforward + bump
-        )
-        fields = {"id": f"c{90 + k:04d}", "policy": policy, "base": best.candidate.id}
-        made = replace(best.candidate, **(fields | {"way": "", "slopes": ""} | changes))
-        trial = drive(TASK, Plant(RAILS), made)
-        found.append(Tried(made, (trial,), (-100.0 - k,), False))
-    return found
-
-
-@pytest.mark.parametrize(
-    ("lost", "options", "error", "step"),
-    [
-        (1, SearchOptions(), np.nan, None),
-        (2, SearchOptions(), np.nan, Step(10.0)),
-        (2, SearchOptions(), 0.0, Step(10.0)),
-        (2, SearchOptions(), 0.1, None),  # where trials scatter
-        (2, SearchOptions(slopes_by_step=False), np.nan, None),
-        (2, SearchOptions(step="full"), np.nan, None),
-    ],
-)
-def test_they_wait_until_two_steps_have_lost(grounded, lost, options, error, step):
-    search, best, _ = grounded
-    incumbent = replace(best, deviation=error)
-    model = best.candidate.model
-    assert options.due(losing(search, lost), incumbent, model, BY_STEP) == step

@@ -10,7 +10,7 @@ from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
 from grounded.search.planner import Planner, predicted
-from grounded.search.step.mispredictions import apart, believed, shared
+from grounded.search.step.mispredictions import believed, shared
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task
 
@@ -85,22 +85,6 @@ def test_a_law_is_found_and_noise_gives_none():
     assert not none.any()
 
 
-def test_without_another_whole_trial_there_is_nothing_to_learn_from():
-    task = cart_task()
-    found = searched(task, Plant(other(task.model, 1.3)), 1)
-    made = believed(Planner(task, task), found.best, (found.best,), found.problem)
-    assert (made.corrected, made.missed) == (None, 0.0)
-
-
-def test_runs_are_apart_by_the_cost_of_their_difference(found):
-    problem, own = found.problem, found.own
-    run = (own.states, own.inputs)
-    assert apart(problem, run, run) == 0.0
-    moved = (own.states, own.inputs + 0.1)
-    weight = problem.horizon * problem.input_weight.sum() + problem.change_weight.sum()
-    assert apart(problem, moved, run) == pytest.approx(0.01 * weight)
-
-
 def test_slopes_that_kept_their_promise_are_not_corrected():
     """Crude slopes that predicted the last gain are kept (else the aircraft lost 14 of -1826)."""
     task = cart_task()
@@ -123,21 +107,3 @@ def lost(found, utility=-100.0, **changes):
     fields = {"base": best.candidate.id, "slopes": "corrected", "model": best.candidate.model}
     made = replace(first.candidate, predicted_gain=1.0, **fields)
     return replace(first, candidate=made, utilities=(utility,), accepted=False, **changes)
-
-
-def test_costs_of_policies_together_are_those_of_single_disturbed_runs(found):
-    planner, history = Planner(found.task, found.task), found.search.standing.history
-    made = believed(planner, found.best, history, found.problem).alternatives
-    own = found.best.candidate.policy
-    policies = [own, replace(own, gain=0.8 * own.gain), history[0].candidate.policy]
-    assert made and any(one.weight for one in made)
-    for one in made:
-        alone = []
-        for policy in policies:
-            costs = []
-            for y in one.off:
-                bias = one.problem.bias.copy()
-                bias[:, : y.shape[1]] += y
-                costs.append(-predicted(replace(one.problem, bias=bias), policy).utility)
-            alone.append(one.weight * np.mean(costs))
-        np.testing.assert_allclose(one.costs(policies), alone, rtol=1e-9)

@@ -14,10 +14,6 @@ def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
     assert after_success(Step(LEAST), 100.0, 100.0) == Step(LEAST)
 
 
-def test_a_shortened_step_earns_no_wider_one():
-    assert after_success(Step(1.0, 0.5), 100.0, 100.0) == Step(1.0)
-
-
 def test_failures_damp_first_and_halve_then():
     step, seen = Step(0.1), []
     while step is not None:

@@ -10,7 +10,6 @@ from cli import grounded
 from grounded.findings import Finding
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.candidates.first_plan import Plan, in_another_unit
 from grounded_trials.workspace.folder import Folder
 from workspaces import blank, edit
@@ -100,46 +99,6 @@ def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(l
     assert again.candidate.id == first.candidate.id and again.then.verb == "export"
 
 
-DRIFT = '{name = "offset:v", c = 0.1214}'
-
-
-@pytest.mark.parametrize(
-    ("effects", "shown"),
-    [
-        ("", 0.0),
-        (DRIFT, -0.1214 / 7.0),
-        (f'{DRIFT}, {{name = "coulomb_friction:v", c = 0.04, width = 0.001}}', -0.1214 / 7.0),
-    ],
-)
-def test_a_free_state_rests_where_the_adopted_effects_let_it(tmp_path, effects, shown):
-    w = blank(tmp_path / "w", BALL, effects=effects)
-    found = rest_value(Folder(w.folder), {"x": 0.15}, "th")
-    assert found == pytest.approx(shown, abs=2e-4)
-
-
-def test_what_held_a_robot_as_its_log_began_is_written(tmp_path):
-    (tmp_path / "lifted.py").write_text(LIFTED)
-    t = np.arange(0, 10, 0.02)
-    thrust = np.where(t < 2, 0.4905, 0.4905 + 0.2 * np.sin(2 * t))
-    v = np.where(t < 2, 0, 0.5 * np.sin(t))
-
-    def start(h, v, thrust):
-        rows = np.column_stack([t, h, v, 0 * t, thrust, np.where(t < 2, 0, np.sin(t))])
-        names = "t,h,v,q,thrust,turn"
-        np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=names, comments="")
-        folder = tmp_path / f"w{len(list(tmp_path.iterdir()))}"
-        begin(folder, tmp_path / "log.csv", model=tmp_path / "lifted.py")
-        return tomllib.loads((folder / "grounded.toml").read_text())["task"]["start"]
-
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(len(t))
-    rising = np.cumsum(v) * 0.02
-    assert start(rising + noise, v + noise, thrust) == {"thrust": 0.4905, "turn": 0.0}
-    assert start(5 + rising, v, thrust) == {"h": 5.0, "thrust": 0.4905, "turn": 0.0}
-    assert start(rising, v + 0.4, thrust) == {}  # it flies on
-    assert start(rising, v, thrust + 0.2 * np.sin(t)) == {}
-    assert start(rising, v, thrust - 0.4905 + noise) == {}  # nothing has to hold it
-
-
 @pytest.fixture
 def plane(tmp_path):
     """A planar drone that hovers at z = 1 m."""
@@ -165,17 +124,6 @@ def test_a_target_says_what_it_leaves_free(plane):
     drawn(plane, "line", "--to", "x=2")
     refused = grounded("-C", plane.folder, "propose")
     assert refused.code == 1 and "weighs z" in refused.err
-
-
-def test_a_line_keeps_the_rest_of_a_position_where_it_starts(plane):
-    model = plane.folder / "model.py"
-    place = "derivative=rate, roles={'position': ('x', 'z')})"
-    model.write_text(model.read_text().replace("derivative=rate)", place))
-    edit(plane.folder, start="{ z = 1.5 }")
-    found = grounded("-C", plane.folder, "target", "line", "--to", "x=2", "--json").json
-    assert found["columns"] == {"x": [0, 2], "z": [1.5, 1.5], "vx": [0, 1], "vz": [0, 0]}
-    weights = reward_of(plane)["state"]
-    assert weights["z"] == weights["x"] and weights["vz"] == weights["vx"]
 
 
 def test_weights_that_were_made_of_the_limits_seen_follow_those_that_are_given(tmp_path):

@@ -1,16 +1,11 @@
 """A plan that reaches its target by a kick of its last commands is told before it is run."""
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from grounded.trial import Trial
 from grounded_trials.workspace.candidates.last_command import kicked
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.after_run import moved_on
-from small_tasks import rover_task
 from workspaces import CONFIG, MODEL, make
 
 ENDS = CONFIG.replace("{ x = 10.0 }", "{ }\nterminal = { x = 100.0 }")
@@ -35,19 +30,3 @@ def test_a_kick_or_a_hold_at_the_end_of_a_plan_is_told(tmp_path, model, last, mo
     inputs[-3:] = last
     told = kicked(planner, Trial(states, inputs, task.dt, ("x", "v"), ("force",)), np.zeros(1))
     assert bool(told) == bool(fact) and (fact or "") in (told.sentence if told else "")
-
-
-@pytest.mark.parametrize(("turned", "noise"), [(0.0, 0.0), (0.008, 0.0), (0.0, 0.003)])
-def test_a_heading_that_turns_after_the_run_is_told_if_the_end_would_cost_more(turned, noise):
-    task = rover_task()
-    weights = replace(task.reward, terminal=np.array([100.0, 100.0, 300.0]))
-    T, rest = task.horizon, 12
-    target = np.vstack([np.repeat(task.target[:1], T // 2, 0), np.repeat(task.target[-1:], T, 0)])
-    task = replace(task, reward=weights, target=target[: T + 1])
-    states = np.vstack([task.target, np.repeat(task.target[-1:], rest, 0)])
-    states[T + 3 :, 2] += turned
-    states[:, 2] += noise * np.random.default_rng(1).standard_normal(len(states))
-    states[T, 2] = task.target[-1, 2]
-    names = task.model.state_names, task.model.input_names
-    run = Trial(states, np.zeros((len(states) - 1, 2)), task.dt, *names)
-    assert bool(moved_on(SimpleNamespace(task=task), run)) == bool(turned)

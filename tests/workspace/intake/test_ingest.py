@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding, holds, of_code
+from facts import holding, of_code
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, write_trial
@@ -19,7 +19,6 @@ from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.discarding import set_aside
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.remarks import initial_state
 from workspaces import CONFIG, make
 
 
@@ -79,17 +78,6 @@ def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_pa
     assert again.known and again.trial == found.trial
 
 
-@pytest.mark.parametrize(("sigma", "told"), [(0.1, False), (0.0, True)])
-def test_a_start_within_the_noise_of_its_sensor_is_no_warning(w, tmp_path, sigma, told):
-    ran, *_ = read_trial(run(w))
-    states = np.array(ran.states)
-    states[:, 0] += np.random.default_rng(1).normal(0, 1, len(states)) * sigma
-    states[0, 0] = 0.2  # of a range of 1: two standard deviations, or a wrong start
-    write_trial(tmp_path / "t.mcap", replace(ran, states=states), {"kind": "trial"})
-    found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    assert bool(of_code(found, "run.start*")) is told
-
-
 def test_a_start_is_far_off_by_what_it_costs(tmp_path):
     config = CONFIG.replace("{ x = 10.0 }", "{ x = 10.0, v = 1e-4 }")
     rows = "\n".join(f"{0.05 * i:.2f},{i / 40},0.5" for i in range(41))
@@ -120,26 +108,6 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
         told.append(of_code(ingest_log(w, tmp_path / "t.mcap", "c0001"), "run.start*"))
     codes = [[one.code for one in some] for some in told]
     assert codes == [["run.start"], ["run.start"], [], [], ["run.start_spoils"]]
-
-
-@pytest.mark.parametrize(("part", "lost", "told"), [(0.1, 0.05, True), (0.1, 0.2, False)])
-def test_a_start_that_explains_a_loss_is_told_however_earlier_ones_scatter(
-    w, tmp_path, monkeypatch, part, lost, told
-):
-    ran, *_ = read_trial(run(w))
-    cost = -w.task.utility(ran)
-    a_step = np.sqrt(cost / len(ran.states) / 10)
-    for off in (0.7, -0.7, 0.6):
-        moved = np.array(ran.states)
-        moved[0, 0] += off * a_step
-        write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-        if off == 0.6:  # as if the model were unstable
-            monkeypatch.setattr(initial_state, "_changes", lambda *_: -part * cost)
-            monkeypatch.setattr(initial_state, "_lost_by", lambda *_: lost * cost)
-        found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    assert not of_code(found, "run.start_spoils")
-    counts = of_code(found, "run.start")
-    assert [one.facts.get("runs") for one in counts if "runs" in one.facts] == [2] * told
 
 
 @pytest.mark.parametrize("data", [True])
@@ -245,23 +213,6 @@ def test_a_trial_of_a_deleted_candidate_still_counts(w):
     assert ingest_log(fresh, again).candidate == "c0001"
 
 
-def test_data_are_taken_from_where_a_step_of_their_commands_begins(w, tmp_path):
-    t = np.arange(0, 4, 0.005)
-    force = np.sin(np.floor((t - 0.03) / 0.05 + 1e-6))
-    rows = np.column_stack([t, np.sin(t), np.cos(t), force])
-    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
-    text = (w.folder / "grounded.toml").read_text() + LOG_OF_A_TABLE
-    (w.folder / "grounded.toml").write_text(text)
-    ingest_log(w, tmp_path / "log.csv", data=True)
-    assert w.trials()[0].meta["start_ns"] == str(round(0.03e9))
-    assert w.store.list()
-    (kept,) = Folder(w.folder).whole_trials()
-    np.testing.assert_allclose(kept.trial.inputs[:70, 0], np.sin(np.arange(70)), atol=1e-5)
-    np.testing.assert_allclose(
-        kept.trial.states[:70, 0], np.sin(0.03 + 0.05 * np.arange(70)), atol=1e-4
-    )
-
-
 LOG_OF_A_TABLE = """
 [log.state]
 x = { path = "/csv.x" }
@@ -336,32 +287,6 @@ def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
     with pytest.raises(GroundedError, match="'force'") as refused:
         ingest_log(Folder(w.folder), log, data=True)
     assert "[estimate]" not in str(refused.value)
-
-
-def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
-    t = np.arange(0, 6, 0.02)
-    x, v = np.sin(t), np.cos(t)
-    file = w.folder / "grounded.toml"
-    file.write_text(file.read_text() + LOG_OF_A_TABLE)
-
-    def taken(name, position):
-        columns = zip(t, position, v, np.sin(3 * np.floor(t / 0.05) * 0.05), strict=True)
-        rows = ["t,x,v,force", *(f"{a:.3f},{b},{c:.6f},{d:.6f}" for a, b, c, d in columns)]
-        (tmp_path / name).write_text("\n".join(rows))
-        found = ingest_log(w, tmp_path / name, data=True)
-        stored = {one.stored.id: one.trial for one in w.trials()}[found.trial]
-        return found.warnings, stored.states[:100, 0] - np.sin(0.05 * np.arange(100))
-
-    held = np.repeat(x[::5], 5)
-    told, off = taken("held.csv", [f"{one:.6f}" for one in held])
-    assert [one for one in told if holds(one, "x", "50 Hz", "10 Hz", "0.04 s", "empty")]
-    empty = [f"{one:.6f}" if k % 5 == 0 else "" for k, one in enumerate(held)]
-    told, mended = taken("empty.csv", empty)
-    assert not any("held" in one for one in told)
-    assert np.abs(mended).max() < 0.1 * np.abs(off).max()
-    for good in (x, np.round(x, 2)):  # a coarse sensor is no slow one
-        told, _ = taken(f"{len(w.trials())}.csv", [f"{one:.6f}" for one in good])
-        assert not any("held" in one for one in told)
 
 
 @pytest.mark.parametrize("judge", ["standing_in"])

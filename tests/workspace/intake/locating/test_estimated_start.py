@@ -10,8 +10,6 @@ import pytest
 
 from facts import of_code
 from grounded.errors import GroundedError
-from grounded_trials.workspace.intake.locating.missed_steps import _waits
-from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from recorded import LOGGED, RATE, record, waiting
 
 ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
@@ -35,17 +33,6 @@ def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
     k = round(before * RATE) + 5 * np.arange(policy.horizon)
     np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
     assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
-
-
-@pytest.mark.parametrize("column, by", [(1, 1000.0)])
-def test_another_unit_is_told_where_speeds_are_estimated(blind, tmp_path, column, by):
-    path = record(blind, tmp_path / "a.csv", blind.candidate("c0002")[0].policy, 0.8)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    table[:, column] *= by
-    np.savetxt(tmp_path / "b.csv", table, "%.6f", ",", header="t,x,v,force", comments="")
-    name = {1: "x", 3: "force"}[column]
-    with pytest.raises(GroundedError, match=f"{name} is "):
-        blind.ingest(tmp_path / "b.csv")
 
 
 def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
@@ -103,12 +90,3 @@ def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, 
     forced = blind.ingest(path, candidate="c0002")
     assert of_code(forced, "run.reversed")
     assert (forced.then.verb, forced.then.arguments) == ("discard", (forced.trial,))
-
-
-def test_a_log_that_begins_at_rest_does_not_begin_after_the_run(blind, tmp_path):
-    path = record(blind, tmp_path / "a.csv", blind.candidate("c0002")[0].policy, 0.5)
-    log = read_foreign(blind, path, mapping_of(blind, path)).recording
-    assert _waits(log)
-    cut = np.loadtxt(path, delimiter=",", skiprows=1)[60:]  # 0.1 s after it began
-    np.savetxt(path, cut, "%.5f", ",", header="t,x,v,force", comments="")
-    assert not _waits(read_foreign(blind, path, mapping_of(blind, path)).recording)

@@ -4,8 +4,6 @@ An arm's loop swung its torques from step to step. Its program missed step 0, an
 of what it had: the mean of all differences put the start 20 ms late, and its utility was another's.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,24 +11,12 @@ from facts import of_code
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.workspace.intake.locating import run_start
-from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from recorded import RATE, record, waiting
-
-SWING = 10.0  # [N], to and fro from step to step
-STRANGE = (0.0, 4.9, -4.8)  # [N]
 
 
 @pytest.fixture
 def w(tmp_path):
     return waiting(tmp_path)
-
-
-def swinging(policy, share):
-    """The policy with a share of its gains, and a plan that swings more and more, to its limits."""
-    k = np.arange(policy.horizon)
-    swung = 0.5 * SWING * (-1.0) ** k * (1 + k / policy.horizon)
-    plan = np.clip(policy.feedforward + swung[:, None], policy.low, policy.high)
-    return replace(policy, feedforward=plan, gain=share * policy.gain)
 
 
 def run(w, path, policy, strange, before=1.0):
@@ -43,16 +29,6 @@ def run(w, path, policy, strange, before=1.0):
     table[(np.arange(len(table)) - first) % every != 0, 3] = np.nan
     np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
     return path
-
-
-@pytest.mark.parametrize("strange", [0, 2, 3])
-@pytest.mark.parametrize("share", [0.3])
-def test_a_run_begins_where_most_of_its_commands_are_the_policy_s(w, tmp_path, strange, share):
-    policy = swinging(w.candidate("c0002")[0].policy, share)
-    log = run(w, tmp_path / "a.csv", policy, STRANGE[:strange])
-    found = read_foreign(w, log, mapping_of(w, log)).recording.start_of(policy)
-    assert found.opens_alike and found.alike == (strange < 3)
-    assert found.seconds == pytest.approx(1.0, abs=0.2 / RATE)
 
 
 def unsent(w, path, policy, missed):

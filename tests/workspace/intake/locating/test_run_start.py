@@ -15,12 +15,11 @@ from cli import grounded
 from facts import holding, holds, of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
-from grounded.search.feedback.sample_age import sample_age
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.opening import cutting
-from recorded import LOGGED, RATE, follow, record, waiting
+from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 
 
@@ -45,25 +44,6 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
     k = round(before * RATE) + 5 * np.arange(policy.horizon)
     np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
-
-
-@pytest.mark.parametrize("waits", [20])
-def test_a_late_first_row_does_not_make_the_samples_of_all_others_old(w, tmp_path, waits):
-    made, rng = w.candidate("c0002")[0], np.random.default_rng(3)
-    policy, model = made.policy, w.task.model
-    late = np.r_[np.zeros(waits), 20, 5, rng.uniform(0, 1, policy.horizon + 18)]  # [ms]
-    z, clock, sent, rows = np.array(w.task.start, float), -1.0, policy.past.copy(), []
-    for k, wait in enumerate(late, -waits):
-        at, force = k * policy.dt + 1e-3 * wait, rows[-1][3] if rows else 0.0
-        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if rows else 0.0
-        z = model.system.step(z[None], np.array([[push]]), model.values, at - clock)[0]
-        felt, clock = z + rng.normal(0, (0.002, 0.01)), at
-        runs = 0 <= k < policy.horizon
-        rows.append([1000 + at, *felt, float(follow(policy, k, felt, sent)[0]) if runs else 0.0])
-    np.savetxt(tmp_path / "a.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
-    found = w.ingest(tmp_path / "a.csv")
-    assert found.candidate == "c0002"
-    assert abs(sample_age(w.task, made, [w.trials()[-1].trial])) < 0.002
 
 
 @pytest.mark.parametrize("before", [1.0])
@@ -213,19 +193,6 @@ def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, bef
     assert named.then.verb == "discard" and of_code(named, "run.clipped")
 
 
-def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
-    policy = w.candidate("c0002")[0].policy
-    path = record(w, tmp_path / "a.csv", policy, 1.0)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    table[1:, 2] = np.diff(table[:, 1]) * RATE
-    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
-    told = of_code(w.ingest(tmp_path / "b.csv"), "log.start_loose")
-    assert [one.facts["ran"] for one in told] == ["c0002"]
-    w.propose()
-    own = record(w, tmp_path / "c.csv", w.candidate("c0003")[0].policy, 1.0)
-    assert not of_code(w.ingest(own), "log.start_loose")
-
-
 def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0)
     once = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -349,29 +316,6 @@ def test_one_log_is_one_trial(w, tmp_path):
         w.ingest(path, candidate="c0002")
 
 
-def recorded_in_motion(path, change=0.3, begun=0.13):
-    """A joystick's commands on a 50 ms grid, begun between two of them; the rows of 100 Hz."""
-    rng = np.random.default_rng(3)
-    t = np.arange(0, 12, 0.01)
-    steps = np.floor((t + begun) / change + 1e-6).astype(int)
-    force = rng.uniform(0.5, 2.0, steps.max() + 1)[steps]
-    rows = np.column_stack([t, np.sin(t), np.cos(t), force])
-    np.savetxt(path, rows, "%.6f", ",", header="t,x,v,force", comments="")
-    return rows
-
-
-def test_data_that_begin_in_motion_begin_where_it_is_known_what_was_sent(w, tmp_path):
-    """Held at rest before the first row, a delay made of the first step a limit that nobody has."""
-    rows = recorded_in_motion(tmp_path / "a.csv")
-    found = w.ingest(tmp_path / "a.csv", data=True)
-    assert of_code(found, "log.from")
-    (kept,) = (t for t in w.trials() if t.stored.id == found.trial)
-    first = round((0.17 + 0.25) / 0.01)  # nothing has changed for 0.25 s
-    np.testing.assert_allclose(kept.trial.states[0], rows[first, 1:3], atol=1e-3)
-    np.testing.assert_allclose(kept.trial.start_inputs, rows[first - 1, 3:], atol=1e-5)
-    assert float(kept.meta["rows_s"]) == pytest.approx(0.01)
-
-
 def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path):
     w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
     policy = w.propose().candidate.policy
@@ -403,20 +347,6 @@ def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
     log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 4.0), hole)
     with pytest.raises(GroundedError, match=r"has a gap of 0\.2.* s .*max_age_s"):
         w.ingest(log)
-
-
-def test_commands_that_were_logged_before_the_states_are_a_lead_in(w, tmp_path):
-
-    def blind(table):
-        table[:8, 1:3] = np.nan
-
-    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0), blind)
-    found = w.ingest(log)
-    assert found.candidate == "c0002" and of_code(found, "log.earlier_rows")
-    late = edited(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 0.0), blind)
-    w.discard(found.trial)
-    with pytest.raises(GroundedError, match="before every state is known"):
-        w.ingest(late)
 
 
 def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_early(tmp_path):

@@ -12,24 +12,6 @@ def w(tmp_path):
     return waiting(tmp_path)
 
 
-@pytest.mark.parametrize("phase", [3])
-def test_a_run_begins_between_the_rows_that_show_it(w, tmp_path, phase):
-    policy, every = w.candidate("c0002")[0].policy, round(w.task.dt * 1000)
-    path = record(w, tmp_path / "fine.csv", policy, 0.5, rate=1000)
-    fine = np.loadtxt(path, delimiter=",", skiprows=1)
-    rows = fine[phase::10]
-    np.savetxt(tmp_path / "b.csv", rows, "%.5f", ",", header="t,x,v,force", comments="")
-    found = w.ingest(tmp_path / "b.csv")
-    assert found.candidate == "c0002" and found.verdict != "data"
-    stored = w.trials()[-1].trial
-    k = 500 + every * np.arange(policy.horizon)
-    np.testing.assert_allclose(stored.inputs[:, 0], fine[k, 3], atol=1e-4)
-    off = float(
-        np.mean((stored.states[:-1, 0] - fine[k, 1]) * fine[k, 2]) / np.mean(fine[k, 2] ** 2)
-    )
-    assert abs(off) < 0.0025  # [s]; a quarter of a row
-
-
 @pytest.mark.parametrize("row", [0.011])
 def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
     policy = w.candidate("c0002")[0].policy

@@ -64,18 +64,6 @@ def test_what_the_names_of_columns_say(model, columns, pairs):
     assert all(holds(one.what, part) for one, part in zip(found, pairs, strict=True))
 
 
-@pytest.mark.parametrize("form", ["/cmd/{}.data", "/{}/value.data"])
-def test_a_message_of_a_number_alone_is_named_by_its_topic(form):
-    boat = Model(
-        states={"v": "m/s"},
-        inputs={"port": "1", "starboard": "1"},
-        derivative=lambda s, a, p: {"v": a.port + a.starboard},
-    )
-    assert not crossed(boat, reading(boat, "v", "port", "starboard", form=form))
-    (told,) = crossed(boat, reading(boat, "v", "starboard", "port", form=form))
-    assert told.about == ("port", "starboard")
-
-
 @pytest.mark.parametrize(
     ("columns", "odd"),
     [
@@ -89,15 +77,6 @@ def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
     found = crossed(ROVER, reading(ROVER, *columns, form="/{}"))
     assert len(found) == odd
     assert all((one.about, one.facts["by"]) == (("linear", "angular"), "units") for one in found)
-
-
-@pytest.mark.parametrize(("path", "scale"), [("/sway.angle", 1), ("/sway.angle", 0.2), ("/t.x", 1)])
-def test_a_length_that_is_read_from_an_angle_is_told(path, scale):
-    boat = Model(states={"p": "m"}, inputs={"u": "1"}, derivative=lambda s, a, p: {"p": a.u})
-    mapping = LogMapping({"p": SignalSpec(path, scale=scale)}, {"u": SignalSpec("/c.u")})
-    found = crossed(boat, mapping)
-    assert len(found) == (path == "/sway.angle" and scale == 1)
-    assert all((one.about, one.facts["path"]) == (("p",), path) for one in found)
 
 
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):

@@ -10,7 +10,6 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
 from grounded_trials.workspace.user_files.config import set_in_model
 from workspaces import CONFIG, make
@@ -55,13 +54,6 @@ def off(found, t, v):
     return found["v"].values[inside] - np.interp(at[inside], t, v), at[inside]
 
 
-@pytest.mark.parametrize("every", [0.001, 0.03])
-def test_a_speed_is_estimated_whatever_the_sensor_s_rate(task, every):
-    logged, t, v = driven(every)
-    error, at = off(with_estimates(logged, TABLE, task), t, v)
-    assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error[at < 0.8]).max() < 0.05
-
-
 def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
 
     class Simulator:
@@ -83,23 +75,6 @@ def test_nothing_is_estimated_where_everything_is_measured(task):
     logged["v"] = series(t[::10], v[::10], "/csv.v")
     table = EstimateTable({"x": 0.002, "v": 0.01}, {})
     assert with_estimates(logged, table, task) == logged
-
-
-@pytest.mark.parametrize(
-    ("effect", "lag", "friction"),
-    [
-        ({"name": "first_order_lag:force", "tau": 0.15}, 0.15, 0.0),  # has a memory state
-        ({"name": "coulomb_friction:v", "c": 0.8}, 0.0, 0.8),
-    ],
-)
-def test_adopted_effects_make_estimates_better(task, effect, lag, friction):
-    logged, t, v = disturbed(lag, friction)
-    crude, _ = off(with_estimates(logged, TABLE, task), t, v)
-    plan = planner_of(task, [effect]).plan
-    found = with_estimates(logged, TABLE, plan, task.model.state_names)
-    better, _ = off(found, t, v)
-    assert set(found) == {"x", "v", "force"}
-    assert np.sqrt(np.mean(better**2)) < 0.5 * np.sqrt(np.mean(crude**2))
 
 
 def disturbed(lag, friction, until=6.0, fine=1e-3):

@@ -1,19 +1,13 @@
 """A file that holds a recording which is stored already, whole or in part, is no second trial."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError
-from grounded.trial import Trial
-from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
-from recorded import record, waiting
 from workspaces import make
 
 TABLE = """
@@ -78,34 +72,3 @@ def test_the_same_stamps_through_another_table_are_refused(w, tmp_path):
         ingest_log(w, part, data=True)
     assert grounded("-C", w.folder, "discard", first).code == 0
     assert not ingest_log(Folder(w.folder), part, data=True).known
-
-
-def test_what_is_left_of_a_trial_of_ours_is_that_trial(w, tmp_path):
-    made = propose_in(w).proposal.candidate
-    t = np.linspace(0, 1, 41)
-    states = np.column_stack([t, np.sin(t)])
-    fields = {"dt": 0.05, "state_names": ("x", "v"), "input_names": ("force",)}
-    whole = Trial(states=states, inputs=np.cos(t)[:-1, None], candidate=made.id, **fields)
-    write_trial(tmp_path / "t.mcap", whole, {"kind": "trial"})
-    first = ingest_log(w, tmp_path / "t.mcap", made.id)
-    part = replace(whole, states=states[:30], inputs=whole.inputs[:29])
-    write_trial(tmp_path / "p.mcap", part, {"kind": "trial"})
-    again = ingest_log(w, tmp_path / "p.mcap", made.id)
-    assert (again.trial, again.known) == (first.trial, True) and again.utility == first.utility
-    with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
-        ingest_log(w, tmp_path / "p.mcap", data=True)
-
-
-@pytest.mark.parametrize("rows", [-110])
-def test_a_shorter_copy_of_a_run_is_no_second_run(tmp_path, rows):
-    w = waiting(tmp_path)
-    whole = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0, after=1.0)
-    first = w.ingest(whole)
-    assert first.candidate == "c0002" and not first.known
-    part = "\n".join(whole.read_text().splitlines()[:rows])  # of 401: 0.4 and 1.1 s
-    (tmp_path / "b.csv").write_text(part)
-    again = w.ingest(tmp_path / "b.csv", candidate="c0002")
-    assert (again.trial, again.known) == (first.trial, True)
-    assert any(first.trial in note for note in again.notes)
-    with pytest.raises(GroundedError, match=holding(first.trial, "discard")):
-        w.ingest(tmp_path / "b.csv", candidate="c0001")

@@ -62,12 +62,6 @@ def tanks(tmp_path_factory):
     return begun, workspace, levels
 
 
-def test_rows_far_apart_are_believed_where_the_column_names_seconds(tanks):
-    begun, *_ = tanks
-    assert begun.dt == DT and begun.then.verb != "init"
-    assert not any("apart" in note for note in begun.notes)
-
-
 def test_a_slow_hidden_state_is_estimated(tanks):
     _, workspace, levels = tanks
     [one] = workspace.trials()

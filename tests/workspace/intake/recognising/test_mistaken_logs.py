@@ -258,24 +258,6 @@ def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
     assert (waits > 0) == (found.then.verb == "discard")
 
 
-@pytest.mark.parametrize(("share", "names"), [(0.0, "v r psi"), (0.6, "v r")])
-def test_a_program_that_smooths_what_it_feeds_back_is_told(w, tmp_path, share, names):
-    """0.7 of the last pose: commands "logged 2 steps late", or a run eight times worse, untold."""
-    plan, dt, smooth = w.propose().candidate, w.task.dt, []
-    which, runner = np.isin(w.base_model.state_names, names.split()), Runner(plan.policy)
-
-    def action(k, logged, now):
-        smooth.append(share * smooth[-1] + (1 - share) * logged if smooth else logged)
-        return runner.action(k * dt, np.where(which, smooth[-1], logged))
-
-    found = driven_by(w, tmp_path / "run.csv", action, noise=0.02)
-    told = of_code(found, "run.smoothed")
-    assert len(told) == (share > 0) == (found.then.verb == "discard")
-    assert all(one.facts["states"] == tuple(names.split()) for one in told)
-    assert all(one.facts["share"] == pytest.approx(share) for one in told)
-    assert not of_code(found, "log.late", "run.late")
-
-
 @pytest.mark.parametrize("fault", ["program", "log"])
 def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, fault):
     plan, dt, wrong = w.propose().candidate, w.task.dt, np.array([1.0, -1.0])
@@ -317,39 +299,6 @@ def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w,
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
-@pytest.mark.parametrize(("fault", "by"), [("program", 1), ("log", 1)])
-def test_commands_that_are_sent_late_are_told_from_a_log_that_has_them_late(w, tmp_path, fault, by):
-    dt = w.task.dt
-
-    def run(by, fault):
-        plan, seen = w.propose().candidate, list[np.ndarray]()
-        runner, path = Runner(plan.policy), tmp_path / f"{plan.id}.csv"
-        was = by if fault == "program" else 0
-
-        def action(k, logged, now):
-            seen.append(logged)
-            return runner.action(max(0, k - was) * dt, seen[max(0, k - was)])
-
-        shown = by if fault == "log" else 0
-        return plan.id, driven_by(w, path, action, pull=0.8, shown=shown)
-
-    _, found = run(by, fault)
-    told = of_code(found, "log.late", "run.late")
-    assert len(told) == (by > 0) and found.then.verb != "discard"  # no run to compare it with
-    w.discard(found.trial)
-    _, found = run(0, "")
-    _, found = run(by, fault)
-    told = of_code(found, "log.late", "run.late")
-    assert [one.facts["steps"] for one in told] == [by] * (by > 0)
-    assert (found.then.verb == "discard") == (fault == "program")
-    if fault == "program":
-        assert told[0].code == "run.late" and not found.faults
-        status = grounded("-C", w.folder, "status").out.replace("\\\n", " ")
-        assert f"discard {found.trial}" in " ".join(status.split())
-    elif fault == "log":
-        assert (told[0].code, told[0].facts["what"]) == ("log.late", "log") and not found.notes
-
-
 @pytest.mark.parametrize("named", [False, True])
 def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, named):
     """A zero that a program set where its boat floated: "somebody drove", and no word of it."""
@@ -364,24 +313,6 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
         return
     found = w.ingest(path, candidate=plan.id)
     assert found.findings[0].code == "run.origin" and found.then.verb == "discard"
-
-
-@pytest.mark.parametrize("part", [1.0, 0.6])
-def test_a_program_that_cuts_commands_inside_their_limits_is_told(w, tmp_path, monkeypatch, part):
-    monkeypatch.setitem(globals(), "RNG", np.random.default_rng(0))  # 5 % less hides in some noise
-    plan, dt = w.propose().candidate, w.task.dt
-    runner, most = Runner(plan.policy), part * np.abs(plan.policy.feedforward).max(axis=0)
-
-    def action(k, logged, now):
-        return np.clip(runner.action(k * dt, logged), -most, most)
-
-    try:  # of a run that differs little from its candidate's, a warning
-        found = driven_by(w, tmp_path / "run.csv", action)
-        told, rests = of_code(found, "run.clipped"), found.then.verb != "discard"
-    except GroundedError as refused:
-        told, rests = of_code([refused.finding], "run.clipped"), False
-    assert bool(told) == (part < 1) == (not rests)
-    assert all("starboard" in one.about for one in told)
 
 
 @pytest.mark.parametrize("predicts", [True])

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 
 from facts import holds, of_code
-from grounded import Model
-from grounded.accounts.reported import scaled
-from grounded.accounts.table import of_commands
 from grounded.errors import GroundedError
 from grounded.result import listed
-from grounded.search.returned.stories import Kind, stories, unit_by_factor
-from grounded.search.returned.who_drove import follows, latest
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from recorded import LOGGED, record
@@ -92,48 +87,6 @@ def test_the_columns_and_their_factor_are_named(driven, tmp_path, names, factor)
     assert any(told.facts.get(k) == pytest.approx(1 / factor, rel=5e-3) for k in ("by", "times"))
     named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
     assert of_code(named, told.code)
-
-
-def test_an_encoder_of_one_joint_the_other_way_round_is_tried(tmp_path):
-    """Neither all angles nor the position alone: its velocity turns with it."""
-    arm = Model(
-        states={"a": "rad", "b": "rad", "va": "rad/s", "vb": "rad/s"},
-        inputs={"ta": "N m", "tb": "N m", "fan": "1"},
-        derivative=lambda s, a, p: {"a": s.va, "b": s.vb, "va": a.ta, "vb": a.tb - s.vb},
-    )
-    tried = {(one.columns, one.factor) for one in of_commands(arm)}
-    assert {((0, 2), -1.0), ((1, 3), -1.0)} <= tried
-    assert {((4, 5), 1e-3), ((4, 5), 1e3)} <= tried
-
-
-def test_centimetres_are_tried_and_are_no_percent():
-    cart = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"throttle": "1"},
-        derivative=lambda s, a, p: {"x": s.v, "v": a.throttle - s.v},
-    )
-    tried = {(one.columns, one.factor) for one in of_commands(cart)}
-    assert {((0, 1), 1e2), ((0,), 1e2)} <= tried
-    assert unit_by_factor(cart, ("x", "v"), 1e-2) == "cm"
-    assert unit_by_factor(cart, ("throttle",), 1e-2) == "percent"
-    assert unit_by_factor(cart, ("x", "throttle"), 1e-2) == ""
-    assert scaled(cart, ("x", "v"), 100.0, "cm").facts["by"] == 0.01
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_other_driving_is_no_factor(driven, seed):
-    w, trial, _ = driven
-    rng, (own, _) = np.random.default_rng(seed), w.candidate(trial.candidate)
-    smooth = np.convolve(rng.normal(size=trial.steps + 20), np.ones(20) / 5, "valid")
-    by_hand = np.array(trial.inputs)
-    by_hand[:, seed % 2] = smooth[: trial.steps] * by_hand[:, seed % 2].std()
-    if seed > 2:
-        by_hand[: trial.steps // 2] = trial.inputs[: trial.steps // 2]  # somebody took over
-    odd = replace(trial, inputs=by_hand)
-    plain = follows(own.policy, odd, latest(w.task))
-    assert plain is not None
-    some = stories(w.task, own, odd, plain)
-    assert not [one for one in some if one.kind is Kind.UNIT]
 
 
 @pytest.mark.parametrize("before", [0.7])

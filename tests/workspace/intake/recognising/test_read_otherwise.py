@@ -121,20 +121,6 @@ def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
     assert (one.code, one.about) == ("log.dead", ("v",))
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_a_person_s_driving_is_none_of_these(w, tmp_path, seed):
-    def driven(table):
-        t, rng = table[:, 0] - table[0, 0], np.random.default_rng(seed)
-        rate = rng.uniform(0.5, 3)
-        table[:, 1], table[:, 2] = np.sin(rate * t), rate * np.cos(rate * t)
-        table[:, 3] = np.repeat(rng.uniform(-2, 2, len(t)), 25)[: len(t)]
-
-    run = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0), driven)
-    error = refused(w, run)
-    assert holds(str(error), "did not run c0002")
-    assert error.then == NextCommand("ingest", (str(run), "--data"))
-
-
 @pytest.mark.parametrize(("waits", "weight"), [(True, 0.5)])
 def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
@@ -154,14 +140,6 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     assert done.code == 0, done.err
     fresh = record(w, tmp_path / "b.csv", own.policy, 0.5, seed=5)
     assert w.ingest(fresh, candidate=own.id).candidate == own.id
-
-
-def test_a_program_that_passed_its_candidate_another_unit_is_told_so(w, tmp_path):
-    policy = w.candidate("c0002")[0].policy
-    unit = np.array([1e3, 1e3, *np.ones(policy.gain.shape[2] - 2)])
-    called_in_mm = replace(policy, gain=policy.gain * unit, reference=policy.reference / unit)
-    one = refused(w, record(w, tmp_path / "a.csv", called_in_mm, 0.5)).finding
-    assert (one.code, one.facts["states"], one.facts["unit"]) == ("run.passed", ("x", "v"), "mm")
 
 
 def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, tmp_path):

@@ -11,14 +11,11 @@ import pytest
 
 from grounded import Model, Reward, Task
 from grounded.policy import Policy
-from grounded.search.returned.who_drove import evidence, follows
-from grounded.trial import Trial
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.recognising.misused_run import (
     exactly_misused,
 )
-from grounded_trials.workspace.intake.recognising.read_otherwise import at_each_start
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])
@@ -122,36 +119,3 @@ def test_degrees_are_named_though_somebody_else_drove_first(seed):
     assert told.finding.code == "run.passed"
     assert told.finding.facts["states"] == ("tilt", "rate")
     assert told.finding.facts["unit"] == "degrees"
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_another_policy_at_its_limits_is_no_misuse(seed):
-    ran, own = candidate(6 * HAND, 2), candidate((2 + 0.5 * seed) * HAND, 3)
-    task, log = log_of(balanced(ran, seed))
-    assert not [*exactly_misused(log, task, own), *at_each_start(log, task, own)]
-
-
-def test_commands_at_the_same_limit_make_neither_of_two_policies_likelier():
-    rng, own, other = np.random.default_rng(0), candidate(HAND), candidate(1.05 * HAND, 1)
-    states = rng.normal(0, (0.01, 0.1), (STEPS + 1, 2))
-    states[100:] = 0.95, 0.0
-    sent = own.policy.commands(states[None, :STEPS], np.zeros(1))[0]
-    sent[:100] += rng.normal(0, 0.3, (100, 1))
-    trial = Trial(states, np.clip(sent, -LIMIT, LIMIT), DT, *NAMES)
-    whole, part = (
-        evidence(*(follows(one.policy, some) for one in (own, other)))
-        for some in (trial, trial.until(100))
-    )
-    assert whole == pytest.approx(part, rel=0.05)
-
-
-@pytest.mark.parametrize("tilt", [0.5, 0.01])
-def test_an_opening_at_the_limit_is_no_opening(tilt):
-    own, t = candidate(8 * HAND), np.arange(STEPS + 1)
-    states = np.stack([0.02 * np.sin(0.09 * t), 0.18 * np.cos(0.09 * t)], axis=1)
-    if tilt == 0.5:
-        states[:100] = tilt, 0.0
-    sent = own.policy.commands(states[None, :STEPS], np.zeros(1))[0]
-    sent[100:] *= -1
-    found = follows(own.policy, Trial(states, sent, DT, *NAMES))
-    assert not found.alike and found.until_s >= 1.0 and found.opens == (tilt < 0.5)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding, holds, of_code
+from facts import holds, of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Plant
 from grounded.search.returned.whose_run import suspicion
@@ -241,38 +241,6 @@ def recorded(path, trial, before, rng):
     noisy = np.column_stack(x) + rng.normal(0, 0.001, (len(t), 2))
     rows = np.column_stack([1000 + t, noisy, force])
     np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
-
-
-@pytest.mark.parametrize("given", ["start = 0.0"])
-def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_path, given):
-    config = LOGGED + f"[log.span]\n{given}\n"
-    w = Workspace(make(tmp_path / "w", config=config).folder)
-    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
-    recorded(tmp_path / "run.csv", trial, 1.0, np.random.default_rng(0))
-    with pytest.raises(GroundedError, match=holding("log.span")):
-        w.ingest(tmp_path / "run.csv")
-    (w.folder / "grounded.toml").write_text(LOGGED)
-    w.forget()
-    strange = replace(trial, inputs=OTHERS["somebody"](np.array(trial.inputs)))
-    recorded(tmp_path / "strange.csv", strange, 1.0, np.random.default_rng(0))
-    with pytest.raises(GroundedError, match="c0001"):
-        w.ingest(tmp_path / "strange.csv")
-    assert not w.trials()
-
-
-def test_a_copy_is_discarded_without_its_original(waiting):
-    w, _, _ = waiting
-    w.ingest(w.run().trial_file)
-    original = w.trials()[0].stored
-    w.store.add(original.path.read_bytes(), again=True)
-    w.forget()
-    copy = w.trials()[-1].stored
-    assert copy.digest == original.digest
-    assert list(w.discard(copy.id).discarded) == [copy.id]
-    assert [one.stored.id for one in w.trials()].count(original.id) == 1
-    assert list(w.discard(original.id).discarded) == [original.id, copy.id]
-    assert list(w.restore(original.id).discarded) == [copy.id]
-    assert w.restore(copy.id).discarded == {}
 
 
 def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):

@@ -75,23 +75,6 @@ def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w)
     assert said[-2:] == ["discard", "t0002"] and "Run c0" not in out
 
 
-@pytest.mark.parametrize(("force", "asked"), [("a.force + 2.5", True), ("a.force", False)])
-def test_a_run_that_cost_ten_times_what_its_candidate_s_others_did_is_asked_about(w, force, asked):
-    w.ingest(run(w, "a.force"))
-    found = w.ingest(run(w, force), candidate="c0002")
-    told = of_code(found, "run.astray")
-    assert bool(told) == asked == (found.then.verb == "discard")
-    assert all(one.facts["others"] == ("t0002",) for one in told)
-    assert (w.status().then.verb == "discard") == asked
-
-
-@pytest.mark.parametrize("force", ["0.6 * a.force"])
-def test_a_run_of_a_robot_that_the_model_knows_little_of_is_not(w, force):
-    found = w.ingest(run(w, force))
-    assert found.then.verb == "propose"
-    assert not [one for one in found.findings if one.weight == "aside"]
-
-
 @pytest.mark.parametrize(("off", "again"), [(0.6, True), (0.02, False)])
 def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
     """One output asked to discard it, called it bad luck, and exported the next candidate."""

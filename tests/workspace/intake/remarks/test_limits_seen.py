@@ -12,8 +12,6 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates import at_rest
-from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.where_to_mend import where_to_mend
 from recorded import LOGGED, record, waiting
 from workspaces import CONFIG, MODEL, make
 
@@ -50,40 +48,6 @@ def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
     clipped = driven(2.15)
     clipped = replace(clipped, inputs=np.minimum(clipped.inputs, 1.17))
     assert [one.kind for one in preflight(w.task, [clipped]).findings] == ["saturated"]
-
-
-LOG = """
-[log]
-state = { x = { path = "/csv.x" }, v = { path = "/csv.v" } }
-input = { force = { path = "/csv.force" } }
-"""
-
-
-def test_logs_are_not_said_to_be_at_limits_that_were_read_off_one(tmp_path):
-    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
-    w = Workspace(make(tmp_path / "w", config=seen + LOG).folder)
-
-    def at_limits():
-        found = Workspace(w.folder).preflight()
-        return {one.signal: one.share for one in found if one.kind == "saturated"}
-
-    run = driven(2.15)
-    force = np.minimum(run.inputs, 1.17)
-    rows = np.column_stack([T, run.states[:-1], force])
-    np.savetxt(tmp_path / "a.csv", rows, "%.9f", ",", header="t,x,v,force", comments="")
-    w.ingest(tmp_path / "a.csv", data=True)
-    assert at_limits() == {}
-    plan = w.propose().proposal.candidate.id
-    write_trial(tmp_path / "b.mcap", replace(run, inputs=np.full((200, 1), 1.17)), {"kind": "data"})
-    b = w.ingest(tmp_path / "b.mcap", data=True)
-    assert at_limits() == {}
-    trial = next(one.trial for one in w.trials() if one.stored.id == b.trial)
-    ran = [replace(trial, candidate=plan)]
-    (finding,) = (f for f in preflight(w.task, ran).findings if f.kind == "saturated")
-    assert where_to_mend(Folder(w.folder), ran, [finding]) == (finding,)  # the plan is held by them
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text().replace('seen_in = "a.csv"', ""))
-    assert at_limits()["force"] > 0.5
 
 
 @pytest.mark.parametrize(("most", "far"), [(0.0204, True)])
@@ -203,15 +167,3 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
     told = of_code(Workspace(w.folder).ingest(file), "run.after_safety")
     assert [one.about for one in told] == [("x",)] * (rolls > 0)
-
-
-@pytest.mark.parametrize("scale", [-1, 1])
-def test_limits_of_a_log_whose_sign_was_wrong_are_to_be_turned_too(tmp_path, scale):
-    table = LOG.replace("/csv.force", f'/csv.force", scale = {scale}, clock = "log')
-    w = Workspace(make(tmp_path / "w", config=NARROW + table).folder)
-    trial = driven(-1.1)
-    states, log = trial.states[:-1], tmp_path / "d.csv"
-    rows = np.column_stack([T, states + 0.01 * np.sin(T)[:, None], trial.inputs / scale])
-    np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
-    (told,) = of_code(w.ingest(log, data=True), "log.limits")
-    assert told.facts["how"] == ("flip" if scale < 0 else "widen")

@@ -9,34 +9,8 @@ from cli import grounded
 from facts import holds
 from grounded import Model, Trial
 from grounded_trials import Workspace
-from grounded_trials.logs.log_table import LogMapping
-from grounded_trials.logs.signals import SignalSpec
-from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults
 from ros_bags import rover_bag
-
-CAR = Model(
-    states={"psi": "rad", "qz": "1", "z": "m"},
-    inputs={"u": "1"},
-    derivative=lambda s, a, p: {"psi": a.u, "qz": a.u, "z": a.u},
-)
-
-
-@pytest.mark.parametrize(
-    ("name", "path", "scale", "instead"),
-    [
-        ("psi", "/odom.pose.pose.orientation.z", 1.0, "/odom.pose.pose.orientation.@rpy.yaw"),
-        ("psi", "/tf.transforms[0].transform.rotation.x", 1.0, "rotation.@rpy.roll"),
-        ("psi", "/odom.pose.pose.orientation.@rpy.yaw", 1.0, ""),
-        ("psi", "/odom.pose.pose.orientation.z", 2.0, ""),  # of a small yaw
-        ("psi", "/odom.pose.pose.orientation.z.@asin.@mul(2)", 1.0, ""),
-        ("qz", "/odom.pose.pose.orientation.z", 1.0, ""),
-        ("z", "/odom.pose.pose.position.z", 1.0, ""),
-    ],
-)
-def test_which_paths_are_no_angles(name, path, scale, instead):
-    found = no_angles(CAR, LogMapping({name: SignalSpec(path, scale=scale)}, {}))
-    assert [holds(one.sentence, path, instead) for one in found] == [True] * bool(instead)
 
 
 def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):

@@ -20,12 +20,3 @@ def test_samples_that_are_older_than_before_are_a_reason_to_run_it_again(tmp_pat
     assert (found.then.verb == "discard") is (old > 0)
     status = plain(grounded("-C", w.folder, "status").out)
     assert ("discard t0002" in status) is (old > 0)
-
-
-def test_samples_that_are_as_old_in_every_run_are_the_robot_s(tmp_path):
-    w = waiting(tmp_path)
-    first = w.candidate("c0001")[0]
-    grounded("-C", w.folder, "discard", "t0001")
-    w.forget()
-    log = record(w, tmp_path / "a.csv", first.policy, 0.0, seed=5, old=2)
-    assert not of_code(Workspace(w.folder).ingest(log, candidate="c0001"), "run.older")

@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import of_code
-from grounded.result import with_error
-from grounded.search.starts import worth_of_start
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -62,18 +59,6 @@ def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, 
     assert placing(w).rms[0] == pytest.approx(0.01)
 
 
-def test_a_discard_tells_what_the_whole_start_changes(w, tmp_path):
-    ran, *_ = read_trial(run(w))
-    moved = np.array(ran.states)
-    moved[0] += [0.6, 0.3]
-    write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
-    found = ingest_log(w, tmp_path / "t.mcap", "c0001")
-    (told,) = of_code(found, "run.start_spoils")
-    policy = w.candidate("c0001")[0].policy
-    whole = worth_of_start(w.planner, policy, moved[0] - w.task.start)
-    assert told.facts["change"] == pytest.approx(whole)
-
-
 def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
     ran, *_ = read_trial(run(w))
     for off in (-0.09, -0.1, -0.08):
@@ -83,20 +68,3 @@ def test_a_start_moved_to_where_runs_began_is_what_they_are_off(w, tmp_path):
     toml.write_text(toml.read_text().replace("[task]", "[task]\nstart = { x = -0.09 }"))
     w.forget()
     assert np.allclose(np.sort(placing(w).off[:, 0]), [-0.01, 0.0, 0.01], atol=1e-6)
-
-
-def test_a_promise_is_told_from_where_runs_begin(w, tmp_path):
-    ran, *_ = read_trial(run(w))
-    for off in (0.2, -0.2, 0.15):
-        placed(w, tmp_path, ran, off)
-    w.forget()
-    found = propose_in(w)
-    known = found.to_json()["from_usual_starts"]
-    assert known["runs"] == 3 and known["utility_change"] < 0 < known["std"]
-    worth = [worth_of_start(w.planner, found.candidate.policy, off) for off in placing(w).off]
-    assert known["utility_change"] == pytest.approx(np.mean(worth))
-    said = " ".join(grounded("-C", w.folder, "propose").out.split())
-    expected = found.candidate.predicted_utility - found.noise_cost + np.mean(worth)
-    assert with_error(expected, known["std"]) in said
-    assert all(one["end_std"] == 0 for one in found.to_json()["off_target"])
-    assert found.predicted.facts["runs"] == 3

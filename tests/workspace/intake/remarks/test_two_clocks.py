@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facts import holding, of_code
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from recorded import LOGGED, record
@@ -50,25 +50,6 @@ def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
     (w.folder / "grounded.toml").write_text(config)
     found = Workspace(w.folder).ingest(log)  # the program was no 8134 s late
     assert found.candidate == ran.id
-
-
-@pytest.mark.parametrize("early", [0.0, 0.5])
-def test_a_log_that_was_put_together_too_early_is_told_with_its_delay(tmp_path, early):
-    config = SPLIT.replace('"/mocap.x"', f'"/mocap.x"\ndelay_s = {0.1 + early}')
-    config = config.replace('"/mocap.v"', f'"/mocap.v"\ndelay_s = {0.1 + early}')
-    w = Workspace(make(tmp_path / "w", config=config).folder)
-    rng, t, x, rows = np.random.default_rng(0), 0.0, np.zeros(2), []
-    for force in np.repeat(rng.uniform(-3, 3, 40), 20):
-        rows.append([t, *(x + rng.normal(0, 0.002, 2)), force])
-        x, t = x + 0.02 * np.array([x[1], 0.7 * force - 0.4 * x[1]]), t + 0.02
-    rows = np.array(rows)
-    names = {"mocap_names": np.array(["x", "v"]), "cmd_names": np.array(["force"])}
-    tables = {"mocap": rows[:, 1:3], "cmd": rows[:, 3:]}
-    log = tmp_path / "run.npz"
-    np.savez(log, mocap_t=rows[:, 0] + 0.1, cmd_t=rows[:, 0], **tables, **names)
-    told = of_code(w.ingest(log, data=True), "log.clock")
-    assert [one.facts["lead"] for one in told] == [pytest.approx(early, abs=0.06)] * (early > 0)
-    assert all(one.about == ("x", "v") for one in told)
 
 
 def test_the_lines_of_the_docs_make_one_log_of_two_tables(tmp_path, monkeypatch):
