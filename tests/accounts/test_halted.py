@@ -40,15 +40,6 @@ def wave(rest=60):
     return np.concatenate([np.zeros(rest), (0.45 + 0.25 * np.sin(1.3 * t))[: STEPS - rest]])
 
 
-def test_a_cart_at_a_wall_is_seen_from_there_on():
-    sent = wave()
-    trial = driven(sent, wall=4.0)
-    arrives = DT * int(np.argmax(trial.states[:, 0] > 3.99))
-    found = halted(CART, trial)
-    assert found is not None and found.inputs == ("u",)
-    assert found.begins == pytest.approx(arrives, abs=0.5) and found.ends > DT * (STEPS - 25)
-
-
 @pytest.mark.parametrize(
     "trial",
     [

@@ -5,7 +5,6 @@ import pytest
 
 from grounded import Model, Param
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.kinematics import kinematic_rows
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.frozen import Array
 from grounded.trial import Trial
@@ -98,16 +97,6 @@ def late(x: Array) -> Array:
     y[3:, 3:] = x[:-3, 3:]
     y[:, 3] = 0.1 + 1.1 * y[:, 3]
     return y
-
-
-@pytest.mark.parametrize("model", [BOAT, PLAIN])
-def test_kinematic_rows_are_read_off_the_model(model):
-    names = model.state_names
-    found = {
-        names[row.i]: [names[j] for j in row.by] for row in kinematic_rows(model, range(model.n))
-    }
-    across = ["v"] * ("v" in names)
-    assert found == {"x": ["psi", "u", *across], "y": ["psi", "u", *across], "psi": ["r"]}
 
 
 def adrift(x: Array) -> Array:

@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.accounts.ages import bias_of as constant_of
-from grounded.accounts.kinematics import turned
 from grounded.accounts.lag import at_samples
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.effects import Library, wrap
 from grounded.errors import GroundedError, NextCommand
-from grounded.models.car import model as car
-from grounded.models.pendulum import model as pendulum
-from grounded.places import integrals
 
 DT = 0.02
 ARM = Model(
@@ -90,38 +84,6 @@ def test_a_velocity_is_held_against_its_position(fault, signal, kind, delay, sca
         assert all(abs(f.delay_s) < 0.2 * delay for f in preflight(ARM, found.trials).findings)
 
 
-def differenced(x, steps):
-    before = np.concatenate([np.full(steps, x[0]), x])
-    return (x - before[:-steps]) / (steps * DT)
-
-
-@pytest.mark.parametrize("moved_back", [1.5])
-def test_a_velocity_that_is_a_difference_of_its_position_says_no_more_than_that(moved_back):
-    """Taken for a sensor, it made 0.41 rad/s^2 of a friction of 0.5: it goes on where q stops."""
-
-    def fault(y):
-        w = differenced(y[:, 0], 3)
-        return np.stack([y[:, 0], at_samples(w, np.arange(len(w)) + moved_back)], axis=1)
-
-    trials = arm(fault, friction=0.5)
-    looked = preflight(ARM, trials)
-    (found,) = [one for one in looked.findings if one.kind == "smoothed"]
-    assert found.signal == "w" and found.corrected and "q" in found.finding
-    assert abs(float(re.search("over ([0-9.]+) s", found.finding)[1]) - 3 * DT) < DT
-    assert all(np.isnan(trial.states[:, 1]).all() for trial in looked.trials)
-    (late,) = [f.delay_s for f in looked.findings if f.kind == "delay"] or [0.0]
-    assert abs(late - (1.5 - moved_back) * DT) < 0.05 * DT
-
-
-@pytest.mark.parametrize(
-    ("w", "noise"), [(lambda x: late(x, 1.5), 0.3), (lambda x: lagged(x, 0.08), 0.0)]
-)
-def test_a_sensor_of_its_own_is_used_however_late_or_noisy(w, noise):
-    rng = np.random.default_rng(5)
-    trials = arm(columns(w=lambda x: w(x) + noise * rng.standard_normal(len(x))))
-    assert not any(f.kind == "smoothed" for f in preflight(ARM, trials).findings)
-
-
 def test_sound_sensors_are_left_alone():
     for seed in range(2):
         trials = arm(seed=seed)
@@ -132,20 +94,6 @@ def test_sound_sensors_are_left_alone():
         assert found.settled == sensors | {"sensor_bias:w", "offset:q", "rate_gain:q"}
         for before, after in zip(trials, found.trials, strict=True):
             np.testing.assert_array_equal(before.states, after.states)
-
-
-@pytest.mark.parametrize("bias", [-0.02])
-def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
-    """0.05 rad/s are 20 cm of way in a run of 4 s; which of the two is off, the physics says."""
-    found = preflight(ARM, arm(columns(w=lambda x: x + bias)))
-    (one,) = found.findings
-    assert (one.signal, one.kind, one.corrected) == ("w", "offset", False)
-    assert ("more" if bias > 0 else "less") in one.finding
-    assert not {"sensor_bias:w", "offset:q"} & found.settled
-    (tie,) = integrals(ARM)
-    for seed in range(4):
-        off = constant_of(ARM, tie, arm(columns(w=lambda x: x + bias), seed=seed))
-        assert off.value == pytest.approx(bias, abs=3 * off.std) and off.std < 0.002
 
 
 def stuck(x):
@@ -213,27 +161,6 @@ def test_inputs_that_are_copies_or_constant_are_stated():
     found = {f.signal: f for f in preflight(model, trials).findings}
     assert {n: f.kind for n, f in found.items()} == {"seen": "copy", "kp": "constant"}
     assert found["seen"].delay_s == pytest.approx(2 * DT, rel=0.02)
-
-
-def test_kinematics_come_from_the_model():
-    assert [
-        (pendulum.state_names[r.i], pendulum.state_names[r.j]) for r in integrals(pendulum)
-    ] == [("theta", "omega")]
-    plane = turned(car)
-    assert plane is not None and turned(ARM) is None
-    names = [car.state_names[i] for i in (plane.i, plane.j, plane.k)]
-    assert set(names[:2]) == {"x", "y"} and names[2] == "psi"
-
-
-@pytest.mark.parametrize("factor", [1e3])
-def test_commands_in_another_unit_in_one_trial_are_told(factor):
-    trials = arm(friction=0.4)
-    odd = replace(trials[2], inputs=factor * trials[2].inputs, start_inputs=np.array([factor]))
-    found = preflight(ARM, [*trials[:2], odd, trials[3]])
-    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [("u", "scale", True)]
-    assert found.findings[0].scale == pytest.approx(factor)
-    np.testing.assert_allclose(found.trials[2].inputs, trials[2].inputs)
-    np.testing.assert_allclose(found.trials[2].start_inputs, [1.0])
 
 
 BEAM = Model(
@@ -309,42 +236,3 @@ def test_a_rate_in_rpm_is_said_to_be_in_rpm(factor, rpm, mended):
     assert (found.signal, found.corrected) == ("w", mended)
     assert ("rpm" in found.finding) == rpm
     assert found.log == "scale = 0.10471976" * mended
-
-
-def adopted(model, *effects):
-    """Return a model with effects, the innermost first."""
-    for name, values in effects:
-        effect = Library().effect(name, model)
-        model = wrap(effect, values, DT)
-    return model
-
-
-def run_of(model, shown, inputs, noise):
-    """A run of a model from 0, with noise on its first `shown` states; the others are memory."""
-    rng, states = np.random.default_rng(0), [np.zeros(model.n)]
-    for u in inputs:
-        states.append(model.system.step(states[-1][None], u[None], model.values, DT)[0])
-    x = np.array(states) + noise * rng.standard_normal((len(states), model.n))
-    x[:, shown:] = np.nan
-    return Trial(x, inputs, DT, model.state_names, model.input_names)
-
-
-ROVER = Model(
-    states={"omega": "rad/s", "psi": "rad"},
-    inputs={"turn": "rad/s"},
-    derivative=lambda s, a, p: {"omega": (a.turn - s.omega) / 0.12, "psi": s.omega},
-)
-
-
-def test_a_delay_that_is_part_of_the_model_is_not_corrected_again():
-    late = adopted(ROVER, ("sensor_delay:omega", {"d": 0.14 * DT}))
-    t = np.arange(1500) * DT
-    inputs = np.sin(1.3 * t)[:, None] + np.sign(np.sin(0.7 * t))[:, None]
-    trial = run_of(late, ROVER.n, inputs, 1e-4)
-    found = preflight(late, [trial], hidden=late.state_names[ROVER.n :])
-    assert not found.findings
-    np.testing.assert_array_equal(found.trials[0].states, trial.states)
-
-    own = Trial(trial.states[:, : ROVER.n], inputs, DT, ROVER.state_names, ROVER.input_names)
-    (one,) = preflight(ROVER, [own]).findings
-    assert one.signal == "omega" and one.delay_s == pytest.approx(0.14 * DT, abs=0.02 * DT)

@@ -3,10 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from grounded import Model, Param, Trial
-from grounded.accounts.time_step import judge_time_step
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
 
@@ -35,16 +33,6 @@ def run(model, seed=0, steps=200):
         states.append(fine.system.step(states[-1][None], one[None], fine.values, DT)[0])
     noise = rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
     return Trial(np.array(states) + noise, u, DT, model.state_names, model.input_names)
-
-
-@pytest.mark.parametrize(("rate", "enough"), [(10.0, 0), (40.0, 0), (95.0, 2), (280.0, 4)])
-def test_a_motor_that_is_too_fast_for_a_step(rate, enough):
-    model = motor(rate)
-    found = judge_time_step(model, [run(model)], [0, 1])
-    assert len(found) == (enough > 0)
-    if enough:
-        assert found[0].kind == "time step" and f"substeps={enough}" in found[0].advice
-        assert not judge_time_step(replace(model, substeps=enough), [run(model)], [0, 1])
 
 
 def test_the_verdict_tells_it():

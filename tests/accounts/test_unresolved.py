@@ -39,18 +39,3 @@ def test_a_whirling_trial_is_cut_where_the_model_cannot_be_integrated():
         assert words in found.finding
     (line,) = [x for x in instrument_lines(looked.findings) if "time steps" in x]
     assert line.startswith("q2_vel: reaches 331 rad/s") and "corrected" not in line
-
-
-@pytest.mark.parametrize(
-    "trials",
-    [
-        [driven(0, WHIRL)],  # nothing to compare it with
-        [driven(k, WHIRL) for k in range(3)],  # it is the manoeuvre
-        [driven(k) for k in range(3)],
-        [driven(0, size=1.0), driven(1), driven(2)],  # large, but no faster than a step resolves
-    ],
-)
-def test_others_are_kept_whole(trials):
-    looked = preflight(arm, trials)
-    assert not [one for one in looked.findings if one.kind == "unresolved"]
-    assert [t.known_steps for t in looked.trials] == [80] * len(trials)

@@ -78,16 +78,6 @@ def compass(x: Array) -> Array:
     return y
 
 
-@pytest.mark.parametrize("trials", [1, 3])
-def test_speeds_in_the_axes_of_the_positions_stop_and_are_no_degrees(trials):
-    with pytest.raises(UnusableTrials) as no:
-        preflight(BOAT, logged(in_the_world, trials))
-    first = no.value.finding
-    assert (first.code, first.about, first.facts["heading"]) == ("log.axes", ("u", "v"), "psi")
-    assert no.value.then is not None
-    assert no.value.then.arguments == tuple(f"t{k:04}" for k in range(trials))
-
-
 def test_one_trial_with_speeds_in_other_axes_is_named_alone():
     odd = [*SOUND[:2], *logged(in_the_world, 3)[2:]]
     with pytest.raises(UnusableTrials) as stopped:

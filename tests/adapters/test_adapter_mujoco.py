@@ -14,7 +14,6 @@ from facts import holding
 mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
-from grounded.adapters.beside import beside, recorded  # noqa: E402
 from grounded.adapters.mujoco_files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
@@ -108,15 +107,6 @@ def test_pendulum_has_the_names_units_angles_and_limits_of_the_file() -> None:
     assert values["motor_gear"] == (3.0, "1", 0.0)
     assert adapter.limits(PENDULUM) == {"motor": (-2.0, 2.0)}
     assert adapter.model(PENDULUM, params={"pole.mass": (0.5, 2)}).params["pole_mass"].high == 2
-
-
-def test_pendulum_swings_as_the_equation_says() -> None:
-    model = adapter.model(PENDULUM, timestep=1e-4)
-    x = np.array([0.3, -0.2])
-    moved = step(model, x, [0.1], dt=0.001)[0]
-    inertia = 0.25 + 0.4 * 1e-4
-    acceleration = (0.3 - 0.1 * x[1] - 9.81 * 0.5 * np.sin(x[0])) / inertia
-    assert (moved[1] - x[1]) / 0.001 == pytest.approx(acceleration, rel=2e-3)
 
 
 def cart_pole(x: Any, force: Any) -> Any:
@@ -228,29 +218,6 @@ def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
     np.testing.assert_array_equal(copied.advance(x, u, model.values, 0.02), together)
 
 
-@pytest.mark.parametrize("most", [20, 2])
-def test_samples_with_parameters_of_their_own_step_together(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(adapter, "MOST_COPIES", most)  # more than that are stepped in turn
-    model = adapter.model(PENDULUM, params=("pole.mass", "hinge.damping"))
-    rng = np.random.default_rng(5)
-    x, u = rng.normal(size=(90, 2)), rng.normal(size=(90, 1))
-    each = model.values * np.array([[1.0, 1.0], [1.5, 1.2], [0.7, 3.0]])
-    p = each[rng.integers(3, size=90)]
-    assert isinstance(model.step, Stepper)
-    for dt in (0.02, 0.04):
-        found = model.step.rows(x, u, p, dt)
-        for one in each:
-            own = (p == one).all(axis=1)
-            alone = model.system.step(x[own], u[own], one, dt)
-            np.testing.assert_array_equal(found[own], alone)
-    assert np.abs(found - model.system.step(x, u, model.values, 0.04)).max() > 1e-3
-    x[4] = np.nan
-    found = model.step.rows(x, u, p, 0.02)
-    assert np.isnan(found[4]).all() and np.isfinite(np.delete(found, 4, axis=0)).all()
-
-
 def test_derivatives_are_those_of_central_differences() -> None:
     for xml in (ARM.format(**NOMINAL | {"frictionloss": 0.0}), FREE):
         model = adapter.model(xml)
@@ -292,43 +259,6 @@ def test_a_step_that_is_no_multiple_a_missing_file_and_a_broken_one(tmp_path: Pa
         adapter.model(tmp_path / "nothing.xml")
     with pytest.raises(GroundedError, match=holding("MJCF", "wrong")):
         adapter.model("<mujoco><wrong/></mujoco>")
-
-
-def test_a_control_step_with_the_jitter_of_a_log_is_made_exactly() -> None:
-    model, x, u = adapter.model(PENDULUM), [0.3, -0.2], [0.1]
-    exact = step(model, x, u, dt=0.05)
-    late = step(model, x, u, dt=0.0500045)
-    assert np.array_equal(step(model, x, u, dt=0.05), exact), "the timestep is put back"
-    own = step(adapter.model(PENDULUM, timestep=0.00500045), x, u, dt=0.0500045)
-    np.testing.assert_allclose(late, own, rtol=1e-14)
-    assert late[0, 0] != exact[0, 0]
-    assert getattr(model.step, "timestep", 0.0) == 0.005
-    for dt in (0.0503, 0.0525):
-        with pytest.raises(GroundedError, match="not a whole multiple") as refused:
-            step(model, x, u, dt=dt)
-        advised = float(str(refused.value).split("timestep=")[1].split(",")[0])
-        assert np.isfinite(step(adapter.model(PENDULUM, timestep=advised), x, u, dt=dt)).all()
-
-
-def test_a_model_file_names_its_files_beside_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot, elsewhere = tmp_path / "robot", tmp_path / "elsewhere"
-    (robot / "parts").mkdir(parents=True)
-    elsewhere.mkdir()
-    drives = '<mujoco><actuator><motor name="m" joint="hinge"/></actuator></mujoco>'
-    (robot / "parts" / "drives.xml").write_text(drives)
-    whole = PENDULUM.replace("</mujoco>", '<include file="parts/drives.xml"/></mujoco>')
-    (robot / "a.xml").write_text(whole)
-    monkeypatch.chdir(elsewhere)
-    with pytest.raises(GroundedError, match=r"no MJCF or URDF file a\.xml"):
-        adapter.model("a.xml")
-    with recorded() as read, beside(robot):
-        assert adapter.model("a.xml").input_names == ("motor", "m")
-        assert "motor" in adapter.limits("a.xml")
-    assert {path for _, path in read} == {robot / "a.xml", robot / "parts" / "drives.xml"}
-    (elsewhere / "a.xml").write_text(PENDULUM)
-    assert adapter.model("a.xml").input_names == ("motor",), "else in the current folder"
 
 
 MARKED = """

@@ -71,11 +71,3 @@ def test_an_older_document_is_read_with_what_it_has():
 def test_what_is_no_diagnosis_is_refused(document):
     with pytest.raises(GroundedError, match="Diagnosis"):
         Diagnosis.from_json(document)
-
-
-def test_values_of_an_effect_that_is_not_there_are_an_error_that_names_what_is():
-    found = Diagnosis.from_json(DIAGNOSIS)
-    with pytest.raises(GroundedError, match=r"'drag:v'.*viscous_friction:v"):
-        found.values("drag:v")
-    with pytest.raises(GroundedError, match="no value"):
-        Diagnosis.from_json({"verdict": {"kind": "none"}}).values("drag:v")

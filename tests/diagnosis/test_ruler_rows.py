@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from grounded.diagnosis.error_report import Remainder, RulerRow, furthest
@@ -10,7 +9,6 @@ from grounded.diagnosis.errors_told import (
     excess,
     lost_most,
     objection,
-    outweighed,
     telling,
 )
 from grounded.diagnosis.parts import Agreement
@@ -33,24 +31,6 @@ def whole(crude, after, **more):
 
 SHORT = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
 LONG = whole({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3})
-
-
-@pytest.mark.parametrize(
-    ("rows", "worse", "outweighs"),
-    [
-        ((), False, False),
-        ((SHORT,), True, False),  # v loses, x gains more
-        ((SHORT, LONG), True, True),
-        ((row({"x": 0.2}, {"x": 0.205}),), False, False),
-        ((row({"x": 0.2, "v": 0.5}, {"x": 0.23, "v": 0.5}),), True, True),
-        ((row({"x": 0.2, "v": 0.5}, {"x": 0.21, "v": 0.4}),), False, False),
-        ((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),), False, None),  # within the noise
-        ((row({"x": 0.02, "v": 0.1}, {"x": np.nan, "v": 0.1}),), False, None),
-    ],
-)
-def test_what_is_called_worse_and_whether_it_outweighs(rows, worse, outweighs):
-    assert (lost_most(rows) is not None) is worse
-    assert outweighs is None or outweighed(rows) is outweighs
 
 
 def test_what_noise_alone_drowns_or_what_diverges_is_not_told():

@@ -81,14 +81,6 @@ def test_three_lines_say_what_how_good_and_what_is_open():
     assert said.rows == ((FRICTION, "k = 0.400 +- 0.020 1/s", "90 %"),)
 
 
-def test_what_is_tied_stands_below_its_cause():
-    tie = (FRICTION, DRAG)
-    found = diagnosed(indistinguishable=(tie,))
-    assert [row[0] for row in told(found).rows] == [FRICTION, f"or {DRAG}"]
-    assert "tie" in codes(found)
-    assert "equivalent" in codes(replace(found, equivalent=(tie,)))
-
-
 @pytest.mark.parametrize(
     ("verdict", "rows", "code"),
     [

@@ -57,8 +57,3 @@ ROTOR = Model(
 def test_an_effect_is_another_value_of_a_constant(model, effect, size, values):
     found = {one.parameter: one.value for one in declared(model, effect, size, 0.01)}
     assert found == pytest.approx(values)
-
-
-def test_its_error_is_that_of_the_effect():
-    (one,) = declared(ROVER, "rate_gain:psi", -0.2, 0.04)
-    assert (one.std, one.was) == pytest.approx((0.25 / 0.8 * 0.04, 0.2))

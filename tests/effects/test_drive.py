@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
-from grounded.effects import Library, wrap
-from grounded.effects.drive import combined_speeds, weights_at
-from grounded.effects.joint import pairs_of, springs_of
+from grounded.effects.drive import weights_at
 from grounded.models.arm import model as arm
 
 DT, HALF_TRACK = 0.02, 0.15
-LEFT, RIGHT = "joint_friction:left<-v+r", "joint_friction:right<-v+r"
 
 
 def drives(s, a, p):
@@ -48,14 +45,6 @@ rover = Model(
 )
 
 
-def test_a_wheel_turns_with_the_speed_and_the_yaw_rate():
-    speeds = combined_speeds(rover)
-    assert pairs_of(rover) == ["left<-v+r", "right<-v+r"] and springs_of(rover) == []
-    for name, side in (("left", -1), ("right", 1)):
-        assert speeds[name] == pytest.approx({"v": 1.0, "r": side * HALF_TRACK})
-    assert combined_speeds(arm) == {}
-
-
 def other(**terms):
     """The rover with other rates, which `terms` compute from s."""
 
@@ -64,19 +53,6 @@ def other(**terms):
         return rates | {name: rates[name] + more(s) for name, more in terms.items()}
 
     return replace(rover, derivative=dynamics)
-
-
-def test_the_loss_of_a_wheel_turns_the_robot():
-    stiff = wrap(Library().effect(LEFT, rover), {"c": 0.6, "b": 0.0}, DT)
-    x = np.array([[0.0, 0.0, 0.0, 0.5, 0.4]])
-    u = np.array([[4.0, 4.0]])
-    after = stiff.system.step(x, u, stiff.values, DT)
-    less = rover.system.step(x, u - np.array([0.6, 0.0]), rover.values, DT)
-    assert after == pytest.approx(less, abs=1e-6)
-    back = np.array([[0.0, 0.0, 0.0, 0.1, 2.0]])  # the left wheel turns backwards
-    after = stiff.system.step(back, u, stiff.values, DT)
-    more = rover.system.step(back, u + np.array([0.6, 0.0]), rover.values, DT)
-    assert after == pytest.approx(more, abs=1e-6)
 
 
 cart = Model(

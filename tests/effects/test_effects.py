@@ -23,7 +23,6 @@ from grounded.effects import (
     wrap,
 )
 from grounded.models.car import model as car
-from grounded.models.cart_pole import model as cart_pole
 
 DT = 0.05
 
@@ -200,32 +199,6 @@ def test_sensor_delay():
     names = wrapped.state_names
     # d = 2 steps: the log of step 21 is the truth of step 19, which step 20 calls "one ago"
     assert after[names.index("psi")] == pytest.approx(z[names.index("psi_true_1")], abs=1e-12)
-
-
-def test_a_position_and_its_own_velocity_are_late_together():
-    """Their logs are the true ones of 1.4 steps ago, both; the motion itself is the model's."""
-    effect = Library().effect("sensor_delay:theta+theta_vel", cart_pole)
-    wrapped = wrap(effect, {"d": 1.4 * DT}, DT)
-    u = np.sin(np.arange(12) / 3)[:, None]
-    true, z = [np.array([0.1, 3.0, 0.2, -0.3])], [np.zeros(wrapped.n)]
-    for row in u:
-        true.append(cart_pole.system.step(true[-1][None], row[None], cart_pole.values, DT)[0])
-    still = Trial(true[0][None], u[:0], DT, cart_pole.state_names, cart_pole.input_names)
-    z = [np.concatenate([true[0], memory_start(wrapped, cart_pole, still)])]
-    for row in u:
-        z.append(wrapped.system.step(z[-1][None], row[None], wrapped.values, DT)[0])
-    x, logged = np.array(true), np.array(z)[:, :4]
-    np.testing.assert_allclose(logged[:, [0, 2]], x[:, [0, 2]], atol=1e-12)
-    late = 0.6 * x[1:-1] + 0.4 * x[:-2]
-    np.testing.assert_allclose(logged[2:, [1, 3]], late[:, [1, 3]], atol=1e-12)
-
-
-def test_missing_and_unknown_quantities_are_named():
-    effect = Library().effect("dead_zone:throttle", car)
-    with pytest.raises(GroundedError, match="no quantity 'width'"):
-        wrap(effect, {"width": 0.1}, DT)
-    with pytest.raises(GroundedError, match="'c' of effect"):
-        wrap(effect, {}, DT)
 
 
 def test_the_docs_have_a_row_for_every_family():

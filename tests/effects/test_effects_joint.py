@@ -11,7 +11,6 @@ from grounded import Model, Param, Trial
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 from grounded.effects.joint import FAMILIES, like_a_load, pairs_of
@@ -128,59 +127,6 @@ def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
     np.testing.assert_allclose(got, want, atol=1e-9)
     assert np.abs(want - predictor.step(x, u, arm.values)).max() > 1e-3
     assert not model.system.note  # it is compiled
-
-
-@pytest.mark.parametrize(
-    ("family", "values"),
-    [
-        ("joint_friction", {"c": 0.3, "b": 0.2}),
-        ("added_inertia", {"J": 0.05}),
-        ("joint_spring", {"k": 2.0, "b": 0.1}),
-    ],
-)
-def test_the_jacobian_goes_through_a_loss(family, values):
-    predictor = Predictor(prepare(arm, real_trials(2, 60)))
-    h = Hypothesis()
-    for pair in SPRINGS if family == "joint_spring" else PAIRS:
-        effect = Library().effect(f"{family}:{pair}", arm, predictor.data.scales)
-        h = h.plus(effect, values)
-    track, u = predictor.data.y, predictor.inputs(h)
-    F = step_jacobian(predictor, h, track)
-    both, f_p = sensitivities_of(predictor, h, track[:-1], u)
-    np.testing.assert_allclose(both, F, atol=1e-9)
-    x, size, t = track[:-1], 1e-6, predictor.data.time
-    for j in range(4):
-        up, down = x.copy(), x.copy()
-        up[..., j] += size
-        down[..., j] -= size
-        slope = predictor.advance(h, up, u, t) - predictor.advance(h, down, u, t)
-        error = np.abs(F[..., j] - slope / (2 * size)).max(axis=-1)
-        assert np.quantile(error, 0.85) < 0.02 * np.abs(F).max()
-    heavier = replace(h, shift=np.array([size]))
-    slope = (predictor.advance(heavier, x, u, t) - predictor.advance(h, x, u, t)) / size
-    assert np.quantile(np.abs(f_p[..., 0] - slope), 0.85) < 0.02 * np.abs(slope).max()
-
-
-def crane(unit):
-    """A trolley with a hanging load, its command in any unit."""
-
-    def rates(s, a, p):
-        sn, cs = np.sin(s.theta), np.cos(s.theta)
-        acc = (p.k * a.motor + 0.6 * s.omega**2 * sn + 9.81 * sn * cs) / (2 + sn**2)
-        return {"x": s.v, "v": acc, "theta": s.omega, "omega": -(acc * cs + 9.81 * sn) / 0.6}
-
-    states = {"x": "m", "v": "m/s", "theta": "rad", "omega": "rad/s"}
-    return Model(states=states, inputs={"motor": unit}, params={"k": Param(15.0)}, derivative=rates)
-
-
-@pytest.mark.parametrize("unit", ["%", "N"])
-def test_what_a_motor_loses_is_offered_whatever_its_commands_unit(unit):
-    assert pairs_of(crane(unit)) == ["motor<-v"]
-    effect = Library().effect("joint_friction:motor<-v", crane(unit))
-    lost = effect.free[0]
-    assert lost.name == "c" and lost.unit == unit
-    better = wrap(Library().effect("first_order_lag:motor", crane(unit)), {"tau": 0.05}, DT)
-    assert pairs_of(better) == ["motor<-v"]
 
 
 def test_no_joint_is_made_of_what_drives_one_axis_or_is_tilted():

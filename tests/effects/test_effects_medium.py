@@ -13,7 +13,6 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
-from grounded.effects.medium import turning
 from grounded.search.planner import planner_with
 from small_tasks import plain_task
 
@@ -109,20 +108,6 @@ def adopted(*parts: tuple[str, dict[str, float]], model: Model = boat) -> Model:
     """The model that plans with these effects."""
     task = plain_task(model, DT, np.zeros((11, model.n)), 1.0, 1.0, terminal=1.0, effort=1.0)
     return planner_with(task, parts).plan.model
-
-
-def test_a_product_of_velocities_is_added_to_each_of_the_three_rates():
-    """The boat's u' = ... + v r, v' = ... - u r: with added masses, others."""
-    assert turning(boat) == ("u", "v", "r")
-    parts = [("coriolis:u", {"k": 0.4}), ("coriolis:v", {"k": -0.3}), ("coriolis:r", {"k": 0.2})]
-    model, (x, u) = adopted(*parts), (TRIALS[0].states[10::30], TRIALS[0].inputs[10::30])
-    after = model.system.step(x, u[: len(x)], model.values, 1e-6)
-    before = boat.system.step(x, u[: len(x)], boat.values, 1e-6)
-    more = dict(zip(STATES, ((after - before) / 1e-6).T, strict=True))
-    ahead, aside, turned = x.T[:3]
-    np.testing.assert_allclose(more["u"], 0.4 * aside * turned, atol=1e-4)
-    np.testing.assert_allclose(more["v"], -0.3 * ahead * turned, atol=1e-4)
-    np.testing.assert_allclose(more["r"], 0.2 * ahead * aside, atol=1e-4)
 
 
 @pytest.mark.parametrize(

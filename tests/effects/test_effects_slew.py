@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
-from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import linearise
-from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded import Model, Param
 from grounded.effects import Library, wrap
 
 DT = 0.02
@@ -38,17 +34,3 @@ def test_a_long_way_goes_at_the_limit_and_arrives(tau):
     np.testing.assert_allclose(x[1:16], 1.5 * DT * np.arange(1, 16), atol=1e-12)
     assert x[-1] == pytest.approx(0.6, abs=1e-3)
     assert np.diff(x).max() <= 1.5 * DT + 1e-12
-
-
-def test_the_filter_knows_that_a_limited_state_keeps_its_error():
-    model = servo(0.02)
-    u = np.where(np.arange(30) < 15, 0.01, 1.0)[:, None]
-    trial = Trial(np.zeros((31, 1)), u, DT, ("angle",), ("command",), start_inputs=np.zeros(1))
-    predictor = Predictor(prepare(model, [trial, trial]))
-    h = Hypothesis(spread=0.1).plus(limit(model), {"r": 1.5})
-    F, d, _ = linearise(predictor, h, predictor.data.y.copy())
-    free, held = F[:15, 0, 0, 0], F[15:, 0, 0, 0]
-    np.testing.assert_allclose(free, 0.375)  # RK4 of exp(-1)
-    np.testing.assert_allclose(held, 1.0)
-    np.testing.assert_allclose(d[15:, 0, 0, 2], 0.0, atol=1e-9)  # no parameter matters there
-    assert np.abs(d[:15, 0, 0, 2]).min() > 1e-4

@@ -49,14 +49,6 @@ def test_finished_jobs_are_kept_and_not_run_again():
     assert seen == [(3, 5), (4, 5), (5, 5)]
 
 
-def test_results_of_other_code_are_not_reused(monkeypatch):
-    kept = {}
-    run_jobs(draws(1), finished=kept)
-    monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
-    run_jobs(draws(1), finished=kept)
-    assert len(kept) == 2
-
-
 def test_a_worker_with_another_version_is_refused(monkeypatch):
     monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
     with pytest.raises(GroundedError, match=holding("version", "grounded")):
@@ -77,12 +69,6 @@ def test_workers_that_keep_dying_end_the_study_with_what_is_done():
     with pytest.raises(GroundedError, match=holding("1 of 3", "--jobs")):
         run_jobs(jobs, Engine(jobs=2), finished=kept)
     assert set(kept) <= {job.key for job in jobs[:2]}
-
-
-def test_a_mistake_in_a_job_is_not_taken_for_a_lost_worker():
-    for engine in (None, Engine(jobs=2)):
-        with pytest.raises(ValueError, match="a mistake"):
-            run_jobs([Job(experiment_jobs.fails, {"seed": 0})] * 2, engine)
 
 
 def test_engines_that_make_no_sense_are_refused():

@@ -130,33 +130,6 @@ def test_a_constant_input_identifies_no_gain_and_no_delay_of_it():
         assert any(name in one.about for one in found.findings if one.code == "model.not_told")
 
 
-def test_a_state_without_a_sensor_is_estimated():
-    tanks = Model(
-        states={"upper": "V", "lower": "V"},
-        inputs={"pump": "V"},
-        params={name: Param(0.05, "1/s", 0.01, 0.2) for name in "abc"} | {"d": Param(0.05)},
-        derivative=lambda s, a, p: {
-            "upper": p.d * a.pump - p.a * np.sqrt(np.maximum(s.upper, 1e-3)),
-            "lower": p.b * np.sqrt(np.maximum(s.upper, 1e-3))
-            - p.c * np.sqrt(np.maximum(s.lower, 1e-3)),
-        },
-    )
-    rng, trials, true = np.random.default_rng(2), [], {"a": 0.05, "b": 0.04, "c": 0.04}
-    for _ in range(3):
-        pump, states = np.repeat(rng.uniform(1.0, 6.0, 8), 25)[:, None], [np.array([[4.0, 5.0]])]
-        for u in pump:
-            values = np.array([*true.values(), 0.05])
-            states.append(tanks.system.step(states[-1], u[None], values, 4.0))
-        logged = np.concatenate(states) + 0.02 * rng.standard_normal((201, 2))
-        logged[:, 0] = np.nan
-        trials.append(Trial(logged, pump, 4.0, tanks.state_names, tanks.input_names))
-    found = fit(tanks, trials)
-    for name, value in true.items():
-        assert found.params[name].value == pytest.approx(value, rel=0.05)
-        assert found.params[name].low < value < found.params[name].high
-    assert found.after.names == ("lower",) and found.after.ahead[0] < 0.5 * found.before.ahead[0]
-
-
 def test_prediction_error_falls_to_the_noise_for_the_true_model():
     trials = simulated(SPRING, 8, ((1e-5, 1e-5), (0.01, 0.05)))
     error = prediction_error(SPRING, trials)

@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 
 from grounded.effects.sensor import lagging
-from grounded.fit import Fit, fit
+from grounded.fit import fit
 from grounded.model import Model, Param
-from grounded.rollout import simulate
-from grounded.search.improve import refitted
 from grounded.trial import Trial
-from small_tasks import cart_task
 
 DT, TAU = 0.02, 0.03
 AXIS = Model(
@@ -57,15 +54,6 @@ def runs(tau=TAU, count=4, steps=250, seed=0):
     return found
 
 
-def pushed(task, seed):
-    """Return a run of a cart under varying pushes."""
-    rng = np.random.default_rng(seed)
-    force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)
-    run = simulate(task.problem(exact=True), task.policy(force, None, None))
-    seen = run.states + rng.normal(0, 0.002, run.states.shape)
-    return Trial(seen, force, task.dt, task.model.state_names, task.model.input_names)
-
-
 def test_a_filter_of_speeds_is_not_fitted_as_friction():
     trials = runs(count=3, steps=200)
     found = fit(AXIS, trials)
@@ -75,12 +63,3 @@ def test_a_filter_of_speeds_is_not_fitted_as_friction():
         assert found.params[name].low < value < found.params[name].high
     assert found.after.names == AXIS.state_names == found.model.state_names
     assert found.helps and {*found.params} == {*TRUE}
-
-
-def test_values_that_predict_worse_are_not_planned_with(monkeypatch):
-    task = cart_task()
-    other = task.with_model(task.model.with_values({"mass": 2.0}))
-    trials = [pushed(other, seed) for seed in range(3)]
-    assert refitted(task, trials).params["mass"].value == pytest.approx(2.0, rel=0.1)
-    monkeypatch.setattr(Fit, "worse", True)
-    assert refitted(task, trials) is task.model

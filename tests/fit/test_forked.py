@@ -3,9 +3,7 @@
 import os
 import signal
 import time
-from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
 from grounded import engine, forked
@@ -18,14 +16,6 @@ HERE = os.getpid()
 @pytest.fixture(autouse=True)
 def always(monkeypatch):
     monkeypatch.setattr(forked, "WORTH_S", 1e-9)
-
-
-@dataclass(frozen=True)
-class Given:
-    """Can't be pickled: it holds a function that has no name."""
-
-    function: object
-    values: np.ndarray
 
 
 @pytest.fixture(autouse=True)
@@ -56,26 +46,6 @@ def test_pieces_are_shared_and_come_back_in_order(copied):
         found = each(lambda i: (time.sleep(0.1), *slowly(i))[1:], list(range(12)))
     assert [i for i, _ in found] == list(range(12))
     assert (len({process for _, process in found}) > 1) is copied  # a busy machine may start one
-
-
-def test_what_a_piece_was_given_comes_back_as_the_same_object():
-    given = [Given(lambda x: x + 1, np.arange(5.0)) for _ in range(8)]
-
-    def made(one, k):
-        slowly(k)
-        return {
-            "one": one,
-            "values": one.values,
-            "new": one.function(one.values),
-            "by": os.getpid(),
-        }
-
-    with running(Engine(2)):
-        found = each(made, given, list(range(8)))
-    assert {result["by"] for result in found} > {HERE}
-    for one, result in zip(given, found, strict=True):
-        assert result["one"] is one and result["values"] is one.values
-        assert (result["new"] == one.values + 1).all()
 
 
 def killed(i):

@@ -1,15 +1,11 @@
 """Constants never change; only uncertain parameters that the trials identify are written."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from facts import holding
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation import limits
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.fit import fit
@@ -105,22 +101,3 @@ def test_parameters_that_are_known_only_together_are_written_together():
     assert all(one["jointly"] for one in written)
     (one,) = [one for one in diagnosis.findings if one.code == "model.jointly"]
     assert one.about == ("a", "b")
-
-
-def test_what_is_known_but_for_one_factor_is_adopted_whole(monkeypatch):
-    model = motor(
-        mass=Param(30.0, "kg", 15.0, 80.0), gain=Param(20.0, "N", 5.0, 60.0), drag=Param(10.0)
-    )
-    values, spreads = (
-        np.array([15.0, 50.0]),
-        np.array([model.params[n].spread for n in ("mass", "gain")]),
-    )
-    ratio = spreads / values * np.array([1.0, -1.0])  # what the trials show: gain / mass
-    known = {n: Estimate(v, 0.23 * v) for n, v in zip(("mass", "gain"), values, strict=True)}
-    monkeypatch.setattr(limits, "_information", lambda *_: 1e6 * np.outer(ratio, ratio))
-    predictor = SimpleNamespace(data=SimpleNamespace(model=model))
-    of = {one.parameter: one for one in limits.identifiable(predictor, None, known)}
-    assert of["gain"].verdict == "not identifiable" and of["gain"].jointly and not of["gain"].lost
-    monkeypatch.setattr(limits, "_information", lambda *_: np.diag([1e6, 0.0]))
-    of = {one.parameter: one for one in limits.identifiable(predictor, None, known)}
-    assert of["gain"].lost  # nothing shows it, whatever the mass

@@ -124,15 +124,6 @@ def test_what_takes_too_long_is_ended_as_by_ctrl_c():
         slowly(0.0)
 
 
-def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
-    def stop(stage):
-        if stage.startswith("fit"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(Interrupted, match=r"gain = .* m/s"):
-        fit(MODEL, trials, progress=stop)
-
-
 def test_a_fit_is_the_same_with_one_worker_and_with_three(trials, monkeypatch):
     monkeypatch.setattr(forked, "WORTH_S", 1e-9)
     monkeypatch.setattr(sys.modules["grounded.diagnosis.likelihood.refine"], "MOST_NUMBERS", 1.0)

@@ -25,7 +25,6 @@ from ros_bags import (
     boat_bag,
     car_bag,
     commanded_arm_bag,
-    rover_bag,
     thruster_bag,
 )
 from shared_data import data
@@ -51,16 +50,6 @@ def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
     assert fitted["L"]["value"] == pytest.approx(0.32, abs=0.01)
     proposed = grounded("-C", w, "propose", "--json").json
     assert proposed["candidate"] == "c0001"
-
-
-def test_a_robot_on_wheels_that_lists_its_joints_drives(tmp_path):
-    log, w = rover_bag(tmp_path / "bag"), tmp_path / "w"
-    found = begin(w, log)
-    paths = {guess.name: guess.path for guess in found.inputs}
-    assert found.kind == "rover"
-    assert paths == {"speed": "/cmd_vel.linear.x", "turn": "/cmd_vel.angular.z"}
-    assert not found.unsure and found.dt == 0.05
-    assert grounded("-C", w, "ingest", "--data", log).code == 0
 
 
 def test_the_joints_of_an_arm_by_name(tmp_path):

@@ -39,11 +39,6 @@ def heater(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
     return Workspace("w")
 
 
-def test_a_step_in_the_first_row_is_told(heater: Workspace) -> None:
-    (told,) = of_code(heater.ingest("heat.csv", data=True), "log.from")
-    assert told.about == ("Q1",) and told.facts["value"] == 50
-
-
 def test_what_was_sent_before_is_given(heater: Workspace) -> None:
     done = heater.ingest("heat.csv", data=True, before={"Q1": 0.0})
     assert not of_code(done, "log.from")
@@ -54,9 +49,3 @@ def test_what_was_sent_before_is_given(heater: Workspace) -> None:
     assert 299 <= trial.steps <= 301
     with pytest.raises(GroundedError, match="Q1"):
         heater.ingest("heat.csv", data=True, before={"Q2": 0.0})
-
-
-def test_the_option_takes_pairs(heater: Workspace) -> None:
-    given = ("-C", "w", "ingest", "--data", "heat.csv")
-    assert grounded(*given, "--before", "Q1").code == 2
-    assert grounded(*given, "--before", "Q1=0").code == 0

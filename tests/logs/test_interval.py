@@ -54,21 +54,6 @@ def test_the_interval_is_found_in_what_rows_show(every, rows, more):
     assert changes_every(gaps(every, rows, **more), rows) == every
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        np.full(2000, 0.01),  # every row
-        np.full(40, 1.0),  # a test signal's steps
-        np.full(15, 0.05),  # too few
-        np.round(np.random.default_rng(0).exponential(0.08, 500) + 0.01, 2),  # whenever
-        np.tile([0.05, 0.05, 0.06, 0.08], 30),
-        0.02 + np.random.default_rng(0).choice([-0.005, 0.0, 0.0, 0.005], 400),  # in no step
-    ],
-)
-def test_what_no_interval_explains_has_none(times):
-    assert changes_every(times, 0.01) is None
-
-
 def table(path, every):
     """A run of 20 s, a row every 10 ms, whose command changes every so many rows."""
     rng, t = np.random.default_rng(1), np.arange(2000) * 0.01

@@ -47,22 +47,6 @@ def grid(x: Series, u: Series | None = None, **options: object):  # type: ignore
     return to_grid({"x": x, "u": u or command()}, 0.05, ["x"], ["u"], **options)  # type: ignore[arg-type]
 
 
-def test_a_moving_state_is_interpolated_and_commands_keep_their_step() -> None:
-    found = grid(pose(np.sin))
-    t = 0.05 * np.arange(len(found.states))
-    np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-5)
-    assert found.inputs[:, 0].tolist() == list(range(40))
-    assert found.start_ns == EPOCH and found.start_inputs is None and found.warnings == ()
-
-
-def test_late_and_early_commands_are_not_moved_to_another_step() -> None:
-    rng = np.random.default_rng(0)
-    t = np.arange(40) * 0.05 + rng.uniform(0, 0.02, 40)
-    t[0] = 0.0
-    found = grid(pose(np.sin), series(t, np.arange(40), SignalSpec("/u", "log")))
-    assert found.inputs[:40, 0].tolist() == list(range(40))
-
-
 def test_a_delay_is_taken_back() -> None:
     speed = 1.0  # [m/s]: 7 ms are 7 mm
     stamps_late = pose(lambda t: speed * (t - 0.007))
@@ -144,19 +128,6 @@ def test_values_that_are_no_numbers() -> None:
     assert found.reports[0].not_finite == np.sum(~np.isfinite(values))
     with pytest.raises(GroundedError, match=holding(340, "finite")):
         grid(replace(x, values=np.full(len(values), np.nan)))
-
-
-def test_repeated_and_shuffled_stamps() -> None:
-    x = pose(np.sin)
-    order = np.arange(len(x.t))
-    order[10:20] = order[10:20][::-1]
-    order = np.insert(order, 50, [49, 49])
-    messy = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])
-    found = grid(messy)
-    np.testing.assert_array_equal(found.states, grid(x).states)
-    report = found.reports[0]
-    assert (report.repeated, report.out_of_order) == (2, 9)
-    assert any(one.facts.get("stamps") == 11 for one in found.findings)
 
 
 def test_clocks_that_jump_or_differ_are_refused() -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from grounded.figures.body import motion
-from grounded.model import Param
 from grounded.models import arm, cart_pole, lift, pendulum
 from grounded_trials.report.bodies import body_of, is_mechanism
 from grounded_trials.report.scene import scene_of
@@ -60,24 +57,6 @@ def test_a_motion_is_the_body_seen_from_the_side(model):
         np.testing.assert_allclose([line[0] for line in links], np.array(poses)[: len(links), ::2])
         np.testing.assert_allclose(links[-1][1], tip[[0, 2]], atol=1e-9)
     assert motion(body, np.full((3, model.n), np.nan), 0.1) is None
-
-
-@pytest.mark.parametrize(
-    ("params", "lengths"),
-    [
-        ({"L": Param(0.6, "m"), "k": Param(15.0, "N/V")}, (0.6,)),
-        ({"rope": Param(0.7, "m"), "m": Param(1.0, "kg")}, (0.7,)),
-        ({"length": Param(0.5, "m"), "radius": Param(0.1, "m")}, (0.5,)),
-        ({"l1": Param(0.4, "m"), "radius": Param(0.1, "m")}, (0.4,)),
-        ({"rope": Param(0.7, "m"), "radius": Param(0.1, "m")}, ()),
-        ({"L": Param(0.6, "H")}, ()),
-    ],
-)
-def test_a_link_is_as_long_as_the_model_says(params, lengths):
-    model = replace(pendulum.model, params=params)
-    body = _body(model)
-    assert body.unit == ("m" if lengths else "")
-    assert body.lengths == (lengths or (1.0,))
 
 
 MJCF = """

@@ -33,13 +33,12 @@ from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import png
-from grounded_trials.report.figures.runs import all_figures, error_figure
+from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
-from reported import car, cart, gathered, many_flights
+from reported import car, cart, gathered
 
 __all__ = ["car", "cart"]
 
@@ -81,23 +80,6 @@ def test_a_position_along_one_axis_is_drawn_over_its_speed(roles, axes):
     scene = scene_of(model)
     assert scene.names == axes and not scene.spatial
     assert "3D!grounded" not in foxglove_layout(model)["configById"]
-
-
-def test_rotations_are_right_handed_and_point_along_the_heading():
-    task = many_flights(1).task
-    scene = scene_of(task.model)
-    states = np.random.default_rng(0).uniform(-1, 1, (20, task.model.n))
-    R = scene.rotations(states)
-    np.testing.assert_allclose(
-        np.einsum("tij,tkj->tik", R, R), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12
-    )
-    np.testing.assert_allclose(np.linalg.det(R), 1.0)
-    level = np.zeros((1, task.model.n))
-    level[0, task.model.state_names.index("psi")] = np.pi / 2  # yawed to the east
-    np.testing.assert_allclose(scene.rotations(level)[0][:, 0], [1, 0, 0], atol=1e-12)
-    level[0, task.model.state_names.index("psi")] = 0.0
-    level[0, task.model.state_names.index("theta")] = 0.3  # pitched up
-    assert scene.rotations(level)[0][2, 0] > 0.2
 
 
 @pytest.fixture(scope="module")
@@ -194,24 +176,6 @@ def test_a_logarithmic_axis_says_its_magnitude(low, span):
     ticks = log_ticks(low, low + span)
     assert len(ticks) >= 2 and ticks == sorted(ticks)
     assert all(low - 0.05 <= np.log10(tick) <= low + span + 0.05 for tick in ticks)
-
-
-@pytest.mark.parametrize("ends", [True, False])
-def test_a_crash_is_marked_where_it_happened(car, ends):
-    findings = gathered(car)
-    run = findings.runs[0]
-    states = run.trial.states.copy()
-    states[20:] = np.nan
-    trial = replace(run.trial, states=states)
-    short = replace(run, trial=trial.until(19) if ends else trial, utility=-np.inf)
-    crashed = replace(findings, runs=(short, *findings.runs[1:]))
-    (cross,) = path_figure(crashed).panels[0].dots
-    x = findings.task.model.state_names.index("x")
-    assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note
-    for panel in error_figure(crashed).panels:
-        (mark,) = panel.dots
-        (off,) = [curve.y for curve in panel.curves if curve.role == mark.role]
-        assert mark.shape == "cross" and mark.y == off[19]
 
 
 def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
-from grounded_trials.report.findings import prediction_error, rms
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import tracking_error
-from reported import DIAGNOSIS, car, cart, copied, damage, gathered, stored
+from reported import DIAGNOSIS, car, cart, copied, damage, stored
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -57,20 +55,6 @@ def test_a_workspace_without_trials_has_a_report(tmp_path):
     done = grounded("-C", tmp_path / "w", "report", "--html", "--png", "--rrd")
     assert done.code == 0, done.err
     assert plain(grounded("-C", tmp_path / "w", "report").out).endswith("next: grounded propose\n")
-
-
-def test_findings_measure_what_they_say(cart):
-    findings = gathered(cart)
-    task, best = findings.task, findings.best
-    assert best is not None
-    off = best.trial.states[:, 0] - task.target[:, 0]
-    assert rms(tracking_error(task, best.trial))[0] == pytest.approx(np.sqrt(np.mean(off**2)))
-    gap = best.trial.states - best.candidate.predicted_states
-    np.testing.assert_allclose(prediction_error(task, best), gap)
-    step = task.model.system.step(
-        best.trial.states[:-1], best.trial.inputs, task.model.values, task.dt
-    )
-    np.testing.assert_allclose(best.residual, best.trial.states[1:] - step, atol=1e-12)
 
 
 @pytest.mark.extra("view", "png")

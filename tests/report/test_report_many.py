@@ -1,6 +1,5 @@
 """A report of many trials: bounded, the same numbers, and it says what it leaves out."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +7,9 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded.search import pictures
-from grounded.search.pictures import few, search_figure
+from grounded.search.pictures import few
 from grounded_trials import Workspace
 from grounded_trials.report import gathering
-from grounded_trials.report.page import tables
 from grounded_trials.report.page.page import page
 from grounded_trials.store.trial_file import write_trial
 from reported import many_flights
@@ -60,18 +57,3 @@ def test_a_report_reads_few_of_many_trials_and_its_numbers_are_the_same(learnt, 
     assert holds(text, f"{part.left_runs} of {len(whole.runs)} trials", "3 of 5 logs")
     head = grounded("-C", learnt.folder, "report").out.splitlines()[0:2]
     assert f"{len(whole.runs)} trials" in " ".join(head)
-
-
-def test_the_page_and_its_figure_of_many_candidates_say_how_many_are_left_out(monkeypatch):
-    findings = many_flights(30)
-    everything = page(findings)
-    for module in (pictures, tables):
-        monkeypatch.setattr(module, "MOST", 10)
-    figure = search_figure(findings.standing)
-    assert "20 candidates" in figure.caption
-    assert len([d for d in figure.panels[0].dots if d.shape == "disc"]) <= 10
-    assert figure.panels[0].curves[0].x[-1] == 30  # the best so far is that of all
-    text = page(findings)
-    assert len(text) < len(everything)
-    body = re.search(r'id="candidates".*?</table>', text, re.DOTALL)[0]
-    assert body.count("<tr") == 11 and "20 candidates are left out" in text

@@ -100,21 +100,6 @@ def test_a_trial_that_is_none_of_this_search_is_refused(change, said):
     assert all(word in str(error.value) for word in said) and asked.trials == (trial,)
 
 
-def test_the_documents_have_the_commands_keys(search):
-    now = search.standing.to_json()
-    best = {"candidate": search.best.candidate.id, "utility": search.best.utility}
-    best["lead_doubt"] = search.standing.lead_doubt.sentence
-    assert search.standing.lead_doubt.facts["doubt"] == "unknown"
-    assert now["best"] == best and now["trials"] == len(search.trials)
-    assert len(now["history"]) == len(search.candidates)
-    assert [row["verdict"] for row in now["history"]][:2] == ["first", "maybe better"]
-    assert now["certainty"] and now["findings"][0]["code"] == "search.nothing_promised"
-    ended = search.proposal.to_json()
-    assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended
-    first = propose(TASK, [], [], OPTIONS).to_json()
-    assert first["candidate"] == "c0001" and first["new"] and first["best_utility"] is None
-
-
 def test_fit_stays_the_function_after_its_room_was_imported():
     import grounded.fit.parameters  # noqa: F401
 

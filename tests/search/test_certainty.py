@@ -46,26 +46,6 @@ def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
 
 
 @pytest.mark.parametrize(
-    ("accepted", "base", "doubt", "trials", "last", "word"),
-    [
-        (True, "", False, 1, True, "first"),
-        (True, "c0001", False, 1, False, "better"),
-        (False, "c0001", False, 1, False, "no better"),
-        (False, "", False, 1, False, "no better"),
-        (None, "c0001", True, 1, True, "in doubt"),
-        (None, "c0001", False, 0, True, "waiting"),
-        (None, "c0001", False, 1, False, "waiting"),
-        (None, "c0001", False, 0, False, "no trial"),
-    ],
-)
-def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, word):
-    nothing = {"expected_of_base": np.nan, "base_as_run": np.nan}
-    candidate = SimpleNamespace(id="c", base=base, model="m", **nothing)
-    tried = Tried(candidate, (None,) * trials, (), accepted, in_doubt=doubt)
-    assert tried.verdict(last) == word
-
-
-@pytest.mark.parametrize(
     ("utility", "repeats", "word"),
     [
         (-3.9, (-4.0, -4.2, -3.8), "maybe better"),  # within the scatter of later repeats

@@ -1,16 +1,14 @@
 """The start of DDP: a closed-loop run near the target, for every manoeuvre."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import grounded as gr
-from grounded.experiments.car_tasks import NAMES, car_task, target
+from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
 from grounded.models import aircraft, car, pendulum
-from grounded.search.first_guess import filled_target, first_guess
+from grounded.search.first_guess import first_guess
 from grounded.search.first_policy import first_policy
 from grounded.solve import ddp
 from small_tasks import cart_task, rover_task
@@ -38,18 +36,6 @@ def test_the_guess_is_finite_and_ddp_is_near_from_it(name):
         task.problem(), np.tile(np.clip(task.past, task.low, task.high), (task.horizon, 1))
     )
     assert not result.cost > 1.05 * nothing.cost  # zero inputs lead to nothing better
-
-
-def test_heading_and_speed_are_read_off_the_path():
-    task = car_task("figure8", car.model)
-    blind = np.array(task.target)
-    blind[:, [1, 4]] = np.nan  # position alone
-    reward = replace(task.reward, state=np.array([0, 0, 10.0, 10.0, 0, 0]))
-    x, _ = filled_target(replace(task, target=blind, reward=reward))
-    expected = target("figure8")
-    moving = expected[:, 1] > 0.3
-    assert np.abs(x[moving, 4] - expected[moving, 4]).max() < 0.1  # not off by a turn either
-    assert np.abs(np.diff(x[:, 4])).max() < 0.5
 
 
 def no_plan(**function):

@@ -221,15 +221,3 @@ def test_footnote_9_one_iteration_finds_the_optimum_whatever_the_bias(b):
 
 
 # headings
-
-
-def test_the_fingerprint_follows_the_model_and_nothing_else():
-    task = rover_task()
-    assert model_fingerprint(task) == model_fingerprint(rover_task())
-    assert model_fingerprint(rover_task(target=task.target + 0.1)) == model_fingerprint(task)
-    others = (
-        task.with_model(other(task.model)),
-        rover_task(latency=np.array([0.06, 0.02])),
-        rover_task(smoothing=0.06),
-    )
-    assert len({model_fingerprint(t) for t in (task, *others)}) == 4

@@ -14,7 +14,7 @@ from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
 from grounded.search.step.step_size import OTHER_WAY, SearchOptions
-from grounded.trial import Trial, mean_trial
+from grounded.trial import mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other
 
@@ -173,22 +173,6 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
     assert story.now.history[-1].accepted is False and len(story.trials) == 4
 
 
-def test_a_lucky_winner_loses_its_luck():
-    story = Story(rerun_incumbent=True).add().add()
-    honest = [story.task.utility(t) for t in story.trials]
-    assert honest[1] > honest[0]
-    lucky = replace(story.trials[1], candidate="c0001")
-    nearly = 0.75 * lucky.states + 0.25 * np.nan_to_num(TASK.target)
-    lucky = replace(lucky, states=nearly)
-    story.trials[0] = lucky
-    assert story.task.utility(lucky) > honest[1]
-    assert story.now.outstanding.id == "c0001"
-    for _ in range(3):
-        story.trials.append(bad(story.trials[1], 2.0))
-        story.trials[-1] = replace(story.trials[-1], candidate="c0001")
-    assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
-
-
 def test_losses_are_not_checked_for_ever():
     """At most one additional trial is run for each loss, however much trials scatter."""
     noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.2}))
@@ -296,25 +280,6 @@ def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
     made = story.propose().candidate
     assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0004")
     assert story.now.outstanding is made
-
-
-def test_trials_of_no_candidate_are_ignored():
-    story = Story().add()
-    before = story.now
-    story.trials += [
-        replace(story.trials[0], candidate=""),
-        replace(story.trials[0], candidate="x"),
-    ]
-    assert story.now.utilities == before.utilities and story.now.trials == 1
-
-
-def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
-    a = Trial(np.zeros((3, 2)), np.zeros((2, 1)), 0.05, ("x", "v"), ("force",), start_inputs=[1.0])
-    none = TASK.model.angle_mask
-    assert mean_trial([a], none) is a
-    b = replace(a, start_inputs=np.array([3.0]))
-    np.testing.assert_array_equal(mean_trial([a, b], none).start_inputs, [2.0])
-    assert mean_trial([a, replace(a, start_inputs=None)], none).start_inputs is None
 
 
 EVENTS = {

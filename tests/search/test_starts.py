@@ -68,19 +68,6 @@ def test_a_better_candidate_that_began_off_is_run_again_and_becomes_the_best(sto
     assert now.incumbent.utility > now.history[0].utility
 
 
-def test_a_worse_candidate_that_began_off_is_run_twice_and_loses(story):
-    """However often the other start is to blame, a loss is asked about once."""
-    worse = 0.05
-    now = story.run(1, OFF, worse)
-    assert now.history[1].in_doubt and now.outstanding.id == "c0002"
-    now = story.run(1, 0.0, worse)
-    while now.outstanding is not None:  # by what the runs differ is not known: the best one again
-        assert now.outstanding.id == "c0001" and len(story.trials) < 4
-        now = story.run(0)
-    assert now.history[1].accepted is False and now.incumbent.candidate.id == "c0001"
-    assert [c.id for c in losers_of(now.history, "c0001", PLANNER.fingerprint)] == ["c0002"]
-
-
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
     policy = story.candidates[1].policy
     late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])

@@ -218,17 +218,6 @@ def test_a_search_that_doubts_its_model_is_diagnosed_after_two_runs(tmp_path, mo
     assert w.status().then.verb == "adopt"
 
 
-def test_data_beside_a_search_leave_the_waiting_candidate_next(tmp_path):
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    first = w.propose().candidate
-    by_hand = record(w, tmp_path / "hand.csv", first.policy, 0.5)
-    assert w.ingest(by_hand, data=True).then == DIAGNOSE
-    w.ingest(record(w, tmp_path / "c0001.csv", first.policy, 0.0, seed=1), candidate="c0001")
-    assert w.propose().candidate.id == "c0002"
-    other = record(w, tmp_path / "wrong.csv", first.policy, 0.3)
-    assert w.ingest(other, data=True).then == NextCommand("run")
-
-
 def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_adopted(
     tmp_path, monkeypatch
 ):

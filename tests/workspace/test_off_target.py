@@ -1,7 +1,6 @@
 """How far a run is off its target, in units: the numbers that a utility does not say."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,15 +76,6 @@ def test_an_error_at_the_end_has_its_standard_error():
     assert several.end_std >= least * 0.999 and several.runs == 3
     (exact,) = off_target_of(task(terminal=END), [run(off(0.1))])
     assert exact.end_std == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_run_that_ended_early_has_no_end_and_a_lost_one_no_line():
-    states = off(0.5, steps=10)
-    (position,) = off_target_of(task(terminal=END), [run(states)])
-    assert position.rms == pytest.approx(0.5) and math.isnan(position.end)
-    assert off_target_of(task(ALONG), [run(np.full((11, 4), np.nan))]) == ()
-    free = replace(task(), target=np.full((H + 1, 4), np.nan))
-    assert off_target_of(free, [run(off(0.5))]) == () == off_target_of(task(ALONG), [])
 
 
 def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):

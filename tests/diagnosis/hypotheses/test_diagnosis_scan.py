@@ -5,7 +5,7 @@ import pytest
 
 from grounded import Model, Param
 from grounded.diagnosis.hypotheses import scan
-from grounded.diagnosis.hypotheses.scan import between, elsewhere
+from grounded.diagnosis.hypotheses.scan import elsewhere
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -13,28 +13,6 @@ from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
-
-
-def test_below_the_smallest_grid_value_an_effect_is_linear():
-    effect = Library().effect("sensor_delay:v", car)
-    first, second = sorted(effect.free[0].grid)[:2]
-    small, next_one = ({"d": first}, -30.0, 100.0), ({"d": second}, -300.0, 400.0)
-    (gain, found), (more, other) = between(effect, [small, next_one])
-    assert gain == pytest.approx(4.5) and found == {"d": pytest.approx(0.3 * first)}
-    assert more == pytest.approx(112.5)  # three quarters, halfway from the first to the second
-    assert other == {"d": pytest.approx(0.5 * (first + second))}
-    assert between(effect, [({"d": first}, -300.0, 100.0)])[0] == (250.0, {"d": first})
-
-
-def test_a_limit_between_two_grid_values_is_found():
-    """The weaker value is never reached, and the stronger one takes too much."""
-    limit = Library().effect("saturation:throttle", car)
-    weak, strong = sorted(limit.free[0].grid)[-2:][::-1]
-    looks = between(limit, [({"c": weak}, 0.0, 0.0), ({"c": strong}, -40.0, 100.0)])
-    assert looks[0][0] == 0.0
-    gain, found = looks[1]
-    assert gain == pytest.approx(8.0)  # the whole change would lose 10
-    assert found == {"c": pytest.approx(weak + 0.4 * (strong - weak))}
 
 
 def test_fits_start_from_every_local_maximum_of_the_scan():

@@ -9,52 +9,7 @@ from grounded import Model, Param, Trial, diagnose
 from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.intervals import (
-    fisher,
-    standard_deviations,
-)
 from grounded.diagnosis.validation.blame import moved_parameters
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_regular_information_is_inverted_whatever_the_units(seed):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((20, 4))
-    units = 10.0 ** rng.uniform(-8, 8, 4)
-    G = A.T @ A
-    expected = np.sqrt(np.diag(np.linalg.inv(G)))
-    np.testing.assert_allclose(fisher(G * np.outer(units, units)), expected / units, rtol=1e-6)
-
-
-def test_what_the_data_do_not_determine_is_not_certain():
-    """Two unknowns of which only the sum is seen, in units 1e9 apart, beside one that is known."""
-    row = np.array([1.0, 1e-9, 0.0])
-    G = 1e4 * np.outer(row, row) + np.diag([0.0, 0.0, 25.0])
-    found = fisher(G)
-    assert found[2] == pytest.approx(0.2)
-    assert found[0] > 1e3 and found[1] > 1e12
-
-
-def test_correlated_innovations_hold_less_information():
-    rng = np.random.default_rng(4)
-    trials = [
-        Trial(
-            np.cumsum(rng.standard_normal((41, 1)), axis=0), np.ones((40, 1)), 0.1, ("x",), ("u",)
-        )
-        for _ in range(2)
-    ]
-    drift = Model(
-        states={"x": "m"},
-        inputs={"u": "1"},
-        params={"k": Param(1.0, std=1.0)},
-        derivative=lambda s, a, p: {"x": p.k * a.u},
-    )
-    search = HypothesisSearch(prepare(drift, trials), ())
-    search.nulls()
-    fit = next(f for (_, spread, _), f in search.fits.items() if spread > 0)
-    of = search.predictor, fit, search.data.folds
-    (whole, _), (less, _) = (standard_deviations(*of, worth) for worth in (1.0, 1e-6))
-    assert less[0] == pytest.approx(fit.hypothesis.spread, rel=0.01) and less[0] > whole[0]
 
 
 def test_of_two_parameters_that_hide_each_other_one_stays():

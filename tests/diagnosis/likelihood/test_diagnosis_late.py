@@ -5,17 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.validation.limits import knowable
-from grounded.diagnosis.validation.prediction_error import errors, horizon, normalised
 from grounded.effects import Library
 from grounded.filter import kernels
 from grounded.filter.augmented import Delayed, coloured
 from grounded.filter.kalman import LinearSystem, gains, innovations, smoother
 from grounded.models.cart_pole import model as cart_pole
-from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
 L, B, n = 12, 2, 3
@@ -195,39 +191,3 @@ def filtered(x, steps):
     for k in range(1, len(fine)):
         fine[k] = fine[k - 1] + (fine[k] - fine[k - 1]) * (1 - np.exp(-0.01 / steps))
     return fine[::100]
-
-
-@pytest.mark.parametrize(
-    ("sensor", "shown", "start"),
-    [("sensor_delay", delayed, {"d": 0.03}), ("sensor_lag", filtered, {"tau": 0.03})],
-)
-def test_a_late_sensor_is_found_where_the_state_is_disturbed(sensor, shown, start):
-    rng, dt, late = np.random.default_rng(3), 0.02, 2.4
-    trials = []
-    for _ in range(4):
-        T = 260
-        u = 1.5 * np.sin(np.arange(T) * dt * rng.uniform(2, 6) + rng.uniform(0, 6))[:, None]
-        x = [np.array([0.5, 0.0])]
-        for t in range(T):
-            after = pendulum.system.step(x[-1][None], u[t][None], pendulum.values, dt)[0]
-            x.append(after + [0.0, 0.03] * rng.standard_normal(2))
-        log = np.array(x)
-        log[:, 1] = shown(log[:, 1], late)
-        log += [0.002, 0.01] * rng.standard_normal(log.shape)
-        trials.append(Trial(log, u, dt, pendulum.state_names, pendulum.input_names))
-    data = prepare(pendulum, trials)
-    search, found = HypothesisSearch(data, ()), {}
-    (null,) = search.refined([search.fresh(Hypothesis())], 20)
-    for name, values in ((sensor, start), ("viscous_friction", {"k": 0.1})):
-        effect = Library().effect(f"{name}:omega", pendulum, data.scales)
-        h = null.hypothesis.plus(effect, values)
-        starts = [(h, null.noise, null.track), search.fresh(h)]
-        found[name] = max(search.refined(starts, 25), key=search.score)
-    fit = found[sensor]
-    assert fit.hypothesis.theta == pytest.approx([late * dt], abs=0.05 * dt)
-    assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
-    assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
-    where = horizon(search.predictor, fit, 0.5)
-    error = errors(search.predictor, fit, where)
-    of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
-    assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15

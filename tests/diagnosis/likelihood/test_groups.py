@@ -5,10 +5,7 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.groups import folds
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.effects import Library
 
 MODEL = Model(
     states={"x": "m", "v": "m/s"},
@@ -68,14 +65,3 @@ def test_trials_of_one_motion_in_one_condition_are_a_group(trials, groups):
 def test_a_fold_is_a_group_or_part_of_one_that_holds_most(group, steps, levels, expected):
     own = np.full(len(group), levels)
     assert folds(np.array(group), np.arange(len(group)), steps, own).tolist() == expected
-
-
-def test_a_coefficient_that_only_what_is_held_out_shows_predicts_nothing_there():
-    data = prepare(MODEL, [trial(slow), trial(fast)])
-    effect = Library().effect("viscous_friction:v", MODEL, data.scales)
-    h = Hypothesis().plus(effect, {"k": 0.7})
-    gram, score = np.array([[[100.0]], [[0.0]]]), np.zeros((2, 1))
-    zero = np.zeros(2)
-    fit = Fitted(h, None, data.y, 0, 0, 0, gram, score, zero, zero, data.y, data.y)
-    shifts = leave_one_out(fit, np.array([0, 1]))
-    np.testing.assert_allclose(shifts[:, 0], [-0.7, 0.0], atol=1e-3)

@@ -107,18 +107,6 @@ def test_an_effect_of_every_run_is_not_unconfirmed_because_one_log_is_long():
     assert seen("input_gain:u", {"g": 0.3}, [("parameter:k", "input_gain:u")], 1) == ()
 
 
-def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
-    model, runs = lagging(0.4, trials=2)
-    better, lifted, memory = adopted(model, runs)
-    data = prepare(better, lifted, hidden=memory)
-    (i,) = data.hidden
-    assert data.seen.shape[1] == 4  # two runs of each trial
-    assert data.seen[0, :, i].sum() == 2 and data.seen[1:, :, i].sum() == 0
-    assert not [one for one in limits(data).findings if memory[0] in one.about]
-    noise = HypothesisSearch(data, ()).nulls().noise
-    assert np.exp(noise.log_q[i]) < 1e-20
-
-
 def late(trials, steps=400, delay=1.5 * DT):
     """Runs of a cart whose place is logged late and whose speed is not; its model with the delay.
 

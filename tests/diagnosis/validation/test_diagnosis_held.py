@@ -1,7 +1,5 @@
 """A parameter that is known only together with one that is held says so."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -54,16 +52,3 @@ def test_a_gain_follows_the_mass_that_is_held(found):
     assert abs(off) < 2 * by["k"].prior * by["k"].left  # with all free
     (one,) = [f for f in found.findings if f.code == "model.given"]
     assert one.about == ("k",) and one.facts["rests"] == ("m",)
-
-
-def test_a_value_that_its_std_stopped_is_told_with_what_to_widen():
-    model, trials = motor(2)
-    known = {"m": Param(1.0, "kg"), "k": Param(1.0, "N/V", std=0.05)}
-    sure = replace(model, params={**model.params, **known})
-    said = diagnose(sure, trials, DiagnosisOptions(library=Library(())))
-    assert said.parameters["k"].value == pytest.approx(1.15)
-    assert {n for n, e in said.parameters.items() if e.stopped == "prior"} == {"k"}
-    (one,) = [f for f in said.findings if f.code == "model.at_bound"]
-    assert one.about == ("k",) and "k = 1.15" in said.verdict.causes[0]
-    again = type(said).from_json(said.to_json())
-    assert again.parameters["k"].stopped == "prior"

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_diagnosis_unmeasured import swings
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
@@ -12,13 +11,34 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
     joints_without_input,
     knowable,
-    limits,
     still_states,
     switches,
 )
 from grounded.effects import Library
 from grounded.effects.wrap import wrap
 from grounded.models.pendulum import model as pendulum
+
+DT = 0.02
+DISTURBED = np.sqrt(DT) * np.array([0.004, 0.06])  # of a step
+MEASURED = np.array([0.005, 0.05])
+
+
+def swings(trials=3, steps=150, seed=0, friction=0.0):
+    """Runs of the pendulum itself (or with more friction), disturbed, from moving starts."""
+    values = pendulum.values.copy()
+    values[pendulum.param_names.index("b")] += friction
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(trials):
+        t, x = np.arange(steps) * DT, rng.uniform(-1, 1, 2)
+        u = 1.5 * np.sin(rng.uniform(3, 5) * t) + np.sin(rng.uniform(7, 9) * t + 1)
+        states = [x]
+        for value in u:
+            x = pendulum.system.step(x[None], np.array([[value]]), values, DT)[0]
+            x = x + DISTURBED * rng.standard_normal(2)
+            states.append(x)
+        y = np.array(states) + MEASURED * rng.standard_normal((steps + 1, 2))
+        found.append(Trial(y, u[:, None], DT, ("theta", "omega"), ("torque",)))
+    return found
 
 
 def stuck(trials, *states):
@@ -49,12 +69,6 @@ def let_go(friction, trials=2, steps=300, seed=3):
         y = np.array(states) + np.array([2e-4, 2e-3]) * rng.standard_normal((steps + 1, 2))
         found.append(Trial(y, np.zeros((steps, 1)), 0.02, ("theta", "omega"), ("torque",)))
     return found
-
-
-def test_a_free_motion_shows_causes_and_a_held_command_does_not():
-    free = let_go(0.0)
-    held = [replace(t, inputs=np.full_like(t.inputs, 0.3)) for t in free]
-    assert [limits(prepare(pendulum, some)).no_cause for some in (free, held)] == [False, True]
 
 
 def test_the_friction_of_a_free_swing_is_named():

@@ -3,10 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
 from grounded.diagnosis.pictures import where_figure
 from grounded.effects import Library
 from small_tasks import DT, pushed_cart
@@ -45,19 +43,6 @@ def test_repeats_of_a_candidate_tell_the_noise():
     for row in diagnose(model, same).prediction_error[:-1]:
         assert row.floor_from == "repeats"
         assert all(e < 1.2 * row.noise_floor[name] for name, e in row.with_effects.items())
-
-
-def test_noise_with_its_outliers_comes_to_its_variance():
-    rng, n = np.random.default_rng(0), 1
-    v = rng.standard_t(3, (2000, 3, n))
-    r, weight = 1.0, np.ones_like(v)
-    for _ in range(20):  # Student of 4 degrees of freedom, by expectation and maximisation
-        weight = (DOF + 1) / (DOF + v**2 / r)
-        r = float((weight * v**2).mean())
-    logs = np.full(n, np.log(r))
-    noise = NoiseModel(Structure(), logs, logs, logs, logs - 20, weight, weight)
-    assert noise.plain.measurement(1)[0, 0, 0] == pytest.approx((v**2).mean(), rel=0.05)
-    assert r < 0.6 * (v**2).mean() and noise.plain.weight_v == 1.0
 
 
 def test_a_trial_beside_itself_confirms_nothing():

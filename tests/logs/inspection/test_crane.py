@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from grounded_trials import Workspace
-from grounded_trials.logs.inspection.joint_names import joint_units, slides
 from grounded_trials.starting.begin import begin
 from ros_bags import crane_bag
 
@@ -72,19 +71,3 @@ def test_what_steps_do_not_tell_is_unsure_as_a_group_and_the_rivals_are_named(tm
     found = begin(tmp_path / "w", crane_bag(tmp_path / "bag", "axis_1"), model=tmp_path / "mine.py")
     assert {guess.name for guess in found.unsure} == {"a", "da", "b", "db"}
     assert all(guess.path and guess.others for guess in found.states)
-
-
-@pytest.mark.parametrize(
-    "joint, slide",
-    [
-        *(
-            (name, True)
-            for name in ("trolley", "slider_to_cart", "joint_lift", "X_Rail", "railJoint")
-        ),
-        *((name, False) for name in ("shoulder_lift_joint", "cart_to_pole", "cart_wheel")),
-    ],
-)
-def test_joints_that_slide_by_their_names(joint, slide):
-    assert slides(joint) is slide
-    units = joint_units({"/j": (joint,)})
-    assert units["/j.velocity[0]"] == ("m/s" if slide else "rad/s")

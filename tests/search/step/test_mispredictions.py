@@ -1,6 +1,5 @@
 """Derivatives of the grounded model, corrected by the mispredictions of earlier trials."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -83,27 +82,3 @@ def test_a_law_is_found_and_noise_gives_none():
     assert missed > 0.9
     none, missed = shared(d, np.zeros((3, 80, 2)), far)
     assert not none.any()
-
-
-def test_slopes_that_kept_their_promise_are_not_corrected():
-    """Crude slopes that predicted the last gain are kept (else the aircraft lost 14 of -1826)."""
-    task = cart_task()
-    plant = Plant(task.model.with_values({"mass": 1.3}))
-    found = searched(task, plant, 2)
-    first, second = found.search.standing.history
-    brought = second.utility - first.utility
-    assert second.accepted and brought == pytest.approx(second.candidate.predicted_gain, rel=0.1)
-    kept = found.search.ask()
-    assert kept.slopes == "" and not (kept.of_corrected or kept.of_original)
-    both = replace(kept, slopes="original, corrected")
-    assert both.of_corrected and both.of_original
-    wrong = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
-    assert wrong.search.ask().slopes == "corrected"
-
-
-def lost(found, utility=-100.0, **changes):
-    """Return a step from the best candidate with corrected slopes that lost."""
-    first, best = found.search.standing.history[0], found.best
-    fields = {"base": best.candidate.id, "slopes": "corrected", "model": best.candidate.model}
-    made = replace(first.candidate, predicted_gain=1.0, **fields)
-    return replace(first, candidate=made, utilities=(utility,), accepted=False, **changes)

@@ -55,10 +55,6 @@ def offered(w: Workspace) -> str:
     return " ".join(note for note in notes if "start = " in note)
 
 
-def test_a_start_is_offered_only_to_a_robot_that_nothing_but_its_inputs_holds(ball):
-    assert f"start = {{ x = -0.15, beam = {B}, u = 0 }}" in offered(ball)
-
-
 @pytest.mark.parametrize(
     ("stood", "beam", "told"), [(0.6, 0.0, False), (0.1, 0.0, True), (0.6, B, True)]
 )

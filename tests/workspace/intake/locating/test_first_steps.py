@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from facts import of_code
-from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.workspace.intake.locating import run_start
 from recorded import RATE, record, waiting
@@ -77,14 +76,3 @@ def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path
     assert found.candidate == "c0002" and not of_code(found, "log.not_run")
     begun = int(w.trials()[-1].meta["start_ns"]) * 1e-9
     assert begun == pytest.approx(1001.0, abs=0.2 / RATE)
-
-
-def test_a_run_that_somebody_took_over_is_not_its_candidate_s_where_its_start_is_said(w, tmp_path):
-    log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, ())
-    table = np.loadtxt(log, delimiter=",", skiprows=1)
-    table[200:, 3] *= -1
-    np.savetxt(log, table, "%.5f", ",", header="t,x,v,force", comments="")
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
-    with pytest.raises(GroundedError, match="alike up to"):
-        Workspace(w.folder).ingest(log)

@@ -4,7 +4,6 @@ A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records be
 Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
 """
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -124,23 +123,6 @@ def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, 
     assert abs(steps - fell / policy.dt) <= 1 if fell else steps == policy.horizon
     again = w.ingest(log, candidate=wanted)
     assert again.known and again.trial == found.trial
-
-
-def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp_path):
-    policy = w.candidate("c0002")[0].policy
-    path = record(w, tmp_path / "a.csv", policy, 0.0, after=0.01)
-    rows = path.read_text().splitlines()
-    whole = w.ingest(path)
-    assert whole.candidate == "c0002" and not of_code(whole, "log.short")
-    w.discard(whole.trial)  # which is the same recording
-    (tmp_path / "b.csv").write_text("\n".join(rows[:-1]))
-    short = w.ingest(tmp_path / "b.csv", candidate="c0002")
-    (told,) = of_code(short, "log.short")
-    assert told.facts["steps"] == 39 and np.isfinite(short.utility)
-    w.discard(short.trial)
-    (tmp_path / "c.csv").write_text("\n".join(rows[:-4]))
-    (told,) = of_code(w.ingest(tmp_path / "c.csv", candidate="c0002"), "log.short")
-    assert told.facts["missing"] == pytest.approx(40)
 
 
 @pytest.mark.parametrize(("before", "late"), [(1.0, 2), (0.0, 1)])
@@ -360,22 +342,6 @@ def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_ea
         Workspace(w.folder).ingest(log, candidate="c0002")
     toml.write_text(written)
     assert Workspace(w.folder).ingest(log, candidate="c0002").candidate == "c0002"
-
-
-@pytest.mark.parametrize("before", [0.92])
-def test_a_run_whose_commands_are_logged_as_they_are_sent_begins_with_its_own(w, tmp_path, before):
-    step = round(w.task.dt * RATE)
-
-    def sent(table):
-        kept = (np.arange(len(table)) - round(before * RATE)) % step == 0
-        kept[0] = True  # a zero, while it waits
-        table[~kept, 3] = np.nan
-
-    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, before), sent)
-    found = w.ingest(log)
-    (note,) = [one for one in found.notes if "begins" in one]
-    assert abs(float(re.search(r"begins ([0-9.]+) s", note)[1]) - before) < 1.5 / RATE
-    assert not of_code(found, "log.late", "run.late")
 
 
 def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):

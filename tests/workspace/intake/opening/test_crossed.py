@@ -30,13 +30,6 @@ PLANE = Model(
 )
 
 
-ROVER = Model(
-    states={"v": "m/s", "psi": "rad"},
-    inputs={"linear": "m/s", "angular": "rad/s"},
-    derivative=lambda s, a, p: {"v": a.linear - s.v, "psi": a.angular},
-)
-
-
 def reading(model, *columns, form="/csv.{}"):
     paths = {
         name: SignalSpec(form.format(column))
@@ -62,21 +55,6 @@ def test_what_the_names_of_columns_say(model, columns, pairs):
     found = crossed(model, reading(model, *columns))
     assert len(found) == len(pairs)
     assert all(holds(one.what, part) for one, part in zip(found, pairs, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("columns", "odd"),
-    [
-        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.angular.z"), False),
-        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.angular.z", "cmd.linear.x"), True),
-        (("odom.twist.twist.linear.x", "@rpy.yaw", "cmd.linear.x", "cmd.linear.y"), False),
-        (("odom.speed", "odom.yaw", "cmd.angular.z", "cmd.data[0]"), False),
-    ],
-)
-def test_two_numbers_of_a_twist_in_each_others_unit_are_exchanged(columns, odd):
-    found = crossed(ROVER, reading(ROVER, *columns, form="/{}"))
-    assert len(found) == odd
-    assert all((one.about, one.facts["by"]) == (("linear", "angular"), "units") for one in found)
 
 
 def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):

@@ -119,19 +119,6 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
     assert not anew.known and anew.trial != first.trial
 
 
-def test_a_mapped_state_that_estimate_leaves_out_is_told(tmp_path):
-    names = (("state", "x"), ("state", "v"), ("input", "force"))
-    lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in names]
-    config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
-    logged, _, v = disturbed(0.0, 0.0)
-    table = [logged["x"].t * 1e-9, logged["x"].values, v[::10], logged["force"].values]
-    head = {"header": "t,x,v,force", "comments": ""}
-    np.savetxt(tmp_path / "all.csv", np.column_stack(table), "%.5f", ",", **head)
-    w = Workspace(make(tmp_path / "w", config=config).folder)
-    (told,) = of_code(w.ingest(tmp_path / "all.csv", data=True), "log.unread")
-    assert told.about == ("v",)
-
-
 def test_seconds_under_a_column_of_milliseconds_are_told(task):
     logged, _, _ = driven()
     log = {n: replace(one, t=one.t[0] + (one.t - one.t[0]) // 1000) for n, one in logged.items()}

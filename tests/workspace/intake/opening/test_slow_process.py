@@ -62,17 +62,6 @@ def tanks(tmp_path_factory):
     return begun, workspace, levels
 
 
-def test_a_slow_hidden_state_is_estimated(tanks):
-    _, workspace, levels = tanks
-    [one] = workspace.trials()
-    known = [flow(*x, 0.0, TRUE)[1] - flow(0.0, x[1], 0.0, TRUE)[1] for x in levels]
-    upper = np.maximum(one.trial.states[:, 0], 0.0)
-    inflow = NOMINAL["k2"] * np.sqrt(upper)  # what its level does to the lower one, in the model
-    rest = (NOMINAL["k3"] - TRUE["k3"]) * np.sqrt(levels[:, 1])  # that the model gives it besides
-    off = (inflow - rest - known[: len(inflow)])[20:]
-    assert np.sqrt(np.mean(off**2)) < 0.1 * np.mean(known)
-
-
 def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
     _, workspace, _ = tanks
     found = workspace.fit().fit

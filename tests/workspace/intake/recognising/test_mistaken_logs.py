@@ -279,26 +279,6 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
     assert holds(str(refused.value), "starboard", "sign in [log.input.starboard]")
 
 
-def test_a_program_that_sends_an_input_times_a_number_is_told_by_earlier_runs(w, tmp_path):
-    dt, wrong = w.task.dt, np.array([0.7, 1.0])
-
-    def run(size):
-        plan = w.propose().candidate
-        runner = Runner(plan.policy)
-        path = tmp_path / f"{plan.id}.csv"
-        sent = lambda k, logged, now: size * runner.action(k * dt, logged)  # noqa: E731
-        return driven_by(w, path, sent, pull=0.8)
-
-    with pytest.raises(GroundedError, match="multiply the scale"):
-        run(wrong)  # nothing tells whether the log is wrong, or the program
-    run(1.0)
-    with pytest.raises(GroundedError) as refused:
-        run(wrong)
-    told = refused.value.finding
-    assert (told.code, told.about, told.facts["proven"]) == ("run.sends", ("port",), ("t0001",))
-    assert refused.value.then == NextCommand("next", ("LOG",))
-
-
 @pytest.mark.parametrize("named", [False, True])
 def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, named):
     """A zero that a program set where its boat floated: "somebody drove", and no word of it."""

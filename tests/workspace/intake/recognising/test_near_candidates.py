@@ -186,16 +186,6 @@ def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, 
     assert seen.own.left > 2 * acted_on(*at_start(w, log, by_alpha[ran])).left
 
 
-@pytest.mark.parametrize("way", ["late", "filtered"])
-def test_who_ran_its_candidate_on_samples_of_its_own_is_believed(ladder, tmp_path, way):
-    w, by_alpha = ladder
-    how = WAYS.get(way, {"felt": (0.6, 0.0)})
-    for seed, alpha in enumerate([1, 1 / 8]):
-        log = drive(tmp_path / f"{seed}.mcap", w, by_alpha[alpha], seed, **how)
-        seen = sender_of_log(w, log, by_alpha[alpha])
-        assert seen.other == "" and seen.why is None and seen.sure == (way in ("held", "late"))
-
-
 def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path):
     """A pose 6.8 ms old made a car lead by 12 mm, of 15: allowed for, but told nowhere."""
     w, by_alpha = ladder
@@ -244,17 +234,3 @@ def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
     done = ingest_log(w, tmp_path / "a.mcap", first)
     (note,) = of_code(done, "search.counts")
     assert first in note.sentence and f"discard {done.trial}" in note.sentence
-
-
-def test_commands_far_beyond_the_limits_are_reported_as_logged(tmp_path):
-    """With an offset of 50 N they are 45 to 55 N: clipped to the limits they would look near."""
-    w = make(tmp_path / "w")
-    ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
-    contents = w.read()
-    own, trial = contents.candidates[0], contents.trials[0].trial
-    seen = suspicion(w.task, replace(trial, inputs=trial.inputs + 50), own, [own])
-    low, high = trial.inputs.min() + 50, trial.inputs.max() + 50
-    assert seen.ran.beyond == "force"
-    assert seen.why.facts["logged"] == f"{low:.4g} to {high:.4g}"
-    assert seen.why.facts["limits"] == "-5 to 5 N"
-    assert suspicion(w.task, trial, own, [own]).ran.beyond == ""

@@ -100,17 +100,3 @@ def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_pat
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
     assert holds(str(refused.value), "c0001", "force", "57.29578", "in rad/s")
-
-
-@pytest.mark.parametrize("before", [0.7])
-@pytest.mark.parametrize(("by", "named"), [(20.0, "percent of 5 N")])
-def test_a_command_in_percent_of_its_limit_is_told(tmp_path, before, by, named):
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)
-    rows = np.loadtxt(log, delimiter=",", skiprows=1)
-    rows[:, 3] *= by
-    np.savetxt(log, rows, "%.6f", ",", header="t,x,v,force", comments="")
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(log)
-    assert holds(str(refused.value), "c0001", "force", named, f"by {1 / by:g}", "[log.input.force]")
-    assert refused.value.then.arguments == (str(log),)

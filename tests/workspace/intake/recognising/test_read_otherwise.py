@@ -1,7 +1,6 @@
 """A run that its log hides: each was told as `somebody, or another controller, drove`."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from cli import grounded
 from facts import holds, of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace.intake.locating.run_start import Recording
-from grounded_trials.workspace.intake.recognising import recognise
 from recorded import LOGGED, record, waiting
 
 
@@ -62,30 +59,6 @@ def test_a_log_without_the_run_s_beginning_says_so(w, tmp_path):
     assert error.finding.code == "log.begun_late"
     assert error.then.arguments == ("LOG",)  # this one would be refused again
     assert error.finding.facts["late"].value == pytest.approx(8 * dt, abs=1.01 * dt)
-
-
-@pytest.mark.parametrize("exchanged, earlier", [(False, False), (True, True)])
-def test_exchanged_columns_are_named_before_a_candidate_that_sends_nearly_the_same(
-    w, tmp_path, monkeypatch, exchanged, earlier
-):
-    run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5, noise=(2e-4, 1e-3))
-    own, like = (w.candidate(one)[0] for one in ("c0002", "c0001"))
-    table = np.loadtxt(run, delimiter=",", skiprows=1)
-    sent = table[50 :: round(100 * w.task.dt), 3][: own.policy.horizon, None]
-    nearly = sent + 0.02 * np.ptp(sent) * np.sin(np.arange(len(sent)))[:, None]
-    like = replace(like, policy=replace(own.policy, feedforward=nearly, gain=0 * own.policy.gain))
-    others = ([own], [like]) if earlier else ([like, own], [])  # of this task, of an earlier one
-    monkeypatch.setattr(recognise, "_may_have_run", lambda _: others)
-    if exchanged:
-        table[:, [1, 2]] = table[:, [2, 1]]
-        np.savetxt(run, table, "%.5f", ",", header="t,x,v,force", comments="")
-        error, before = refused(w, run), len(w.read().trials)
-        assert (error.finding.code, error.finding.about) == ("log.exchange", ("x", "v"))
-        assert "c0001" not in str(error) and error.then == NextCommand("ingest", (str(run),))
-        warned = w.ingest(run, candidate="c0002")
-        assert before == 1 and of_code(warned, "log.exchange")
-        return
-    assert w.ingest(run).candidate == "c0002"
 
 
 def test_columns_that_no_command_depends_on_are_not_called_exchanged(tmp_path):
@@ -140,28 +113,6 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     assert done.code == 0, done.err
     fresh = record(w, tmp_path / "b.csv", own.policy, 0.5, seed=5)
     assert w.ingest(fresh, candidate=own.id).candidate == own.id
-
-
-def test_the_wrong_log_is_refused_without_a_full_search_under_every_reading(w, tmp_path):
-    policy, count = w.candidate("c0002")[0].policy, list[str]()
-    hand = replace(policy, gain=None, reference=None, feedforward=_by_hand(policy))
-    log = record(w, tmp_path / "hand.csv", hand, 1.0)
-    thorough = Recording._by_its_samples
-
-    def counted(self, policy, strays):
-        count.append("thorough")
-        return thorough(self, policy, strays)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Recording, "_by_its_samples", counted)
-        assert refused(w, log).finding.code == "log.not_run"
-    assert 1 <= len(count) <= len(w.candidate_ids()) + 1
-
-
-def _by_hand(policy):
-    """Commands that nobody planned, (H, m)."""
-    k = np.arange(policy.horizon)
-    return (4 * np.sin(k / 3) * np.sin(k / 11))[:, None]
 
 
 @pytest.mark.parametrize("waits", [False])
