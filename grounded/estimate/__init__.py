@@ -1,23 +1,21 @@
-"""State estimation: filter, smoother, likelihood, noise, and a tracker for the running robot.
+"""State estimation: filter, smoother, likelihood and noise.
 
     smooth_trials   the smoother, or the extended Kalman filter alone, along stored trials
     noise_of        process and measurement noise by maximum likelihood
-    Tracker         predict and update while the robot runs (footnotes 15 and 18)
 
-All of it works for any model (including black-box simulators), any measurement function, lost
+All of it works for any model (including black-box simulators), lost
 samples, sensors and controllers of different rates, and transport delays of any fraction of a step.
 
 Read `trials` first (the public functions), then `measurement` and `record` (their input),
 `extended` (the Kalman filter along a track) with `steps` (the model in it), `likelihood` (the
-noise). The linear filter is in `grounded.filter`. `tracker` is independent of the rest.
+noise). The linear filter is in `grounded.filter`.
 """
 
 from __future__ import annotations
 
 from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, NoiseStd, of_function, of_states
+from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record, cut, record_of
-from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
     Estimated,
     noise_of,
@@ -30,10 +28,8 @@ __all__ = [
     "NoiseEstimate",
     "NoiseStd",
     "Record",
-    "Tracker",
     "cut",
     "noise_of",
-    "of_function",
     "of_states",
     "record_of",
     "smooth_trials",

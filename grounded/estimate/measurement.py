@@ -2,9 +2,7 @@
 
     x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = h(x) + v,  v ~ N(0, diag(r^2))
 
-By default the states themselves are measured. A camera that sees two markers, a gyroscope or an
-encoder is a function h of states (N, n) -> (N, ny), with a Jacobian or without (then finite
-differences are used). `grounded.estimate.likelihood` estimates the noise.
+The states themselves are measured, all or some. `grounded.estimate.likelihood` estimates the noise.
 """
 
 from __future__ import annotations
@@ -17,8 +15,6 @@ import numpy as np
 from grounded.checks import known, wrong
 from grounded.frozen import Array, readonly
 from grounded.model import Model
-
-DIFFERENCE = 1e-6  # step of the central difference, relative to max(1, |x|)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,47 +71,6 @@ def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
         angles=tuple(name in model.angles for name in names),
         states=tuple(index),
     )
-
-
-def of_function(
-    names: Sequence[str],
-    function: Callable[[Array], Array],
-    jacobian: Callable[[Array], Array] | None = None,
-    angles: Sequence[str] = (),
-) -> Measurement:
-    """Return the measurement with any function h.
-
-    Args:
-        names: names of the ny channels.
-        function: h, states (N, n) -> (N, ny).
-        jacobian: h_x (N, n) -> (N, ny, n); None for central differences.
-        angles: names of channels whose innovations wrap to [-pi, pi].
-
-    Raises:
-        GroundedError: for an angle that is not a channel.
-    """
-    for name in angles:
-        known("measured angle", [name], names)
-    return Measurement(
-        names=tuple(names),
-        function=function,
-        jacobian=_differenced(function) if jacobian is None else jacobian,
-        angles=tuple(name in angles for name in names),
-        states=(-1,) * len(names),
-    )
-
-
-def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    def jacobian(x: Array) -> Array:
-        N, n = x.shape
-        h = DIFFERENCE * np.maximum(1.0, np.abs(x))  # (N, n)
-        shift = h[:, None, :] * np.eye(n)  # (N, n, n): row i moves state i
-        up = function((x[:, None] + shift).reshape(N * n, n))
-        down = function((x[:, None] - shift).reshape(N * n, n))
-        slopes = (up - down).reshape(N, n, -1) / (2 * h)[:, :, None]
-        return np.asarray(slopes.transpose(0, 2, 1))
-
-    return jacobian
 
 
 @dataclass(frozen=True, eq=False)

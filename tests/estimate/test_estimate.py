@@ -6,15 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from consistency import consistency, merged
+from consistency import consistency
 from facts import holding
 from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.estimate import (
     NoiseStd,
-    Tracker,
     noise_of,
-    of_function,
     of_states,
     record_of,
     smooth_trials,
@@ -262,51 +260,6 @@ def test_received_inputs_are_the_delay_queue_of_the_kernels(delay):
     h = 1e-5
     up, down = (record.received(np.array([delay * DT + s]))[0] for s in (h, -h))
     assert np.allclose(record.received(np.array([delay * DT]))[1], (up - down) / (2 * h))
-
-
-def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
-    rng = np.random.default_rng(7)
-    L, sigma = 0.15, 0.003
-    steps = 600  # of 1/60 s
-    noise = NoiseStd(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
-
-    def markers(x):
-        front = x[:, 2:4] + L * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
-        return np.hstack([front, x[:, 2:4]])
-
-    camera = of_function(("front_x", "front_y", "rear_x", "rear_y"), markers)
-    command_times = np.arange(0, steps / 60, 0.05)
-    commands = np.stack([np.sin(command_times), 0.5 + 0.2 * np.sin(0.7 * command_times)], axis=1)
-    latency = np.array([0.1, 0.1])
-    x = np.zeros((steps + 1, 6))
-    for t in range(steps):
-        held = int(np.floor((t / 60 - 0.1) / 0.05 + 1e-9))
-        u = commands[held] if held >= 0 else np.zeros(2)
-        x[t + 1] = car.system.step(x[t][None], u[None], car.values, 1 / 60)[0]
-        x[t + 1] += noise.process * rng.standard_normal(6)
-    times = np.arange(0, steps + 1, 2) / 60
-    y = markers(x[::2]) + sigma * rng.standard_normal((len(times), 4))
-
-    record = merged(times, y, command_times, commands)
-    stored = filter_trials(car, [record], noise, latency=latency, measurement=camera)[0]
-    tracker = Tracker(
-        car, noise, np.zeros(6), np.ones(6), measurement=camera, latency=latency, time=0.0
-    )
-    live, nis, sent = [], [], 0
-    for t, seen in zip(times, y, strict=True):
-        while sent < len(command_times) and command_times[sent] <= t + 1e-9:
-            tracker.predict(command_times[sent])
-            tracker.sent(command_times[sent], commands[sent])
-            sent += 1
-        nis.append(tracker.update(t, seen))
-        live.append(tracker.state)
-    rows = np.isfinite(stored.innovations[:, 0])
-    assert np.allclose(np.array(live), stored.states[rows], atol=1e-4)
-    error = (np.array(live) - x[::2])[60:]
-    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.05  # speed, which no marker measures
-    assert np.sqrt(np.mean(error[:, 2] ** 2)) < sigma
-    assert 0.85 < np.mean(nis[1:]) < 1.15
-    assert np.isnan(tracker.update(1.0, y[0]))  # older than the estimate: not used
 
 
 def test_angles_wrap_in_innovations():

@@ -7,26 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.estimate import Estimated, Record
+from grounded.estimate import Estimated
 from grounded.frozen import Array
-
-
-def merged(
-    times: Array,
-    measured: Array,
-    command_times: Array,
-    commands: Array,
-    past: Array | None = None,
-    *,
-    resolution: float = 1e-6,
-) -> Record:
-    """Merge measurements and commands into one record with states at the times of both."""
-    inside = (command_times >= times[0]) & (command_times <= times[-1])
-    ticks = np.unique(np.round(np.concatenate([times, command_times[inside]]) / resolution))
-    where = np.searchsorted(ticks, np.round(np.asarray(times) / resolution))
-    rows = np.full((len(ticks), measured.shape[1]), np.nan)
-    rows[where] = measured
-    return Record(np.asarray(ticks * resolution), rows, command_times, commands, past)
 
 
 @dataclass(frozen=True, eq=False)
