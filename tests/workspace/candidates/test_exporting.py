@@ -14,8 +14,7 @@ from cli import grounded, plain
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
-from grounded_trials.workspace.candidates.exported_files import to_run
-from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate
+from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate, to_run
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.folder import Folder

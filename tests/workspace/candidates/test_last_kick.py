@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.trial import Trial
-from grounded_trials.workspace.candidates.last_command import kicked
+from grounded_trials.workspace.candidates.rest_at_end import kicked
 from grounded_trials.workspace.folder import Folder
 from workspaces import CONFIG, MODEL, make
 

@@ -13,7 +13,7 @@ from grounded.model import Model
 from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.candidates.standstill import STEADY, STOOD, drift, steady
+from grounded_trials.workspace.candidates.at_rest import STEADY, STOOD, drift, steady
 from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import FILE, OFFERED
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target

@@ -18,7 +18,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.scatter import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.candidates.at_rest import resting
-from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.diagnosing import near
 from grounded_trials.workspace.folder import Folder
 

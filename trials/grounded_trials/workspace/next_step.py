@@ -17,12 +17,14 @@ from grounded.model import all_at_bounds
 from grounded.search.standing import LOST, Ending, Phase, Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adoptable import declined, late_open
-from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
+    changed_since,
     fitted_in_vain,
+    last_again,
     made_from,
     newer_alone,
     read_diagnosis,
@@ -31,7 +33,6 @@ from grounded_trials.workspace.last_diagnosis import (
     usable_ids,
 )
 from grounded_trials.workspace.off_target import logged_target
-from grounded_trials.workspace.read_before import changed_since, last_again
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:

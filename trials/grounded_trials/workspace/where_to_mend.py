@@ -19,7 +19,7 @@ from grounded.accounts.finding import AS_LATE, SENSOR_DELAY, Finding, late_effec
 from grounded.places import heading, position
 from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
-from grounded_trials.workspace.read_before import PLAIN
+from grounded_trials.workspace.last_diagnosis import PLAIN
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:

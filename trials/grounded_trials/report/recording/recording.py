@@ -18,6 +18,7 @@ of one workspace have the same id, so that they can be merged (`rerun rrd merge`
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -39,9 +40,61 @@ from grounded_trials.report.figures.paths import crash, ended
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.layout import Space, blueprint, entity_of, escaped, over_time
-from grounded_trials.report.recording.texts import credit, summary, verdict
 from grounded_trials.report.scene import scene_of
-from grounded_trials.wording import labelled, per_second
+from grounded_trials.wording import count, figure, labelled, per_second
+
+
+def verdict(findings: Findings) -> str:
+    """Return the next command, and the diagnosis in a few lines (Markdown)."""
+    lines = [f"next: `{findings.next_command}`\n"]
+    if findings.diagnosis is None:
+        lines.append("not diagnosed yet\n")
+    lines += [f"{_marked(line)}\n" for line in findings.lines]
+    return "\n".join(lines)
+
+
+def credit(findings: Findings) -> str:
+    """Return the causes as a table (Markdown); "" if there is none."""
+    said = findings.told
+    if said is None or not said.rows:
+        return ""
+    rows = (said.header, ("---",) * len(said.header), *said.rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _marked(text: str) -> str:
+    """Return a text with ± and ², and with the names of tables as code: lines broke after [."""
+    return str(typeset(re.sub(r"\[\w+\]", "`\\g<0>`", text)))
+
+
+def summary(findings: Findings) -> str:
+    """Return a summary of the workspace and of what is left out (Markdown)."""
+    task, best, first = findings.task, findings.best, findings.first
+    left = findings.left_runs + findings.left_logs
+    lines = [
+        f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
+        f"{count(len(findings.runs), 'trial')}"
+        + f", {count(len(findings.logs), 'log')} of data" * bool(findings.logs)
+        + f" (not shown: {left})" * bool(left),
+        "",
+    ]
+    known = []
+    if first is not None:
+        known.append(f"{figure(first.utility)} by the model's policy ({first.candidate.id})")
+    if best is not None:
+        known.append(f"{figure(best.utility)} best so far ({best.candidate.id})")
+    if findings.optimum is not None:
+        known.append(f"{figure(findings.optimum)} at the optimum")
+    lines.append(f"utility {', '.join(known)}" if known else "no candidate has been run yet")
+    lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
+    if findings.better is not None and best is not None:
+        lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
+    if any(crash(run) is not None for run in findings.runs):
+        lines[-1] += "; crosses: where and when a run ended early"
+    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.outlook)}", ""]
+    lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
+    return "\n".join(lines)
+
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
@@ -102,8 +155,8 @@ class _Recorder:
         if values:
             log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
         self.paths()
-        for figure in over_time(findings):
-            self.series(figure)
+        for drawn in over_time(findings):
+            self.series(drawn)
         self.forecasts()
         for run in findings.runs:
             self.trial(run)

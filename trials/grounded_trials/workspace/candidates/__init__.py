@@ -2,8 +2,7 @@
 
 Read `proposing.py` first (propose and status); `search_state.py` derives where the search stands,
 `standing_without.py` what single runs change in it. `handover.py` checks each candidate before it
-leaves, for `exporting.py` (other programs; `exported_files.py`: the formats) and `running.py` (the
-robot, or a simulated one).
+leaves, for `exporting.py` (other programs) and `running.py` (the robot, or a simulated one).
 `first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks;
-`standstill.py` finds where the robot stood in its logs.
+`rest_at_end.py` what a plan lacks to end at rest.
 """

@@ -395,7 +395,7 @@ class Check:
     def _coasting(self) -> Finding | None:
         """Return where the robot goes after the run, with the input held then."""
         from grounded.search.safety import coasts_out
-        from grounded_trials.workspace.candidates.last_command import kicked
+        from grounded_trials.workspace.candidates.rest_at_end import kicked
 
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)

@@ -15,7 +15,7 @@ from grounded.search.difference import last_gain
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
-from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,

@@ -29,7 +29,7 @@ from grounded.trial import Trial
 from grounded.trusted import check_own
 from grounded_trials.store.store import made_folder
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import Handed, checked_candidate
 from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder

@@ -36,7 +36,7 @@ from grounded_trials.workspace.intake.opening.estimating import (
     read_estimate,
     with_estimates,
 )
-from grounded_trials.workspace.read_before import hashed, read_by
+from grounded_trials.workspace.last_diagnosis import hashed, read_by
 from grounded_trials.workspace.user_files.config import FILE
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid

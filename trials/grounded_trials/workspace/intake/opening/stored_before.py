@@ -21,7 +21,7 @@ from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files, on_disk
 from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.workspace.candidates.exported_files import to_run
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256

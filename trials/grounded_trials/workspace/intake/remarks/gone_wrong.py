@@ -35,8 +35,7 @@ from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
-from grounded_trials.workspace.last_diagnosis import diagnosable
-from grounded_trials.workspace.read_before import paths_of, read_by
+from grounded_trials.workspace.last_diagnosis import diagnosable, paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried

@@ -18,7 +18,7 @@ from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.read_before import paths_of, read_by
+from grounded_trials.workspace.last_diagnosis import paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.accounts.table import Account, Told
