@@ -6,7 +6,7 @@ listed in docs/effects.md.
 
     InputFamily     u_eff = effect(u, t, c)                 static map of a command
     MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        dynamic map of a command, with memory z
-    LossFamily      u_eff = u - loss(w, u, c)               loss of an input to the motion it drives
+    LossFamily      u_eff = u - loss(w, u, c)               loss of an input to its motion (joint)
     RateFamily      ds/dt = model + rate(s, a, own, t, c)   added to the rates of states
     MediumFamily    f in axes that move with (c)            the surrounding water or air moves
     SensorFamily    y = measure(s, c),  s = recover(y, c)   logged value of a state
@@ -37,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import places
 from grounded.checks import known, wrong
 from grounded.frozen import Array
 from grounded.model import Model
@@ -87,6 +88,8 @@ class Scales:
         dt: control step [s].
         duration: longest trial [s].
         slowest: slowest time constant of the model that a trial is long enough to excite [s].
+        turns: of each velocity that reversed, how far the motion went in RESOLVED samples after a
+            reversal, and how far until the next one (medians).
     """
 
     low: Mapping[str, float] = field(default_factory=dict)
@@ -94,6 +97,7 @@ class Scales:
     dt: float = 0.05
     duration: float = 10.0
     slowest: float = 0.0
+    turns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def peak(self, name: str) -> float:
         """Return the largest absolute value of a signal, 1 if it is unknown or zero."""
@@ -211,6 +215,7 @@ class Family:
         turned: the sentence of a gain for 1 + g below zero.
         loose: whether it names no mechanism and fits anything that repeats with a motion.
         ratio: converts a quantity (name, value) to the ratio shown as {g%}.
+        shows: whether data of these sizes can show it at a site; else it is not offered.
     """
 
     name: str
@@ -223,6 +228,7 @@ class Family:
     turned: str = ""
     loose: bool = False
     ratio: Callable[[str, float], float] = lambda name, value: value
+    shows: Callable[[Site], bool] = lambda site: True
 
     def at(self, site: Site) -> Effect:
         """Return the effect of this family at a site, with its quantities there."""
@@ -270,11 +276,20 @@ class LossFamily(Family):
     `free` without the loss; a unit of u adds `gain` to that. torque(w, rate, gain, u, c): the
     instantaneous loss, where the speed's own rate is `rate` and a unit of u adds `gain` to it.
     early: as `loss`, for the first half of a step, with fewer parts; None: `loss` itself.
+
+    A loss may have a memory of the motion (a bent bristle, a wound spring), states that no sensor
+    shows. They are among the values c as they are when a step begins, and follow from the motion:
+
+    memory(site): their names with units. later(w, end, u, c, dt): their values after a step from
+    the speed w to `end`. rest(u, c): at rest under an input held for long.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
     torque: Callable[[Any, Any, Any, Any, Any], Any] = lambda w, rate, gain, u, c: 0.0
     early: Callable[[Any, Any, Any, Any, Any, Any], Any] | None = None
+    memory: Callable[[Site], Mapping[str, str]] = lambda site: {}
+    later: Callable[[Any, Any, Any, Any, Any], Values] = lambda w, end, u, c, dt: {}
+    rest: Callable[[Any, Any], Values] = lambda u, c: {}
 
 
 @dataclass(frozen=True)
@@ -425,7 +440,22 @@ def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: f
                 continue
             low[name], high[name] = (float(q) for q in np.quantile(column, [0.002, 0.998]))
     slowest = _slowest(model, np.nan_to_num(states), np.nan_to_num(inputs), dt, duration)
-    return Scales(low, high, dt, duration, slowest)
+    moving = {name: states[:, model.state_names.index(name)] for name in places.velocities(model)}
+    each = {name: _turns(speeds[np.isfinite(speeds)], dt) for name, speeds in moving.items()}
+    turns = {name: turn for name, turn in each.items() if turn is not None}
+    return Scales(low, high, dt, duration, slowest, turns)
+
+
+def _turns(speeds: Array, dt: float) -> tuple[float, float] | None:
+    """Return `Scales.turns` of one velocity (N,), None if it hardly ever reversed."""
+    clear = np.flatnonzero(np.abs(speeds) > STILL * np.abs(speeds).max(initial=0.0))
+    ways = np.sign(speeds[clear])
+    begun = clear[1:][ways[1:] != ways[:-1]]
+    if len(begun) < REVERSALS:
+        return None
+    way = np.concatenate([[0.0], np.cumsum(np.abs(speeds)) * dt])
+    first = way[np.minimum(begun + RESOLVED, len(speeds))] - way[begun]
+    return float(np.median(first)), float(np.median(np.diff(way[begun])))
 
 
 def _slowest(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> float:
@@ -440,3 +470,6 @@ def _slowest(model: Model, states: Array, inputs: Array, dt: float, duration: fl
 
 
 SAMPLES = 8
+RESOLVED = 2  # samples after a reversal within which a friction that builds up must show
+REVERSALS = 6  # fewest reversals that tell how it builds up
+STILL = 0.05  # fraction of the largest speed below which a sign may be noise

@@ -41,13 +41,13 @@ FORCES = ("N", "V", "A")  # first letters of the units of efforts: N m, V ...
 
 def _friction(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
-    unit, most = site.unit(tau), _strongest(site)
+    unit, most = site.unit(tau), strongest(site)
     by = f"{unit} s/{site.unit(w).removesuffix('/s')}".removeprefix("1 ")
     viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, site.joined))
     return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
 
 
-def _per_acceleration(site: Site) -> str:
+def per_acceleration(site: Site) -> str:
     """Return the unit of an inertia: kg m^2 for N m and rad/s, kg for N and m/s, or a fraction."""
     tau, w = (site.unit(name) for name in coupled(site))
     other = f"{tau} s^2/{w.removesuffix('/s')}".removeprefix("1 ")
@@ -77,7 +77,7 @@ def has_viscous(model: Model, target: str) -> bool:
     return bool(alike > ALIKE**2 * float(np.sum(ours**2)) > 0)
 
 
-def _strongest(site: Site) -> float:
+def strongest(site: Site) -> float:
     """Return an upper bound of dry friction, twice the largest input seen.
 
     It is infinite for an input that is always zero (a joint without a motor).
@@ -234,7 +234,7 @@ def one_friction(one: Effect, other: Effect) -> bool:
     joints = {joint_friction.name, load_friction.name}
     if of == at and "viscous_friction" in (a, b) and joints & {a, b}:
         return any(q.name == "b" for e in (one, other) for q in e.free)
-    return {a, b} <= joints | {"coulomb_friction"} and of == at
+    return {a, b} <= joints | {"coulomb_friction", "dahl_friction"} and of == at
 
 
 joint_friction = LossFamily(
@@ -302,7 +302,7 @@ added_inertia = LossFamily(
     sentence="{driven} moves an inertia of {J} {J>more than modelled (a rotor, a gear, a load)|"
     "less than modelled}",
     targets=pairs_of,
-    quantities=lambda site: (Quantity("J", _per_acceleration(site)),),
+    quantities=lambda site: (Quantity("J", per_acceleration(site)),),
     lookalikes=("input_gain", "rate_gain", "parameter"),
     loss=_inertia,
     early=_inertia,

@@ -39,6 +39,7 @@ from grounded.compile import System, system_of
 from grounded.compile.names import Named
 from grounded.effects.drive import speed
 from grounded.effects.family import Effect, LossFamily, coupled
+from grounded.effects.plain_step import param_name
 from grounded.frozen import Array
 
 SWEEPS = 3
@@ -51,6 +52,11 @@ Weights = Sequence[Mapping[str, Any]]  # of velocities in the speed of each pair
 Left = tuple[Array, dict[str, Array]]  # inputs (..., m) after losses, and terms of positions
 Integrated = Mapping[str, tuple[str, float]]  # {position: (its velocity, factor)}
 Losses = tuple[Callable[..., Any], ...]
+
+
+def memory_name(effect: Effect, name: str) -> str:
+    """Return the name of a loss' memory among the states of a model that has the loss."""
+    return param_name(effect.name, name)
 
 
 class Loads(NamedTuple):
@@ -74,7 +80,11 @@ def step_with(
         given[name] = given[name] - loss
     after = dict(step(Named("input", tuple(given), list(given.values()))))
     more = ahead(pairs, at, losses, dt, moved)
-    return after | {q: after[q] + by for q, by in more.items()}
+    after |= {q: after[q] + by for q, by in more.items()}
+    for (effect, c), w, u in zip(pairs, at.w, at.u, strict=True):
+        kept = _family(effect).later(w, speed(effect, after), u, c, dt)
+        after |= {memory_name(effect, name): value for name, value in kept.items()}
+    return after
 
 
 def loads(

@@ -16,7 +16,7 @@ FOLLOWS = 0.4  # of what the model misses of a log in a step, by which the true 
 
 
 def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
-    """Return the settled memories of inputs under constant inputs a, by `input_family`."""
+    """Return the settled memories under constant inputs a, by `input_family` or state."""
     found = getattr(model.step, "settled", None)
     return {} if found is None else dict(found(a, p))
 
@@ -131,7 +131,7 @@ def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
     params = Named("parameter", wrapped.param_names, list(wrapped.values))
     known = settled(wrapped, inputs, params)
     names, n = wrapped.state_names, base.n
-    start = [float(known.get(name.rpartition("_")[0], 0.0)) for name in names[n:]]
+    start = [float(known.get(z, known.get(z.rpartition("_")[0], 0.0))) for z in names[n:]]
     for memory, logged in true_values(names, names[n:]).items():
         start[memory - n] = float(trial.states[0, logged])
     return np.array(start)

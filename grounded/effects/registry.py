@@ -26,7 +26,7 @@ import numpy as np
 
 from grounded import places
 from grounded.checks import refused, unknown
-from grounded.effects import actuator, friction, geometry, joint, medium, rate, sensor
+from grounded.effects import actuator, elastic, friction, geometry, joint, medium, rate, sensor
 from grounded.effects.correction import correction
 from grounded.effects.drive import speed_weights
 from grounded.effects.family import (
@@ -66,6 +66,7 @@ parameter = ParamFamily(
 BUILT_IN: tuple[Family, ...] = (
     *actuator.FAMILIES,
     *joint.FAMILIES,
+    *elastic.FAMILIES,
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,

@@ -49,8 +49,9 @@ from grounded.effects.family import (
     Site,
     Values,
     braked,
+    coupled,
 )
-from grounded.effects.losses import step_with
+from grounded.effects.losses import memory_name, step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
@@ -269,7 +270,7 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
 
 
 def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
-    """Return a function for the settled memories of inputs under constant commands, by name.
+    """Return a function for the settled memories under constant commands, by name.
 
     Each effect passes its output on to the effects that were wrapped before it.
     """
@@ -284,6 +285,9 @@ def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
             c = quantities_of(effect, p)
             u = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
             a = _replaced(model, a, u)
+        elif isinstance(family, LossFamily) and family.memory(effect.site):
+            rest = family.rest(a[coupled(effect.site)[0]], quantities_of(effect, p))
+            own = {memory_name(effect, z): value for z, value in rest.items()}
         return own if inner is None else {**inner(a, p), **own}
 
     return settled
@@ -297,11 +301,18 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, given = own_state(inner, s), _replaced(inner, a, {})
-        pairs = [(e, quantities_of(e, p)) for e in effects]
+        kept = [{z: s[memory_name(e, z)] for z in _loss(e).memory(e.site)} for e in effects]
+        pairs = [(e, quantities_of(e, p) | z) for e, z in zip(effects, kept, strict=True)]
         return step_with(pairs, start, given, dt, lambda u: base(start, u, p, dt), moved)
 
     vars(step)["losing"] = (inner, effects)
-    return step, {}
+    memory = _loss(effect).memory(effect.site)
+    return step, {memory_name(effect, z): unit for z, unit in memory.items()}
+
+
+def _loss(effect: Effect) -> LossFamily:
+    assert isinstance(effect.family, LossFamily)
+    return effect.family
 
 
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:

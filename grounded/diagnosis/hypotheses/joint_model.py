@@ -25,14 +25,14 @@ from grounded.diagnosis.hypotheses.search import (
     Start,
 )
 from grounded.diagnosis.hypotheses.tuning import tune
-from grounded.diagnosis.hypotheses.variations import LATE, push, varied
+from grounded.diagnosis.hypotheses.variations import LATE, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
-from grounded.effects.drive import motion_of
+from grounded.effects.drive import motion_of, push
 from grounded.effects.family import coupled
 from grounded.effects.joint import added_inertia
 from grounded.frozen import Array
@@ -90,7 +90,7 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
     bare, spreads = Hypothesis(), [0.0]
     if param_scale(data.model).any():
         spreads.append(CRUDE)
-    own = [1 / max(push(inertia), 1e-12) for _, inertia in joints]  # effort over acceleration
+    own = [1 / max(push(inertia.site), 1e-12) for _, inertia in joints]  # effort over acceleration
     starts = []
     together = [e for e in search.candidates if e.family.name == LATE[1]]
     together = [e for e in together if len(e.site.targets) == data.model.m]

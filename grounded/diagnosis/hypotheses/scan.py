@@ -405,14 +405,17 @@ def between(
 
     A change is taken as linear between two grid points, and between the weakest and none. So a
     threshold is found that a few samples exceed, where one grid point does nothing and the next too
-    much.
+    much. Of several scanned quantities together, a part of the change is taken for the gain of all.
 
     Args:
-        effect: an effect with one scanned quantity.
+        effect: an effect without linear quantities.
         changes: each grid point, its score (the gain's slope, negated) and its squared size.
     """
     found = []
     for grid, score, gram in changes:
+        if len(grid) > 1:
+            found.append((0.5 * max(-score, 0.0) ** 2 / max(gram, -score, 1e-300), grid))
+            continue
         ((name, value),) = grid.items()
         (none,) = (q.start for q in effect.free if q.name == name)
         away = {other[name]: size for other, _, size in changes}

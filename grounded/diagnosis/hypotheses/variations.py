@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded import places
 from grounded.diagnosis.hypotheses.orders import orders
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.hypotheses.tuning import tune
@@ -28,8 +27,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.actuator import delay
-from grounded.effects.drive import motion_of, speed
-from grounded.effects.family import coupled
+from grounded.effects.drive import motion_of, push
 from grounded.effects.joint import joint_friction, load_friction
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
@@ -150,7 +148,7 @@ def plainer(search: HypothesisSearch, h: Hypothesis) -> Iterator[Change]:
             same = {q.name: float(values[q.name]) for q in joint.quantities}
             yield {effect.name: ((joint, same),)}
         if joint is not None and family == "coulomb_friction":
-            own = (joint, {"c": values["c"] / push(joint), "b": 0.0})
+            own = (joint, {"c": values["c"] / push(joint.site), "b": 0.0})
             if (stiction := by_family.get(("stiction", motion))) is not None:
                 yield {effect.name: (), stiction[0].name: (own,)}
             if len(joint.free) == 1:
@@ -169,17 +167,6 @@ def _dry(effect: Effect) -> Effect:
     """Return a joint's friction without its viscous part."""
     some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
     return replace(effect, quantities=tuple(some))
-
-
-def push(joint: Effect) -> float:
-    """Return the median acceleration per unit of the joint's input."""
-    model, (tau, _) = joint.site.model, coupled(joint.site)
-    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
-    _, f_u = model.system.linearise(x, u, model.values, dt)
-    by = speed(
-        joint, dict(zip(model.state_names, f_u[..., model.input_names.index(tau)].T, strict=True))
-    )
-    return float(np.median(by)) / dt
 
 
 def _in_place(h: Hypothesis, change: Change) -> Hypothesis:

@@ -16,8 +16,10 @@ import numpy as np
 
 from grounded.compile import System, system_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.joint_memory import remembering
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect, LossFamily, MediumFamily, RateFamily, wrap
+from grounded.effects.losses import memory_name
 from grounded.effects.plain_step import param_name
 from grounded.effects.sensed import behind_logs
 from grounded.errors import GroundedError
@@ -40,7 +42,10 @@ class March:
     names: tuple[str, ...]  # parameters: those of the hypothesis' effects before adopted ones
 
     def __call__(self, predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Times) -> Array:
-        """Roll out from x (M, n) at times t with u (T, M, m): states (T + 1, M, n)."""
+        """Roll out from x (M, n) at times t with u (T, M, m): states (T + 1, M, n).
+
+        Memories of joints may stand behind the states (`joint_memory`).
+        """
         own = dict(zip(predictor.data.model.param_names, predictor.params(h), strict=True))
         for effect, values in h.pairs:
             whole = effect.complete(values)
@@ -88,7 +93,11 @@ def _compiled(predictor: Predictor, h: Hypothesis) -> March | None:
             if isinstance(effect.family, LossFamily | RateFamily):
                 at = replace(effect.site, model=model)
                 model = wrap(replace(effect, site=at), values, data.dt)
-        clocks = [name for name in model.state_names if name not in data.model.state_names]
+        known = {
+            *data.model.state_names,
+            *(memory_name(e, z) for e, _, own in remembering(h) for z in own),
+        }
+        clocks = [name for name in model.state_names if name not in known]
         if model.step is None or not all(name.endswith("_clock") for name in clocks):
             return None
         names = (model.state_names, model.input_names, model.param_names)

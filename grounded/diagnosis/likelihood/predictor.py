@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
+from grounded.diagnosis.likelihood import joint_memory
 from grounded.diagnosis.likelihood.arriving import (
     Acting,
     arriving,
@@ -74,6 +75,7 @@ class Predictor(SentOnce):
     _inputs: dict[str, Cache] = field(default_factory=dict)
     _steps: Cache = field(default_factory=lambda: Cache(16))  # of a simulator
     _loads: Cache = field(default_factory=lambda: Cache(32_000))
+    _remembered: Cache = field(default_factory=lambda: Cache(400_000, least=8))
     _weights: dict[str, Cache] = field(default_factory=dict)
     _alike: dict[Any, list[tuple[Any, Array, Array]]] = field(default_factory=dict)
     marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
@@ -261,14 +263,26 @@ class Predictor(SentOnce):
                 if len(some) == 1:
                     found[some[0]] = self.advance(own, x[some[0]], u[some[0]], data.time)
                     continue
-                starts, sent = (np.concatenate([a[i] for i in some]) for a in (x, u))
+                starts = np.concatenate([self.widened(hypotheses[i], x[i]) for i in some])
+                sent = np.concatenate([u[i] for i in some])
                 starts, sent = (a.reshape(-1, a.shape[-1]) for a in (starts, sent))
                 after = self.advance(own, starts, sent, np.tile(data.time.reshape(-1), len(some)))
+                after = after[:, : data.model.n]
                 found[some] = after.reshape(len(some), *found.shape[1:])
         return found
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
-        """Return one step of a hypothesis from x (..., n) with received u (..., m) at times t."""
+        """Return one step of a hypothesis from x (..., n) with received u (..., m) at times t.
+
+        Columns behind the states are the memories of its joints, which go on, too. Without them
+        x (L, B, n) is a track, along which they are known (`joint_memory`).
+        """
+        n = self.data.model.n
+        if x.shape[-1] > n:
+            x, now = x[..., :n], joint_memory.at(h, x[..., n:])
+            reached = self.advance(now, x, u, t)
+            return np.concatenate([reached, joint_memory.after(self, now, x, reached, u)], axis=-1)
+        h = self.with_memory(h, x)
         if medium := moving(h, self.seen):
             after = self.advance(medium.still, medium.through(x), u, t)
             return self.logged(h, x, medium.over(after, self.data.dt))
@@ -298,6 +312,22 @@ class Predictor(SentOnce):
                 found.append(rate[..., i] + added[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
         return self.logged(h, x, result)
+
+    def with_memory(self, h: Hypothesis, x: Array) -> Hypothesis:
+        """Return a hypothesis with the memories of its joints along a track x (L, B, n)."""
+        own = joint_memory.remembering(h)
+        if not own or own[0][2][0] in own[0][1]:
+            return h
+        values = tuple((name, *v.items()) for name, v in zip(h.names, h.values, strict=True))
+        key = (values, self.params(h).tobytes(), x.tobytes())
+        z = self._remembered.made(key, lambda: joint_memory.along(self, h, x))
+        return joint_memory.at(h, z)
+
+    def widened(self, h: Hypothesis, x: Array) -> Array:
+        """Return a track x (L, B, n) with the memories of joints behind its states."""
+        own = joint_memory.remembering(self.with_memory(h, x))
+        z = [values[name][..., None] for _, values, names in own for name in names]  # type: ignore
+        return np.concatenate([x, *z], axis=-1) if z else x
 
     def logged(self, h: Hypothesis, x: Array, after: Array) -> Array:
         """Return states after a step from x (or slopes of them) with delayed logs updated."""
@@ -403,7 +433,7 @@ class Predictor(SentOnce):
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
         names = self.data.model.input_names
-        if not (pairs := losses_of(h)):
+        if not (pairs := losses_of(self.with_memory(h, x))):
             return u, {}
         found, at, dt = u.copy(), self.loads(h, x, u, dt), dt or self.data.dt
         taken = solved(pairs, at, dt)
@@ -483,7 +513,7 @@ class Predictor(SentOnce):
 
         f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
         """
-        names, pairs = self.data.model.input_names, losses_of(h)
+        names, pairs = self.data.model.input_names, losses_of(self.with_memory(h, x))
         f_p, m = f_x[..., :0] if f_p is None else f_p, len(names)
         by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
         if not pairs:

@@ -80,17 +80,19 @@ def missed(
     path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
     together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
     advance = stepper(predictor, together)
+    x, n = _widened(predictor, each, track, at, run), data.model.n
     if (
         added is None
-        and (marched := _marched(predictor, each, path[-1], sent, t[0] * data.dt)) is not None
+        and (marched := _marched(predictor, each, x, sent, t[0] * data.dt)) is not None
     ):
-        path, sent = [*path, *marched[1:]], sent[:0]  # all steps are done
+        path, sent = [*path, *marched[1:, :, :n]], sent[:0]  # all steps are done
     for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
-        x = advance(path[-1], u, now)
+        x = advance(x, u, now)
         if added is not None:
             inside = (at + j < len(added))[:, None]
-            x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
-        path.append(np.fmax(np.fmin(x, FAR), -FAR))  # NaN becomes FAR, too
+            x[:, :n] += np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
+        x = np.fmax(np.fmin(x, FAR), -FAR)  # NaN becomes FAR, too
+        path.append(x[:, :n])
     states = np.stack(path)
     logged = np.empty_like(states[oldest:])
     for h, own in each:
@@ -101,6 +103,19 @@ def missed(
     error = data.model.difference(data.filled[flat], logged)
     seen = np.isfinite(data.states[flat]) & (ahead <= last)[..., None]
     return np.where(seen, error, np.nan)
+
+
+def _widened(
+    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], track: Array, at: Any, run: Any
+) -> Array:
+    """Return the states at each moment (M, n), and the memories of joints behind them."""
+    last, found = len(predictor.data.time) - 1, list[Array]()
+    for h, own in each:
+        whole = predictor.widened(h, track[: last + 1])[np.minimum(at, last), run]
+        found = found or [whole]
+        found[0][own] = whole[own]
+    found[0][:, : track.shape[-1]] = track[at, run]
+    return found[0]
 
 
 def unseen(predictor: Predictor, h: Hypothesis) -> Any:

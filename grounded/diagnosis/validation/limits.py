@@ -206,6 +206,8 @@ def knowable(
     kept = []
     for effect in effects:
         family, joined = effect.family, effect.site.targets
+        if not family.shows(effect.site):
+            continue
         if isinstance(family, LossFamily):
             joined = joined[:1]  # a wheel turns, even if the robot does not
         targets = {part for t in joined for part in t.split("<-")}
