@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.challenge.truth import Actuator
-from grounded.effects import Effect, Library, Scales
+from grounded.effects import Effect, Library, Scales, elastic
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -39,10 +39,10 @@ SMALLEST, LARGEST = 0.04, 0.35  # size relative to the signals an effect acts on
 def draw_effect(
     model: Model, scales: Scales, rng: np.random.Generator, families: Sequence[str] = ()
 ) -> Effect:
-    """Draw a family (from `families`, if any are given), then one of its targets."""
+    """Draw a family (from `families`, else any but `elastic`), then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):
-        if not families or effect.family.name in families:
+        if effect.family.name in families or not (families or effect.family in elastic.FAMILIES):
             by_family.setdefault(effect.family.name, []).append(effect)
     options = by_family[rng.choice(sorted(by_family))]
     return options[int(rng.integers(0, len(options)))]

@@ -127,7 +127,7 @@ class _Run:
         return Trial(states, np.array(inputs), self.dt, *names, start_inputs=self.held)
 
     def settle(self) -> None:
-        """Initialise memories of effects on inputs as settled at the held inputs."""
+        """Initialise memories as settled at the held inputs."""
         u, names = self.held.copy(), self.truth.model.input_names
         for index, (effect, values) in enumerate(self.truth.effects):
             for target in effect.site.targets:
@@ -138,6 +138,9 @@ class _Run:
                 elif isinstance(family, MemoryFamily):
                     depth = family.depth(values, self.fine)
                     self.memory[f"{index}{target}"] = (u[names.index(target)],) * depth
+            if isinstance(effect.family, LossFamily):
+                held = u[names.index(coupled(effect.site)[0])]
+                self.memory[effect.name] = effect.family.rest(held, values)
         self.queues = [[u[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
 
     def received(self, u: Array, t: float) -> Array:
@@ -190,7 +193,8 @@ class _Run:
                 more = model.derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
                 w, rate, then = (speed(effect, one) for one in (s, own, more))
                 gain = (then - rate) / NUDGE
-                lost = effect.family.torque(w, rate, gain, a[tau], values)
+                c = {**values, **self.memory[effect.name]}
+                lost = effect.family.torque(w, rate, gain, a[tau], c)
                 a = _with(a, tau, a[tau] - lost)
                 own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}
@@ -210,8 +214,22 @@ class _Run:
         if self.plant is not None:
             self.x = self.plant.advance(self.x, received)
             return
-        half = self.x + 0.5 * self.fine * self.rates(self.x, received, t)
-        self.x = self.x + self.fine * self.rates(half, received, t + 0.5 * self.fine)
+        start, memory = self.x, self.memory
+        half = start + 0.5 * self.fine * self.rates(start, received, t)
+        self.memory = memory | self.remembered(start, half, received, 0.5 * self.fine)
+        self.x = start + self.fine * self.rates(half, received, t + 0.5 * self.fine)
+        self.memory = memory
+        self.memory = memory | self.remembered(start, self.x, received, self.fine)
+
+    def remembered(self, x: Array, after: Array, u: Array, dt: float) -> dict[str, Any]:
+        """Return the memories of losses after a motion from x to `after` (n,) with inputs u (m,)."""
+        found, inputs = dict[str, Any](), self.truth.model.input_names
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, LossFamily):
+                w, end = (speed(effect, dict(zip(self.names, s, strict=True))) for s in (x, after))
+                sent, c = u[inputs.index(coupled(effect.site)[0])], self.memory[effect.name]
+                found[effect.name] = effect.family.later(w, end, 0.0, sent, {**values, **c}, dt)
+        return found
 
     def tie(self, t: float) -> None:
         """Set heading rates that the model only carries along to the heading's true rate."""

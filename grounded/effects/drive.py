@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from grounded import places
-from grounded.effects.family import Effect, Site, coupled
+from grounded.effects.family import Effect
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -150,12 +150,13 @@ def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None)
     return total
 
 
-def push(site: Site) -> float:
-    """Return the median acceleration of a drive per unit of the input, `tau<-w`."""
-    model, (tau, _) = site.model, coupled(site)
+@lru_cache(maxsize=KEPT)
+def push(model: Model, target: str) -> float:
+    """Return the median acceleration of a drive, `tau<-w`, per unit of the input."""
+    tau = target.partition("<-")[0]
     dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
     by = model.system.linearise(x, u, model.values, dt)[1][..., model.input_names.index(tau)]
-    weights = speed_weights(model, site.joined)
+    weights = speed_weights(model, target)
     total = sum(k * by[:, model.state_names.index(name)] for name, k in weights.items())
     return float(np.median(total)) / dt
 

@@ -1,7 +1,7 @@
 """Losses with a memory of the motion: a friction that bends before it slides, a spring in a joint.
 
     u_eff = u - c y,      y' = (w - |w| y) / x                                   Dahl's friction
-    u_eff = u - J z'',    J (z'' + 2 zeta v z' + v^2 z) = a u - J w',  v = 2 pi f         a spring
+    u_eff = u - J z'',    J (z'' + 2 zeta v z' + v^2 z) = a u - J w'            a spring
 
 Dahl (A solid friction model, 1968): bristles bend by y x before they slide, at full bend y = 1. So
 a reversed friction builds up over the distance x. Its y depends on the path alone, not on the
@@ -19,9 +19,8 @@ The memory starts at rest. It follows from the motion and the inputs, so nothing
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +31,8 @@ from grounded.effects.joint import pairs_of, per_acceleration, strongest
 PER_PERIOD = 8  # samples in a period of the fastest resonance that is looked for
 PERIODS = 4  # periods of the slowest one in the longest trial
 NEXT = 1.1  # ratio of resonances that are tried
+SHARES = (0.1, 0.4)  # parts of the inertia that an input drives that are tried as its motor's
+MOST, LEAST = 0.95, 0.02  # largest such part, and least that is left to the side that is shown
 DAMPED = 0.05  # first damping ratio of a spring
 NEWTON = 3  # steps of the solution, from one that is at most a tenth off
 FLAT = 1e-6  # way in units of the bristles' below which they bend in proportion
@@ -82,56 +83,80 @@ def _dragged(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
     return c["c"] * _bent(y, s * np.maximum(X, 0.0) * c["x"], c["x"])[1]
 
 
-def _bend_later(w: Any, end: Any, u: Any, c: Any, dt: Any) -> Values:
+def _bend_later(w: Any, end: Any, gain: Any, u: Any, c: Any, dt: Any) -> Values:
     return {"y": _bent(c["y"], 0.5 * dt * (w + end), c["x"])[0]}
 
 
-def _spring(site: Site, apart: bool) -> tuple[Quantity, ...]:
-    """Return the quantities of a spring; `apart`: whether a log tells J.
-
-    Behind the spring, the motion that a motor causes tells its resonance alone. Then J is taken to
-    be half of what the input drives.
-    """
-    whole, scales = 1 / max(push(site), 1e-12), site.scales
+def _spring(site: Site, driven: float) -> tuple[Quantity, ...]:
+    """Return the quantities of a spring; of a driven motor behind it also the whole inertia M."""
+    whole, scales = 1 / max(push(site.model, site.joined), 1e-12), site.scales
     fastest = 1 / (PER_PERIOD * scales.dt)
     slowest = min(PERIODS / scales.duration, 0.5 * fastest)
     count = 1 + int(np.ceil(np.log(fastest / slowest) / np.log(NEXT)))
     fs = tuple(float(f) for f in np.geomspace(slowest, fastest, count))
     f = Quantity("f", "Hz", fs, 0.1 * slowest, 2 * fastest, places=count)
-    J = Quantity("J", per_acceleration(site), (), 0.0, 0.95 * whole)
-    J = J if apart else replace(J, fixed=True, start=0.5 * whole)
-    return (J, f, Quantity("zeta", "1", (DAMPED,), 0.0, 0.95))
+    unit, shares = per_acceleration(site), tuple(part * whole for part in SHARES if driven)
+    J = Quantity("J", unit, shares, 1e-3 * whole if driven else 0.0, MOST * whole)
+    found = (J, f, Quantity("zeta", "1", (DAMPED,), 0.0, 0.95))
+    return (*found, Quantity("M", unit, fixed=True, start=whole)) if driven else found
 
 
-def _swing(c: Mapping[str, Any], dt: Any) -> tuple[Any, Any, Any, Any]:
-    """Return w, and S, E and D of z(dt) = rest + D (z - rest) + S z' and z'(dt) likewise with E."""
-    w = 2 * np.pi * c["f"]
-    down, turn = c["zeta"] * w, w * np.sqrt(1 - c["zeta"] * c["zeta"])
+def _own(c: Mapping[str, Any], driven: float) -> Any:
+    """Return v [rad/s], how fast the hidden side swings on its spring while the other is held."""
+    return 2 * np.pi * c["f"] * (np.sqrt(1 - c["J"] / c["M"]) if driven else 1.0)
+
+
+class _Swing(NamedTuple):
+    """Both sides of a spring over a time, under constant u and rate e of w without the loss.
+
+    With n = 1 - J gain, the part of the inertia on the side that is shown,
+
+        z'' + 2 zeta v / n z' + v^2 / n z = (a u / J - e) / n
+
+    rest = (a u / J - e) / v^2, z(t) = rest + D (z - rest) + S z', z'(t) = E z' - v^2 / n S (z - rest)
+    """
+
+    v: Any
+    n: Any
+    S: Any
+    E: Any
+    D: Any
+
+
+def _swing(c: Mapping[str, Any], gain: Any, dt: Any, driven: float) -> _Swing:
+    v, n = _own(c, driven), np.maximum(1 - c["J"] * gain / dt, LEAST)
+    square, down = v * v / n, c["zeta"] * v / n
+    turn = np.sqrt(np.maximum(square - down * down, LEAST * square))
     e = np.exp(-down * dt)
     S, C = e * np.sin(turn * dt) / turn, e * np.cos(turn * dt)
-    return w, S, C - down * S, C + down * S
+    return _Swing(v, n, S, C - down * S, C + down * S)
 
 
 def _sprung(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any, driven: float) -> Any:
-    """Return the mean of J z'' over a step, in which w' = (free - gain J z'' - w) / dt."""
-    own, S, E, _ = _swing(c, dt)
-    swing = S * (own * own * c["z"] + (free - w) / dt) + (1 - E) * c["r"]
-    push = driven * u * S
-    return (push - c["J"] * swing) / dt / np.maximum(1 - c["J"] * S * gain / dt**2, 0.02)
+    """Return the mean of J z'' over a step."""
+    v, n, S, E, _ = _swing(c, gain, dt, driven)
+    pushed = driven * u - c["J"] * (v * v * c["z"] + (free - w) / dt)
+    return (S * pushed / n + c["J"] * (E - 1) * c["r"]) / dt
 
 
-def _spring_later(w: Any, end: Any, u: Any, c: Any, dt: Any, driven: float) -> Values:
-    own, S, E, D = _swing(c, dt)
-    f = (driven * u / c["J"] if driven else 0.0) - (end - w) / dt
-    rest = f / (own * own)
+def _spring_later(w: Any, end: Any, gain: Any, u: Any, c: Any, dt: Any, driven: float) -> Values:
+    v, n, S, E, D = _swing(c, gain, dt, driven)
+    # the rate without the loss: (end - w) / dt = e - gain / dt loss(e)
+    still = (S * (driven * u - c["J"] * v * v * c["z"]) / n + c["J"] * (E - 1) * c["r"]) / dt
+    e = ((end - w) + gain * still) / (dt + gain * c["J"] * S / (n * dt))
+    rest = ((driven * u / c["J"] if driven else 0.0) - e) / (v * v)
     away = c["z"] - rest
-    return {"z": rest + D * away + S * c["r"], "r": E * c["r"] - own * own * S * away}
+    return {"z": rest + D * away + S * c["r"], "r": E * c["r"] - v * v / n * S * away}
 
 
 def _spring_torque(w: Any, rate: Any, gain: Any, u: Any, c: Any, driven: float) -> Any:
-    own = 2 * np.pi * c["f"]
+    own = _own(c, driven)
     swing = 2 * c["zeta"] * own * c["r"] + own * own * c["z"] + rate
-    return (driven * u - c["J"] * swing) / np.maximum(1 - c["J"] * gain, 0.02)
+    return (driven * u - c["J"] * swing) / np.maximum(1 - c["J"] * gain, LEAST)
+
+
+def _at_rest(u: Any, c: Any, driven: float) -> Values:
+    return {"z": driven * u / (c["J"] * _own(c, driven) ** 2) if driven else 0.0 * u, "r": 0.0 * u}
 
 
 def _twist(site: Site) -> Mapping[str, str]:
@@ -146,17 +171,14 @@ def _elastic(driven: float, name: str, equation: str, sentence: str) -> LossFami
         equation=equation,
         sentence=sentence,
         targets=pairs_of,
-        quantities=partial(_spring, apart=not driven),
+        quantities=partial(_spring, driven=driven),
         lookalikes=("added_inertia", "joint_spring", "first_order_lag", "delay", "sensor_lag"),
         loss=loss,
         early=loss,
         torque=partial(_spring_torque, driven=driven),
         memory=_twist,
         later=partial(_spring_later, driven=driven),
-        rest=lambda u, c: {
-            "z": driven * u / (c["J"] * (2 * np.pi * c["f"]) ** 2) if driven else 0.0 * u,
-            "r": 0.0 * u,
-        },
+        rest=partial(_at_rest, driven=driven),
     )
 
 
@@ -179,9 +201,9 @@ dahl_friction = LossFamily(
 elastic_joint = _elastic(
     1.0,
     "elastic_joint",
-    "u_eff = u - J z'', J (z'' + 2 zeta v z' + v^2 z) = u - J w', v = 2 pi f   (u<-w)",
-    "{driven} drives {source} through a spring: held at {source}, a motor with an inertia of {J} "
-    "would swing at {f}, with a damping ratio of {zeta}",
+    "u_eff = u - J z'', J (z'' + 2 zeta v z' + v^2 z) = u - J w', v = 2 pi f sqrt(1 - J/M)   (u<-w)",
+    "{driven} drives {source} through a spring, on which a motor of {J} and the rest of {M} swing "
+    "at {f} with a damping ratio of {zeta}",
 )
 
 elastic_load = _elastic(

@@ -280,15 +280,15 @@ class LossFamily(Family):
     A loss may have a memory of the motion (a bent bristle, a wound spring), states that no sensor
     shows. They are among the values c as they are when a step begins, and follow from the motion:
 
-    memory(site): their names with units. later(w, end, u, c, dt): their values after a step from
-    the speed w to `end`. rest(u, c): at rest under an input held for long.
+    memory(site): their names with units. later(w, end, gain, u, c, dt): their values after a step
+    from the speed w to `end`, with the gain as in `loss`. rest(u, c): at rest under an input held for long.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
     torque: Callable[[Any, Any, Any, Any, Any], Any] = lambda w, rate, gain, u, c: 0.0
     early: Callable[[Any, Any, Any, Any, Any, Any], Any] | None = None
     memory: Callable[[Site], Mapping[str, str]] = lambda site: {}
-    later: Callable[[Any, Any, Any, Any, Any], Values] = lambda w, end, u, c, dt: {}
+    later: Callable[[Any, Any, Any, Any, Any, Any], Values] = lambda w, end, gain, u, c, dt: {}
     rest: Callable[[Any, Any], Values] = lambda u, c: {}
 
 

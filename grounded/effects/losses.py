@@ -81,8 +81,9 @@ def step_with(
     after = dict(step(Named("input", tuple(given), list(given.values()))))
     more = ahead(pairs, at, losses, dt, moved)
     after |= {q: after[q] + by for q, by in more.items()}
-    for (effect, c), w, u in zip(pairs, at.w, at.u, strict=True):
-        kept = _family(effect).later(w, speed(effect, after), u, c, dt)
+    for i, (effect, c) in enumerate(pairs):
+        end, gain = speed(effect, after), at.gain[i][i]
+        kept = _family(effect).later(at.w[i], end, gain, at.u[i], c, dt)
         after |= {memory_name(effect, name): value for name, value in kept.items()}
     return after
 

@@ -90,7 +90,9 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
     bare, spreads = Hypothesis(), [0.0]
     if param_scale(data.model).any():
         spreads.append(CRUDE)
-    own = [1 / max(push(inertia.site), 1e-12) for _, inertia in joints]  # effort over acceleration
+    own = [
+        1 / max(push(inertia.site.model, inertia.site.joined), 1e-12) for _, inertia in joints
+    ]  # effort over acceleration
     starts = []
     together = [e for e in search.candidates if e.family.name == LATE[1]]
     together = [e for e in together if len(e.site.targets) == data.model.m]

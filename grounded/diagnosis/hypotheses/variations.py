@@ -148,7 +148,7 @@ def plainer(search: HypothesisSearch, h: Hypothesis) -> Iterator[Change]:
             same = {q.name: float(values[q.name]) for q in joint.quantities}
             yield {effect.name: ((joint, same),)}
         if joint is not None and family == "coulomb_friction":
-            own = (joint, {"c": values["c"] / push(joint.site), "b": 0.0})
+            own = (joint, {"c": values["c"] / push(joint.site.model, joint.site.joined), "b": 0.0})
             if (stiction := by_family.get(("stiction", motion))) is not None:
                 yield {effect.name: (), stiction[0].name: (own,)}
             if len(joint.free) == 1:

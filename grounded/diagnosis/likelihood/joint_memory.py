@@ -3,7 +3,7 @@
 They follow from the motion and the received inputs alone (`effects.elastic`), so they have no noise
 of their own and no row in the filter:
 
-    z_{t+1} = later(w_t, w_{t+1}, u_t, z_t)
+    z_{t+1} = later(w_t, w_{t+1}, B, u_t, z_t)         B: a median, since it only tells how w went
 
 Along a track w are its own speeds, from the start of each trial on, where z is at rest. Where a
 prediction leaves the track, z goes on with the predicted speeds, as columns behind its states.
@@ -21,7 +21,7 @@ import numpy as np
 from grounded.compile import System, system_of
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of
 from grounded.effects import Effect, LossFamily
-from grounded.effects.drive import speed
+from grounded.effects.drive import push, speed
 from grounded.effects.family import coupled
 from grounded.frozen import Array
 
@@ -53,7 +53,8 @@ def after(predictor: Predictor, h: Hypothesis, x: Array, reached: Array, u: Arra
     for effect, c, names in remembering(h):
         ends = [speed(effect, predictor.named(end), weights[effect.name]) for end in (x, reached)]
         sent = u[..., inputs.index(coupled(effect.site)[0])]
-        kept = effect.family.later(*ends, sent, c, predictor.data.dt)  # type: ignore[attr-defined]
+        gain = push(effect.site.model, effect.site.joined) * predictor.data.dt
+        kept = effect.family.later(*ends, gain, sent, c, predictor.data.dt)  # type: ignore[attr-defined]
         found += [np.broadcast_to(kept[name], sent.shape) for name in names]
     return np.stack(found, axis=-1)
 
@@ -74,7 +75,8 @@ def along(predictor: Predictor, h: Hypothesis, x: Array) -> Array:
         system = _system(effect.family, names, tuple(sorted(c)))
         start = effect.family.rest(data.held[:, j], c)  # type: ignore[attr-defined]
         z = np.stack([start[name] for name in names], axis=-1)
-        given = np.stack([w[:, :-1].T, w[:, 1:].T, sent[..., j].T], axis=-1)
+        gain = np.full(w[:, 1:].T.shape, push(effect.site.model, effect.site.joined) * data.dt)
+        given = np.stack([w[:, :-1].T, w[:, 1:].T, gain, sent[..., j].T], axis=-1)
         p = np.array([c[name] for name in sorted(c)])
         path = _marched(system, z, given, p, data.dt)
         found.append(data.runs(path[:-1].swapaxes(0, 1)))
@@ -100,13 +102,13 @@ def _system(family: LossFamily, names: tuple[str, ...], quantities: tuple[str, .
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         c = {name: p[name] for name in quantities} | {name: s[name] for name in names}
-        return dict(family.later(a.w, a.end, a.u, c, dt))
+        return dict(family.later(a.w, a.end, a.gain, a.u, c, dt))
 
     return system_of(
         step,
         kind="step",
         states=names,
-        inputs=("w", "end", "u"),
+        inputs=("w", "end", "gain", "u"),
         params=quantities,
         derivatives=False,
     )
