@@ -222,7 +222,7 @@ class _Run:
         self.memory = memory | self.remembered(start, self.x, received, self.fine)
 
     def remembered(self, x: Array, after: Array, u: Array, dt: float) -> dict[str, Any]:
-        """Return the memories of losses after a motion from x to `after` (n,) with inputs u (m,)."""
+        """Return the memories of losses after a motion from x to `after` (n,) with u (m,)."""
         found, inputs = dict[str, Any](), self.truth.model.input_names
         for effect, values in self.truth.effects:
             if isinstance(effect.family, LossFamily):

@@ -113,7 +113,8 @@ class _Swing(NamedTuple):
 
         z'' + 2 zeta v / n z' + v^2 / n z = (a u / J - e) / n
 
-    rest = (a u / J - e) / v^2, z(t) = rest + D (z - rest) + S z', z'(t) = E z' - v^2 / n S (z - rest)
+    rest = (a u / J - e) / v^2
+    z(t) = rest + D (z - rest) + S z',      z'(t) = E z' - v^2 / n S (z - rest)
     """
 
     v: Any
@@ -201,7 +202,8 @@ dahl_friction = LossFamily(
 elastic_joint = _elastic(
     1.0,
     "elastic_joint",
-    "u_eff = u - J z'', J (z'' + 2 zeta v z' + v^2 z) = u - J w', v = 2 pi f sqrt(1 - J/M)   (u<-w)",
+    "u_eff = u - J z'', J (z'' + 2 zeta v z' + v^2 z) = u - J w', v = 2 pi f sqrt(1 - J/M) "
+    "  (u<-w)",
     "{driven} drives {source} through a spring, on which a motor of {J} and the rest of {M} swing "
     "at {f} with a damping ratio of {zeta}",
 )

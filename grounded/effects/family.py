@@ -281,7 +281,7 @@ class LossFamily(Family):
     shows. They are among the values c as they are when a step begins, and follow from the motion:
 
     memory(site): their names with units. later(w, end, gain, u, c, dt): their values after a step
-    from the speed w to `end`, with the gain as in `loss`. rest(u, c): at rest under an input held for long.
+    from the speed w to `end`, gain as in `loss`. rest(u, c): at rest under an input held for long.
     """
 
     loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
