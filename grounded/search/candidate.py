@@ -100,6 +100,11 @@ class Candidate(Result):
         return bool(self.base) and self.way in ("", "recorded inputs", BY_STEP)
 
     @property
+    def of_model_alone(self) -> bool:
+        """Whether it is an optimal policy of a model that replays no trial."""
+        return not self.base or self.way == "own plan"
+
+    @property
     def expected_gain(self) -> float:
         """The predicted gain less its likely error."""
         return self.predicted_gain - self.likely_off

@@ -77,7 +77,7 @@ class Ending(StrEnum):
 
 WORDS = {Phase.PROPOSE: "going on", Phase.AWAIT: "waiting"}  # the other phases are their own words
 DIAGNOSE = NextCommand("diagnose")
-ASKS = ("search.diagnose", "search.lost_in_row", "search.far_off")  # answered by a diagnosis
+ASKS = ("search.diagnose", "search.lost_in_row", "search.far_off", "search.within_model")  # answered by a diagnosis
 DOUBTS = ("search.crashes", *ASKS)
 RESULTS = (
     Ending.NOTHING_PROMISED,
@@ -324,14 +324,15 @@ def standing(
     if total + options.repeats > options.max_trials:
         needs = options.repeats if total < options.max_trials else None
         used = found("search.used_up", used=total, most=options.max_trials, needs=needs)
-        return ended(now, Ending.USED_UP, used)
+        return let_down(ended(now, Ending.USED_UP, used), model)
     if incumbent is None:
         return _none_stood(now, options, model)
     own = incumbent.candidate.id
     step, way = _next_step(history, incumbent, options, model)
     if step is None:
         alpha = 2.0**-options.max_halvings
-        return ended(now, Ending.NO_STEP, found("search.no_step", own, best=own, alpha=alpha))
+        least = found("search.no_step", own, best=own, alpha=alpha)
+        return let_down(ended(now, Ending.NO_STEP, least), model)
     if options.damps and (hardly := _hardly(history, options.tolerance, model)):
         return let_down(ended(now, *hardly), model)
     last = history[-1]
@@ -425,29 +426,45 @@ def _due(tried: Tried, best: Tried) -> float:
 
 
 def let_down(now: Standing, model: str) -> Standing:
-    """Return an ended search; it asks for a diagnosis if a step that promised much has lost.
+    """Return an ended search; it asks for a diagnosis if the model promises much that it lacks.
 
-    Much is more than LITTLE of the best cost, more than the step's own likely error, and not to be
-    explained by noise.
+    A plan of the model alone promises what that reaches beyond the best run, a step that has lost
+    what it was to gain. Much is more than LITTLE of the best cost, more than a step's own likely
+    error, and not to be explained by noise.
     """
     best = now.incumbent
-    assert best is not None
-    lost, missed = losers_of(now.history, best.candidate.id, model), list[Tried]()
+    if best is None:
+        return now
+    lost, missed = losers_of(now.history, best.candidate.id, model), list[tuple[float, Tried]]()
     for tried in now.history:
         made = tried.candidate
-        if made not in lost or made.doubtful:
-            continue
         between = Difference(best, tried, now.history)
-        loss = best.utility - tried.utility - _due(tried, best)
         # a plan may replay a log's noise
         noise = max(LUCK * between.error if between.known else 0.0, tried.noise_cost)
-        short = loss + made.predicted_gain
-        luck = short <= noise or max(loss, made.predicted_gain) <= noise
-        if not luck:
-            missed.append(tried)
-    most = max(missed, key=lambda one: one.candidate.predicted_gain, default=None)
-    if most is None or not most.candidate.predicted_gain > LITTLE * -best.utility:
+        if made.of_model_alone and made.model == model:
+            short = gain = tried.promised - best.utility - missed_by_start(best)
+        elif made in lost and not made.doubtful:
+            loss, gain = best.utility - tried.utility - _due(tried, best), made.predicted_gain
+            short = min(loss + gain, max(loss, gain))
+        else:
+            continue
+        if short > noise:
+            missed.append((gain, tried))
+    gain, most = max(missed, key=lambda one: one[0], default=(0.0, None))
+    if most is None or not gain > LITTLE * -best.utility:
         return now
+    if most.candidate.of_model_alone:
+        own = best.candidate.id
+        reached = found(
+            "search.within_model",
+            own,
+            then=DIAGNOSE,
+            best=own,
+            real=best.utility,
+            promised=best.utility + gain,
+            by=gain,
+        )
+        return now.with_finding(reached)
     return now.with_finding(_far_off(most, most.promised - missed_by_start(most)))
 
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grounded.errors import NextCommand
+from grounded.model import Model
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
@@ -122,6 +123,32 @@ def test_a_step_that_costs_a_hundred_times_what_was_predicted_asks_for_a_diagnos
     now = story.now
     assert now.phase == "propose" and now.step is not None
     assert (now.then == NextCommand("diagnose")) is asks
+
+
+@pytest.mark.parametrize(
+    ("lag", "most", "asks"), [(0.6, 40, True), (0.6, 6, True), (0.02, 40, False)]
+)
+def test_an_end_far_from_the_models_own_optimum_asks_for_a_diagnosis(lag, most, asks):
+    lagged = Model(
+        states={"x": "m", "v": "m/s", "f": "N"},
+        inputs={"force": "N"},
+        params=dict(cart_task().model.params),
+        derivative=lambda s, a, p: {
+            "x": s.v,
+            "v": (s.f - p.drag * s.v) / p.mass,
+            "f": (a.force - s.f) / lag,
+        },
+    )
+    story = Story(plant=Plant(lagged, substeps=20), max_trials=most)
+    while (ended := story.propose()).candidate is not None:
+        story.add()
+    now = ended.standing
+    far = [one.facts for one in now.findings if one.code == "search.within_model"]
+    assert bool(far) is asks and (now.then == NextCommand("diagnose")) is asks
+    if asks:
+        own = now.history[0].candidate.predicted_utility
+        assert far[0]["by"] == pytest.approx(own - now.incumbent.utility)
+        assert far[0]["by"] > 0.5 * -now.incumbent.utility
 
 
 def test_a_system_that_repeats_itself_exactly_is_not_asked_again():

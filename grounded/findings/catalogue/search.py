@@ -88,6 +88,12 @@ ENTRIES: dict[str, Entry] = {
         "{candidate} [[gave {real:.4g}]][[!real? failed]], but {promised:.4g} was predicted",
         MODEL,
     ),
+    "within_model": Entry(
+        "note",
+        "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}, "
+        "which may be lost to what it lacks",
+        MODEL,
+    ),
     "diagnose": Entry("note", MODEL),
     "again": Entry("note", "run {best} again"),
     "fit_first": Entry(
