@@ -77,7 +77,8 @@ class Ending(StrEnum):
 
 WORDS = {Phase.PROPOSE: "going on", Phase.AWAIT: "waiting"}  # the other phases are their own words
 DIAGNOSE = NextCommand("diagnose")
-ASKS = ("search.diagnose", "search.lost_in_row", "search.far_off", "search.within_model")  # answered by a diagnosis
+# answered by a diagnosis
+ASKS = ("search.diagnose", "search.lost_in_row", "search.far_off", "search.within_model")
 DOUBTS = ("search.crashes", *ASKS)
 RESULTS = (
     Ending.NOTHING_PROMISED,
