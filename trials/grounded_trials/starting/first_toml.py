@@ -10,10 +10,11 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.trial import Trial
 from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.candidates.at_rest import STEADY, STOOD, drift, steady
+from grounded_trials.workspace.candidates.at_rest import STOOD, Stand, standstill
 from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import FILE, OFFERED
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target
@@ -117,14 +118,11 @@ def held_first(
 ) -> dict[str, float] | None:
     """Return the states in which a robot stands at the start of a log, and the inputs holding it.
 
-    States at 0 are not named.
-
-    A controller may sag at first and its commands may tremble, so inputs only need to be `steady`
-    in the second half of the first `STOOD` seconds. If none has to hold it, none is named:
-    inputs then count as 0 before a run, which is also what is sent after it; it may then stand for
-    a moment only (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is
-    named without such an input. Returns None if the robot moves or an input changes. Also returns
-    None for a model without a speed, since a slow drift could not be detected.
+    States at 0 are not named. If no input has to hold it, none is named: inputs then count as 0
+    before a run, which is also what is sent after it; it may then stand for a moment only
+    (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is named without
+    such an input. Returns None if the robot moves or an input changes. Also returns None for a
+    model without a speed, since a slow drift could not be detected.
 
     Args:
         model: the model of the states and inputs.
@@ -133,54 +131,28 @@ def held_first(
         dt: control interval [s].
         ranges: lowest and highest value of each signal in the whole log.
     """
-    steps = round(STOOD / dt)
-    speeds = {name for name, unit in model.states.items() if unit.endswith("/s")}
+    speeds = any(unit.endswith("/s") for unit in model.states.values())
     whole = set(sent) == set(model.inputs) and set(columns) == set(model.states)
-    if not speeds or not whole or steps < 2:
+    if not speeds or not whole:
         return None
-    spans = {name: ranges[name] or (0.0, 0.0) for name in (*columns, *sent)}
-    long = _stood(columns, sent, speeds, steps, spans)
-    if long and long[1]:
-        return long[0] | long[1]
-    brief = _stood(columns, sent, speeds, max(round(BEGAN / dt), 2), spans)
-    if brief is None or brief[1] or has_plane(model):
+    x, u = (
+        np.column_stack([one[name] for name in names])
+        for one, names in ((columns, model.state_names), (sent, model.input_names))
+    )
+    trial = Trial(x, u, dt, model.state_names, model.input_names)
+    long, brief = (standstill(model, trial, seconds, ranges) for seconds in (STOOD, BEGAN))
+    if long is not None and long.needs.any():
+        held = dict(zip(model.input_names, long.inputs.tolist(), strict=True))
+        return _away(model, long) | held
+    if brief is None or brief.needs.any() or has_plane(model):
         return None
-    return (long and long[0]) or brief[0]
+    return (long and _away(model, long)) or _away(model, brief)
 
 
-def _stood(
-    columns: Mapping[str, Array],
-    sent: Mapping[str, Array],
-    speeds: set[str],
-    steps: int,
-    spans: Mapping[str, tuple[float, float]],
-) -> tuple[dict[str, float], dict[str, float]] | None:
-    """Return where a robot stood in its first rows, and the inputs that had to hold it there.
-
-    None if it did not stand.
-    """
-    first = {name: values[:steps] for name, values in {**columns, **sent}.items()}
-    if not all(len(v) == steps and np.isfinite(v).all() for v in first.values()):
-        return None
-    found, held = {}, {}
-    for name in columns:
-        low, high = spans[name]
-        most = max(abs(low), abs(high)) if name in speeds else high - low
-        off = first[name].mean() if name in speeds else drift(first[name])
-        if abs(off) > STEADY * most:
-            return None
-        at = float(first[name][steps // 2 :].mean())
-        if name not in speeds and abs(at) > STEADY * most:
-            found[name] = at
-    needed = False
-    for name in sent:
-        low, high = spans[name]
-        later = first[name][steps // 2 :]
-        if not steady(later, high - low):
-            return None
-        held[name] = float(later.mean() if np.ptp(later) else later[0])
-        needed |= held[name] != 0 and (not np.ptp(later) or abs(held[name]) > STEADY * (high - low))
-    return found, held if needed else {}
+def _away(model: Model, stand: Stand) -> dict[str, float]:
+    """Return the states that are no speeds where a robot stands, except for those near 0."""
+    each = zip(model.states.items(), stand.states.tolist(), stand.steady, strict=True)
+    return {n: at for (n, unit), at, near in each if not unit.endswith("/s") and abs(at) > near}
 
 
 def _span(ends: Sequence[float]) -> str:

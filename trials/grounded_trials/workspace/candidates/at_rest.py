@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,11 +46,13 @@ class Stand:
     """Where a robot stood at the start of a trial.
 
     Args:
-        states: their medians (n,).
-        inputs: their medians (m,).
+        states: their medians in the second half of that time (n,).
+        inputs: the same of the inputs (m,): a controller may sag at first.
         moved: the drift of the states in that time (n,).
         seconds: how long it stood there at least.
+        steady: changes of the states that count as none (n,).
         ranges: of the inputs in the whole trial (m,).
+        needs: inputs that have to hold it there (m,) bool: constant, or beyond what trembles.
         trial: its id.
     """
 
@@ -57,25 +60,49 @@ class Stand:
     inputs: Array
     moved: Array
     seconds: float
+    steady: Array
     ranges: Array
+    needs: NDArray[np.bool_]
     trial: str
 
 
-def standstill(model: Model, trial: Trial) -> Stand | None:
-    """Return where the robot stands at the start of a trial; None if it moves there."""
-    steps = max(LEAST, round(STOOD / trial.dt))
+def standstill(
+    model: Model,
+    trial: Trial,
+    seconds: float = STOOD,
+    ranges: Mapping[str, tuple[float, float] | None] = MappingProxyType({}),
+) -> Stand | None:
+    """Return where the robot stands at the start of a trial; None if it moves there.
+
+    Args:
+        model: whose states they are.
+        trial: it may be the first part of a log.
+        seconds: how long it has to stand.
+        ranges: lowest and highest value of each signal in the whole log; else those of the trial.
+    """
+    steps = max(LEAST, round(seconds / trial.dt))
     x, u = trial.states[: steps + 1], trial.inputs[:steps]
     if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
         return None
-    whole, sent = np.nan_to_num(np.ptp(trial.states, axis=0)), np.ptp(trial.inputs, axis=0)
+    low, high = (
+        np.nan_to_num(np.concatenate([end(v, axis=0) for v in (trial.states, trial.inputs)]))
+        for end in (np.fmin.reduce, np.fmax.reduce)
+    )
+    for i, name in enumerate((*model.state_names, *model.input_names)):
+        low[i], high[i] = ranges.get(name) or (low[i], high[i])
+    whole, sent, n = (high - low)[: model.n], (high - low)[model.n :], model.n
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
-    fastest, moved = np.abs(trial.states).max(axis=0), drift(x)
-    off = np.where(rates, np.abs(x.mean(axis=0)), np.abs(moved))
-    most = np.where(rates, fastest, whole)
-    if (off > STEADY * most).any() or not steady(u, sent).all():
+    off, later = drift(x), u[steps // 2 :]
+    off, whole = (
+        np.where(rates, a, b)
+        for a, b in ((x.mean(axis=0), off), (np.maximum(abs(low), abs(high))[:n], whole))
+    )
+    if (np.abs(off) > STEADY * whole).any() or not steady(later, sent).all():
         return None
-    at, held = np.median(x, axis=0), np.median(u, axis=0)
-    return Stand(at, held, moved, steps * trial.dt, sent, trial.id)
+    at, held = np.median(x[steps // 2 :], axis=0), np.median(later, axis=0)
+    needs = (held != 0) & ((np.ptp(later, axis=0) == 0) | (np.abs(held) > STEADY * sent))
+    lasted = steps * trial.dt
+    return Stand(at, held, drift(x), lasted, STEADY * whole, sent, needs, trial.id)
 
 
 def standstills(workspace: Folder) -> list[Stand]:
@@ -393,11 +420,10 @@ def _rest_of(model: Model, trial: Trial) -> dict[str, float]:
     if (stand := standstill(model, trial)) is None:
         return {}
     at, held = stand.states, stand.inputs
-    whole = np.nan_to_num(np.ptp(trial.states, axis=0))
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
     a = model.system.linearise(at[None], held[None], model.values, trial.dt)[0][0]
     needed = np.abs(np.nan_to_num(a) - np.eye(model.n)).max(axis=0) > DEPENDS
-    told = needed & ~rates & (np.abs(at) > STEADY * whole)
+    told = needed & ~rates & (np.abs(at) > stand.steady)
     found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
     inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
     return found | {n: v for n, v in inputs.items() if found and v}
