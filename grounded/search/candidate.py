@@ -74,7 +74,6 @@ class Candidate(Result):
     caution: float = 0  # how often the first policy, or its gains, were made gentler
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # derivatives of the model that it was planned in
-    base_as_run: float = float("nan")  # model's utility of the base from where its trials began
     likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
     sample_age: float = 0.0  # [s] of the samples that the robot acts on, allowed for in it
     seen: tuple[str, ...] = ()  # ids of the search's trials that were known when it was made

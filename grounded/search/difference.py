@@ -19,7 +19,7 @@ import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import PART, SURE, Candidate, Tried
-from grounded.search.scatter import Repeats, Scatter, beyond_noise
+from grounded.search.scatter import Repeats, Scatter
 
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
@@ -112,19 +112,9 @@ class Difference:
 
     @cached_property
     def of_start(self) -> float:
-        """The model's part of the gain that is due to the start; 0 if alike, NaN if unknown.
-
-        It is the planning model's (`Starts`), which tells it of both; of the models that were
-        grounded on trials one may know only one of them. These tell it where that one can't.
-        """
-        before, after = self.before, self.after
-        grounded = self._of_grounded()
-        if after.starts is None or not before.trials:
-            return grounded
-        planned = after.starts.owed(after, before)
-        if not planned and grounded:  # NaN, too: they began apart
-            planned = after.starts.cost(before) - after.starts.cost(after)
-        return planned if math.isfinite(planned) else grounded
+        """The part of the gain that is due to the start by the planning model; NaN if unknown."""
+        starts = self.after.starts
+        return 0.0 if starts is None else starts.owed(self.after, self.before)
 
     @property
     def owed(self) -> float:
@@ -208,22 +198,6 @@ class Difference:
             exact=int(self.known and self.error == 0 and not self.owed),
         )
 
-    def _of_grounded(self) -> float:
-        before, after = self.before, self.after
-        if not (before.trials and after.trials and began_apart(before, after)):
-            return 0.0
-
-        def worth(one: Tried) -> float:
-            s_0 = one.candidate.predicted_states[0]
-            off = np.array([trial.began - s_0 for trial in one.trials])
-            if not beyond_noise(one.trials, off, s_0, one.candidate.predicted_states).any():
-                return 0.0
-            made = [c for t in self.history if (c := t.candidate).base == one.candidate.id]
-            known = [cost for c in made if math.isfinite(cost := cost_of_start(one, c))]
-            return known[-1] if known else math.nan
-
-        return worth(before) - worth(after)
-
 
 def last_gain(history: Sequence[Tried]) -> Difference | None:
     """Return the last accepted improvement; None before there is one."""
@@ -271,24 +245,6 @@ def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> Finding 
     )
 
 
-def planned_before(best: Tried, made: Candidate) -> bool:
-    """Return whether a candidate was planned before the latest run of its base, `best`."""
-    return bool(made.seen) and not {trial.id for trial in best.trials} <= {*made.seen}
-
-
-def cost_of_start(best: Tried, made: Candidate) -> float:
-    """Return what the starts of a candidate's runs cost on average, by the model; NaN if unknown.
-
-    Args:
-        best: the candidate.
-        made: one that was planned from its runs. The model that was grounded on those tells it; of
-            runs that came later the planning model does.
-    """
-    if planned_before(best, made):
-        return math.nan if best.starts is None else best.starts.cost(best)
-    return made.expected_of_base - made.base_as_run
-
-
 def missed_by_start(tried: Tried) -> float:
     """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
 
@@ -300,25 +256,6 @@ def missed_by_start(tried: Tried) -> float:
     cost = tried.starts.cost(tried)
     small = abs(cost) < PART * abs(tried.promised - tried.utility)
     return 0.0 if small or not math.isfinite(cost) else cost
-
-
-def began_apart(one: Tried, other: Tried) -> bool:
-    """Return whether the trials of two candidates began apart.
-
-    That is by more than the sensors' noise, and more than the scatter of where repeats begin, which
-    the scatter of their utilities includes.
-    """
-    first, second = (np.array([t.began for t in tried.trials]) for tried in (one, other))
-    s_0, apart = one.candidate.predicted_states[0], np.ones(first.shape[1], bool)
-    if (freedom := len(first) + len(second) - 2) > 0:
-        squares = sum(len(starts) * starts.var(axis=0) for starts in (first, second)) / freedom
-        error = np.sqrt(squares * (1 / len(first) + 1 / len(second)))
-        apart = np.abs(first.mean(axis=0) - second.mean(axis=0)) > LUCK * error
-    pairs = ((one, first - second.mean(axis=0)), (other, second - first.mean(axis=0)))
-    return all(
-        (apart & beyond_noise(tried.trials, off, s_0, tried.candidate.predicted_states)).any()
-        for tried, off in pairs
-    )
 
 
 def student(x: float, freedom: float) -> float:

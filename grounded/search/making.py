@@ -112,9 +112,6 @@ class About:
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
-        began = np.append(own.states[0], self.real.start[own.states.shape[1] :])
-        as_run = replace(self.real, start=began)  # theta's run from where its trial began
-        self.as_run = predicted(as_run, incumbent.candidate.policy).utility
         self.least = options.tolerance * abs(self.already)
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
         self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
@@ -151,7 +148,7 @@ class About:
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """Return a candidate with this model's prediction and its likely error."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        made = replace(made, slopes=self.slopes, base_as_run=self.as_run)
+        made = replace(made, slopes=self.slopes)
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from scipy.stats import ttest_ind
 
@@ -13,8 +12,7 @@ from grounded.search.difference import Difference, beyond_one_trial
 
 
 def tried(*utilities, accepted=True, base="c0001"):
-    nothing = {"expected_of_base": np.nan, "base_as_run": np.nan}
-    candidate = SimpleNamespace(id="c", base=base, model="m", way="", **nothing)
+    candidate = SimpleNamespace(id="c", base=base, model="m", way="")
     return Tried(candidate=candidate, trials=(), utilities=utilities, accepted=accepted)
 
 

@@ -19,7 +19,6 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Document, or_zero
-from grounded.search.difference import began_apart
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -279,7 +278,7 @@ def traded(task: Task, best: Tried, before: Tried) -> Finding | None:
     Utility also counts inputs and other states. On a path that is followed to a centimetre they may
     be all that is left to gain. Runs that began apart are farther off for that reason alone.
     """
-    if began_apart(before, best):
+    if best.starts is not None and best.starts.owed(best, before) != 0:
         return None
     pair = [off_target_of(task, tried.trials)[:1] for tried in (before, best)]
     if not all(pair) or pair[0][0].what != pair[1][0].what:
