@@ -43,7 +43,7 @@ from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.sound_data import MOST_STATES, sound_data
 from grounded.diagnosis.validation.agreement import compared
-from grounded.diagnosis.validation.decide import Decision, decide
+from grounded.diagnosis.validation.decide import Decision, beside_lookalikes, decide
 from grounded.diagnosis.validation.limits import (
     Limits,
     counted_once,
@@ -173,6 +173,8 @@ def diagnose(
     ):
         decision = loop.decided()
         tick("leftover")
+        if not sound.limits.no_cause:
+            decision = beside_lookalikes(decision)
         used = [trial for trial in looked.trials if trial.known_steps >= 2]
         written = Writer(
             decision,

@@ -139,7 +139,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
     if not singles:
         return null
     # a large effect starts far from its optimum after the scan
-    search.finished(singles[:SHORTLIST], 8, rivals=True)
+    search.refined(singles[:SHORTLIST], 8, rivals=True)
     many = limit is None or limit > USUAL_EFFECTS
     if many and (whole := joint_model(search)) is not None:
         more = search.score(whole) - search.score(search.of_size(1)[0])
@@ -158,7 +158,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         best = again
         if same:
             break
-    search.finished(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
+    search.refined(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
     tune(search, search.of_size(1)[:TUNED])
     best = search.of_size(1)[0]
     search.fair(best)
@@ -253,10 +253,10 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         added = [search.extended(start, AT_FIRST) for start in starts]
         added += [search.extended(half, 4) for half in halves]
         firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
-        search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
+        search.refined(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
         reordered(search, search.of_size(size + 1)[:HOPEFUL])
-        search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
+        search.refined(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
         for fit in search.of_size(size + 1)[:TUNED]:
             search.structures(fit)
@@ -348,13 +348,10 @@ def _neighbours(search: HypothesisSearch) -> None:
         search.refined([(bare, found.noise, found.track)], AGAIN)
     for _ in range(ROUNDS):
         best = search.best_null()
-        h, own = best.hypothesis, best.noise.structure
+        h = best.hypothesis
         near = [(replace(h, spread=w), best.noise, best.track) for w in SPREADS if h.spread > 0]
         search.refined([start for start in near if start[0].spread != h.spread], AGAIN)
-        for structure in map(Structure, search.taus):
-            if structure != own:
-                noise = best.noise.allowing(structure, search.data.dt)
-                search.refined([(h, noise, best.track)], AGAIN)
+        search.coloured(h, best.noise, best.track, iterations=AGAIN)
         if search.best_null() is best:
             return
-        search.finished([search.best_null()], TO_THE_TOP)
+        search.refined([search.best_null()], TO_THE_TOP)

@@ -29,7 +29,6 @@ from grounded.diagnosis.hypotheses.variations import LATE, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
 from grounded.effects.drive import motion_of, push
@@ -109,12 +108,8 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
 
 def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Return the likeliest of the fit and the same under noise of other correlation times."""
-    starts = [
-        (fit.hypothesis, fit.noise.allowing(Structure(tau), search.data.dt), fit.track)
-        for tau in search.taus
-        if tau != fit.noise.structure.tau
-    ]
-    return max([fit, *search.refined(starts, AGAIN)], key=search.score)
+    found = search.coloured(fit.hypothesis, fit.noise, fit.track, iterations=AGAIN)
+    return max([fit, *found], key=search.score)
 
 
 def _spared(search: HypothesisSearch, fit: Fitted) -> Fitted:

@@ -103,12 +103,6 @@ class HypothesisSearch(FittedHypotheses):
         self.keep(fits)
         return fits
 
-    def finished(self, fits: Sequence[Fitted], iterations: int, *, rivals: bool = False) -> None:
-        """Continue fits of any noise structures, those of one structure together."""
-        for structure in dict.fromkeys(fit.noise.structure for fit in fits):
-            of_one = [f for f in fits if f.noise.structure == structure]
-            self.refined(of_one, iterations, rivals=rivals)
-
     def settled(self, fits: Sequence[Fitted]) -> None:
         """Converge fits that decide, see `polished`."""
         self.keep(polished(self.predictor, fits, iterations=TO_THE_TOP, tick=self._ticks))
@@ -170,26 +164,25 @@ class HypothesisSearch(FittedHypotheses):
         The reference must have converged, or a better noise model would be taken for an effect.
         """
         h = best.hypothesis
-        bare = Hypothesis(shift=h.shift, spread=h.spread)
-        starts = [(bare, best.noise, best.track)]
+        bare = Hypothesis(shift=h.shift, spread=h.spread), best.noise, best.track
         if best.noise.structure.tau is None:
-            starts += [
-                (bare, best.noise.allowing(Structure(tau), self.data.dt), best.track)
-                for tau in self.taus
-            ]
-            self.refined(starts[1:], iterations=8)
-        (alone,) = self.refined(starts[:1], iterations=12)
+            self.coloured(*bare, iterations=8)
+        (alone,) = self.refined([bare], iterations=12)
         self.calibrated(alone)
 
-    def structures(self, fit: Fitted) -> list[Fitted]:
+    def coloured(
+        self, h: Hypothesis, noise: NoiseModel, track: Array, *, iterations: int
+    ) -> list[Fitted]:
+        """Fit a hypothesis from a start under coloured noise of the other correlation times."""
+        others = [Structure(tau) for tau in self.taus if tau != noise.structure.tau]
+        starts = [(h, noise.allowing(other, self.data.dt), track) for other in others]
+        return self.refined(starts, iterations)
+
+    def structures(self, fit: Fitted) -> None:
         """Fit a hypothesis with coloured noise of several correlation times (if it has none)."""
-        if fit.noise.structure.tau is not None:
-            return []
-        starts = [
-            (fit.hypothesis, fit.noise.allowing(Structure(tau), self.data.dt), fit.track)
-            for tau in self.taus
-        ]
-        return self.refined(starts, iterations=8 if fit.hypothesis.effects else TO_THE_TOP)
+        if fit.noise.structure.tau is None:
+            most = 8 if fit.hypothesis.effects else TO_THE_TOP
+            self.coloured(fit.hypothesis, fit.noise, fit.track, iterations=most)
 
     def calibrated(self, fit: Fitted) -> list[Fitted]:
         """Fit a hypothesis with the model's parameters free within fractions of their priors.
@@ -246,8 +239,7 @@ class HypothesisSearch(FittedHypotheses):
                 weight_v=weights.weight_v,
             )
             starts.append((fit.hypothesis, noise, fit.track))
-        for structure in {s[1].structure for s in starts}:
-            other.refined([s for s in starts if s[1].structure == structure], 8)
+        other.refined(starts, 8)
         plain = [f for f in other.fits.values() if not f.hypothesis.effects]
         if not any(f.noise.structure == Structure() and not f.hypothesis.spread for f in plain):
             noise = replace(weights, structure=Structure())

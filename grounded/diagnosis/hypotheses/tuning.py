@@ -46,10 +46,7 @@ def sweep(search: HypothesisSearch) -> None:
         if q.tunable
         for value in np.geomspace(max(q.low, q.high / WIDEST), q.high, TRIED)
     ]
-    swept = []
-    for structure in dict.fromkeys(noise.structure for _, noise, _ in starts):
-        of_one = [start for start in starts if start[1].structure == structure]
-        swept += refine(search.predictor, of_one, iterations=TO_THE_TOP, worth=search.score)
+    swept = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
     large = [fit for fit in swept if search.score(fit) > null + LARGE_GAIN]
     search.keep(large)
     names = {fit.hypothesis.names for fit in large}

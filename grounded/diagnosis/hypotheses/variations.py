@@ -53,7 +53,7 @@ def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
             search.extended(search.without(best, name), AT_FIRST)
         varied(search, best)
         new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
-        search.finished(new, TO_THE_TOP)
+        search.refined(new, TO_THE_TOP)
         reordered(search, new)
         tune(search, [search.latest(fit) for fit in new])
         before, best = best, search.of_size(size)[0]

@@ -42,14 +42,12 @@ def polished(
     open_ = [i for i, fit in enumerate(found) if not fit.fine]
     for _ in range(ROUNDS):
         left = []
-        for structure in dict.fromkeys(found[i].noise.structure for i in open_):
-            some = [i for i in open_ if found[i].noise.structure == structure]
-            starts = [(found[i].hypothesis, found[i].noise, found[i].states) for i in some]
-            again = refine(predictor, starts, iterations=iterations, tick=tick, share=SHARE)
-            for i, fit in zip(some, again, strict=True) if len(again) == len(some) else ():
-                rise = fit.evidence - found[i].evidence
-                if rise > -APART:
-                    found[i] = fit
-                    left += [i] * (abs(rise) > SAME)
+        starts = [(found[i].hypothesis, found[i].noise, found[i].states) for i in open_]
+        again = refine(predictor, starts, iterations=iterations, tick=tick, share=SHARE)
+        for i, fit in zip(open_, again, strict=True) if len(again) == len(open_) else ():
+            rise = fit.evidence - found[i].evidence
+            if rise > -APART:
+                found[i] = fit
+                left += [i] * (abs(rise) > SAME)
         open_ = left
     return [replace(fit, settled=True, fine=True) for fit in found]

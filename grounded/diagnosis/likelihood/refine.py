@@ -13,7 +13,7 @@ The shifts of the model's parameters have a normal prior and are integrated out 
 
     log p(y | h) = loglik - shift' P shift / 2 - log det(1 + P^-1 G) / 2,   P = (spread scale)^-2
 
-All hypotheses with the same noise structure are filtered together, along the batch axis.
+Hypotheses with the same noise structure are filtered together, along the batch axis.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from grounded.diagnosis.likelihood.linearise import (
 )
 from grounded.diagnosis.likelihood.noise import (
     NoiseModel,
+    Structure,
     average,
     cleaned,
     climbed,
@@ -119,7 +120,7 @@ def refine(
     bar: float = -np.inf,
     share: float = 1.0,
 ) -> list[Fitted]:
-    """Fit hypotheses that share a noise structure.
+    """Fit hypotheses, those of one noise structure together.
 
     Args:
         predictor: evaluates hypotheses on the data.
@@ -127,7 +128,8 @@ def refine(
         iterations: most iterations; a fit whose likelihood no longer rises stops earlier.
         tick: called whenever a block of fits is done.
         fixed_noise: keep the noise as it is.
-        worth: value of a rival; those far behind the best stop early. None: all continue.
+        worth: value of a rival; those far behind the best of their structure stop early. None: all
+            continue.
         bar: the worth of the best rival that is known already.
         share: fraction of the thresholds (in nats) at which a fit ends.
 
@@ -140,18 +142,23 @@ def refine(
         else Work(*s, share=share)
         for s in starts
     ]
-    if not works:
-        return []
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
-    wide = n if works[0].noise.structure.tau is None else 2 * n
-    size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    # a race: after each round, those that can't catch up with the best are given up
-    lap = KEPT if simulated(predictor.data.model) else 1
-    while worth is not None and len(works) > 1 and iterations > lap:
-        works = _after(predictor, works, (lap, fixed_noise, False), size, tick)
-        _race(works, worth, bar)
-        iterations -= lap
-    works = _after(predictor, works, (iterations, fixed_noise, True), size, tick)
+    alike: dict[Structure, list[int]] = {}
+    for i, work in enumerate(works):
+        alike.setdefault(work.noise.structure, []).append(i)
+    for structure, own in alike.items():
+        wide = n if structure.tau is None else 2 * n
+        size, left = max(1, int(MOST_NUMBERS / (L * B * wide * wide))), iterations
+        some = [works[i] for i in own]
+        # a race: after each round, those that can't catch up with the best are given up
+        lap = KEPT if simulated(predictor.data.model) else 1
+        while worth is not None and len(some) > 1 and left > lap:
+            some = _after(predictor, some, (lap, fixed_noise, False), size, tick)
+            _race(some, worth, bar)
+            left -= lap
+        some = _after(predictor, some, (left, fixed_noise, True), size, tick)
+        for i, work in zip(own, some, strict=True):
+            works[i] = work
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
     return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
 

@@ -12,12 +12,10 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import no_limits, parametric
 from grounded.diagnosis.hypotheses.lookalike import (
-    lookalikes,
     moving,
     of_parameters,
     one_clock,
     one_thing,
-    swap,
     twins,
 )
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
@@ -89,10 +87,9 @@ class Claims:
         self.blamed = self.moved if calibrating else ()
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
-        self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
+        self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         self.one_clock = one_clock(self.data.model, late, ruler.names, constant_inputs(self.data))
-        swap(search, best, self.alike)  # ties are decided between converged fits
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()
         )

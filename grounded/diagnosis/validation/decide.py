@@ -25,11 +25,13 @@ import numpy as np
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.explored import no_limits
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, swap
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.parts import Likeness
 from grounded.diagnosis.validation.averaged import averaged
 from grounded.diagnosis.validation.choose import Choice, Option, Rule
 from grounded.diagnosis.validation.gain import Errors
@@ -64,6 +66,7 @@ class Decision:
     doubtful: tuple[Doubtful, ...]  # likeliest first
     left: tuple[Leftover, ...]  # structure that the claim leaves
     flexible: dict[str, tuple[Leftover, Errors]]  # of it, what predictions gain by, by channel
+    alike: tuple[Likeness, ...] = ()  # look-alikes of the claim (`beside_lookalikes`)
 
     @property
     def gap(self) -> bool:
@@ -125,6 +128,17 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
         tuple(left),
         corrections(ruler, fit, left),
     )
+
+
+def beside_lookalikes(decision: Decision) -> Decision:
+    """Return a decision with the look-alikes of its claim, each fitted in its effect's place.
+
+    So ties are told between converged fits, and the report fits nothing.
+    """
+    search = decision.search
+    alike = lookalikes(search.predictor, decision.fit, search.candidates)
+    swap(search, decision.fit, alike)
+    return replace(decision, alike=alike)
 
 
 class Options:
