@@ -9,7 +9,7 @@ judge         scores each account by both, tells the best, corrects or refuses
 words         what is said of an account, and what to do about it
 ages          late and filtered sensors, velocities computed from positions, biases; by `lag`
 commands      clocks that differ, inputs that act in reverse; `inputs` copies and limits
-signals       samples of one sensor; `halted` a robot that stood still
+signals       samples of one sensor
 time_step     models and motions that are too fast for the steps
 finding       one fault of a sensor or command, and the corrected trials
 """

@@ -13,8 +13,7 @@ AGAIN = "[[; then discard {trials} and {source:log=ingest the log,trial=run it} 
 SCALE = "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]]"
 WRITES = "[[let the program write {writes}]]"
 # how a run went can't be judged by a wrong log
-RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.after*", "run.moved_on")
-RUN += ("run.let_go", "run.swings", "run.samples", "run.start")
+RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.after*", "run.start")
 
 ENTRIES: dict[str, Entry] = {
     # columns: the accounts
@@ -168,12 +167,6 @@ ENTRIES: dict[str, Entry] = {
         "no state changes in it: was the robot switched on, and are these its columns?",
         "`discard {trial}` sets it aside",
     ),
-    "halted": Entry(
-        "warn",
-        "nothing moves from {begins:.1f} to {ends:.1f} s, though {inputs} {inputs:changes/change}: "
-        "was the robot against a stop, or switched off? A diagnosis takes that for its physics",
-        "cut the log there ([log.span] end), `discard {trial}` and ingest it again",
-    ),
     "unknown": Entry("refuse", "{about} {about:is/are} NaN from the start"),
     "late_states": Entry(
         "refuse",
@@ -233,7 +226,7 @@ ENTRIES: dict[str, Entry] = {
         "up to {until}]][[; no {unknown} for {gap}]][[; only {lasts} of commands]][[; {guessed} by "
         "[estimate] may be why]][[ (no copy of {bare} in it)]]",
         "who drove? Use --data, --candidate {ran} anyway, or set [log.span] start",
-        hides=("log.start_doubt", "log.start_loose", "run.start", "run.swings", "run.reversed"),
+        hides=("log.start_doubt", "log.start_loose", "run.start", "run.reversed"),
     ),
     "silent": Entry(
         "refuse",
@@ -273,7 +266,6 @@ ENTRIES: dict[str, Entry] = {
         "start=shifted by that they fit better}",
         "log each command when it is sent; if it is, [log.span] start is {steps:step} too "
         "{side:late=early,early=late}",
-        hides=("run.samples", "run.older"),
     ),
     # stored before
     "again": Entry(

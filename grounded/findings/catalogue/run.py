@@ -7,7 +7,6 @@ from grounded.findings.catalogue import Entry
 OF = "[[{log}: ]]"  # the file, where the log is refused
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
 OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.after*")
-OUTCOME += ("run.moved_on", "run.let_go", "run.swings", "run.samples")
 SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
 
 ENTRIES: dict[str, Entry] = {
@@ -105,13 +104,6 @@ ENTRIES: dict[str, Entry] = {
         "returns at once, and run {ran} again",
         hides=OUTCOME,
     ),
-    "older": Entry(
-        "aside",
-        "its commands are what {ran} sends on states that are {age:size} old, at the present time; "
-        "earlier runs acted on the newest",
-        "pass `runner.action` the newest sample, and run {ran} again",
-        hides=OUTCOME,
-    ),
     "ahead": Entry(
         "aside",
         "its commands are what {ran} sends on states {age:size} newer than those in the log; the "
@@ -119,13 +111,6 @@ ENTRIES: dict[str, Entry] = {
         "let its program act on the samples as logged or, if only the log is late, set delay_s in "
         "[log] in place of these effects; and run {ran} again",
         hides=OUTCOME,
-    ),
-    "samples": Entry(
-        "note",
-        "its program acted on samples that were {age:size} old[[, {ran} was planned for "
-        "{planned:size}]]: {state} had moved on by {moved:size} (its error: {error:size} rms)",
-        "pass newer samples, or send each command when a sample arrives; the next candidates allow "
-        "for an age that stays",
     ),
     # the robot
     "reversed": Entry(
@@ -172,13 +157,6 @@ ENTRIES: dict[str, Entry] = {
         "it did not run {ran} as it should, as `ingest` told",
         "`discard {trial}`, unless it ran {ran}; then `propose` goes on",
     ),
-    "swings": Entry(
-        "warn",
-        "its feedback made {inputs} swing about the plan[[ ({input}: {swings} swings of more than "
-        "{size})]][[, {irregular:True=at no one frequency}, as sensor noise does]][[, but not in "
-        "{calm}: did the program or the robot differ?]]",
-        "the next candidates get weaker feedback, or say if they can't",
-    ),
     # its start
     "start_spoils": Entry(
         "aside",
@@ -211,18 +189,6 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "{after} after its end the robot left [safety] {about} = {bound}: it was {most}",
         "stop it in time, or let the target end at rest inside",
-    ),
-    "moved_on": Entry(
-        "warn",
-        "{after} after the run {what} was {far:size} from its target, at its end {near:size}",
-        "to make the robot stay, let the target rest at its end (`target --hold`), and weigh the "
-        "rates there ([reward] terminal)",
-    ),
-    "let_go": Entry(
-        "warn",
-        "{after} after the run {what} was {far:size} from its target, at its end {near:size}: the "
-        "runner sends {held}, which does not hold it there[[ ({would} would)]]",
-        "hold it with another controller as soon as `runner.done(t)` is true",
     ),
     # the command of [system]
     "by_hand": Entry(

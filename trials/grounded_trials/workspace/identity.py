@@ -119,7 +119,6 @@ class Noted:
     ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
     hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
     since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
-    told: dict[str, str] = field(default_factory=dict)  # what was told once -> of which trial
     asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> why
     groups: dict[str, str] = field(default_factory=dict)  # trial -> the condition it was run in
 
@@ -166,8 +165,6 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.asked[note["trial"]] = note["said"]
         elif kind == "group":
             found.groups[note["trial"]] = note["group"]
-        elif kind == "told":
-            found.told.setdefault(note["what"], note["trial"])
     return found
 
 

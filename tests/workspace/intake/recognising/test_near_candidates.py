@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from facts import of_code
-from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.who_drove import evidence, follows
 from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
@@ -21,7 +20,6 @@ from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.recognising.sender import sender_of
-from grounded_trials.workspace.intake.remarks.control_loop import old_samples
 from recorded import follow
 from workspaces import CONFIG, make
 
@@ -193,20 +191,6 @@ def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path)
     log, policy, begins = at_start(w, drive(tmp_path / "a.mcap", w, made, 1), made)
     old = acted_on(log, policy, begins).old  # 12 and 4 ms, and half of the 20 ms between samples
     assert old == pytest.approx([0.022, 0.014], abs=0.004)
-    run = log.trial_from(begins).until(policy.horizon)
-    near = w.task.target[: len(run.states)].copy()
-    near[:, 0] += 0.05 * np.sin(np.arange(len(near)))  # off by 35 mm, and moving fast
-    (note,) = old_samples(w, made, replace(run, states=near), old)
-    assert (note.code, note.facts["state"]) == ("run.samples", "x")
-    assert note.facts["age"].value == pytest.approx(0.022, abs=5e-4)
-    assert not [*old_samples(w, made, replace(run, states=near), np.zeros(2))]
-    far = near + 10.0
-    assert not [*old_samples(w, made, replace(run, states=far), old)]
-    aged = sample_age(w.task, made, [run])
-    assert not [*old_samples(w, replace(made, sample_age=aged + 0.004), run, old)]
-    (note,) = old_samples(w, replace(made, sample_age=aged - 0.012), run, old)
-    assert note.facts["planned"].value == pytest.approx(aged - 0.012)
-    assert note.facts["age"].value == pytest.approx(aged)
 
 
 def sender_of_log(w, path, said):

@@ -11,9 +11,8 @@ from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.candidates import at_rest
-from recorded import LOGGED, record, waiting
-from workspaces import CONFIG, MODEL, make
+from recorded import record, waiting
+from workspaces import CONFIG, make
 
 NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")
 T = np.arange(200) * 0.05
@@ -106,53 +105,6 @@ def driven_on(w, folder):
     record(w, file, policy, 1.0, after=1.5)
     table = np.loadtxt(file, delimiter=",", skiprows=1)
     return file, table, table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
-
-
-@pytest.mark.parametrize("rolls", [0.0, 0.4])
-def test_a_robot_that_moves_on_after_its_run_did_not_come_to_rest(tmp_path, rolls):
-    w = waiting(tmp_path)
-    file, table, beyond = driven_on(w, tmp_path)
-    end = table[beyond <= 0, 1][-1]
-    table[beyond > 0, 1] = end + rolls * beyond[beyond > 0]
-    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
-    told = of_code(Workspace(w.folder).ingest(file), "run.moved_on")
-    assert [one.facts["far"].unit for one in told] == ["m"] * (rolls > 0)
-
-
-def test_that_a_robot_moves_on_after_its_runs_is_told_once_a_task_unless_much_farther(tmp_path):
-    w = waiting(tmp_path)
-    _, table, beyond = driven_on(w, tmp_path)
-    end, told = table[beyond <= 0, 1][-1], []
-    for k, speed in enumerate((0.4, 0.4, 1.0)):
-        again = tmp_path / f"again{k}.csv"
-        table[beyond > 0, 1] = end + speed * beyond[beyond > 0]
-        table[:, 1] += 1e-6 * k
-        np.savetxt(again, table, "%.7f", ",", header="t,x,v,force", comments="")
-        said = Workspace(w.folder).ingest(again, candidate="c0002")
-        told.append(bool(of_code(said, "run.moved_on", "run.let_go")))
-    assert told == [True, False, True]
-    same = Workspace(w.folder).ingest(tmp_path / "again0.csv")
-    assert of_code(same, "run.moved_on", "run.let_go")  # of the log that it was told of
-
-
-@pytest.mark.parametrize(("knows", "holds_it"), [(True, True)])
-def test_a_robot_that_its_held_input_lets_go_is_told_so(tmp_path, monkeypatch, knows, holds_it):
-    model = MODEL.replace("a.force - p", "a.force - 1.5 * s.x - p") if knows else MODEL
-    made = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
-    first = made.propose().candidate.policy
-    record(made, tmp_path / "first.csv", first, 0.0, seed=9, after=0.0)
-    made.ingest(tmp_path / "first.csv")
-    made.propose()
-    file, table, beyond = driven_on(made, tmp_path)
-    if not knows:  # what pulls is not in the model, but in the log
-        late = beyond > 0
-        table[late, 1] = table[beyond <= 0, 1][-1] - 0.3 * beyond[late] ** 2
-        np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
-    if not holds_it:
-        monkeypatch.setattr(at_rest, "resting", lambda *_: None)
-    (told,) = of_code(Workspace(made.folder).ingest(file), "run.let_go")
-    assert told.facts["held"] == ("force = 0 N",)
-    assert (told.facts["would"] == ("force = 1.5 N",)) is (knows and holds_it)
 
 
 @pytest.mark.parametrize("rolls", [0.0, 0.4])

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, Weight, found, settle
+from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Tried
 from grounded.search.returned.who_drove import as_sent
@@ -49,12 +49,11 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     others_differ,
     repeated,
 )
-from grounded_trials.workspace.intake.remarks.after_run import left_afterwards, moved_on
-from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise, swung
+from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
-from grounded_trials.workspace.intake.remarks.trial_check import checked
+from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
 from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
 from grounded_trials.workspace.unknown_id import refuse_ids
@@ -62,7 +61,6 @@ from grounded_trials.workspace.unknown_id import refuse_ids
 if TYPE_CHECKING:
     from grounded_trials.logs.signal_report import SignalReport
 
-FARTHER = 2.0  # times as far as was told: a robot that moves on after its run is told again
 FAULTS = (*COLUMNS, "run.exchanged")  # the next plan would be based on wrong columns
 ASIDE = "set aside"  # the verdict on a run that does not count
 
@@ -208,7 +206,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     if read.before:
         some.append(read.before.finding(used=not aside))
     some += _of_trial(workspace, read, trial)
-    some += filter(None, _of_run(workspace, read, added, trial, tried, history))
+    some += filter(None, _of_run(workspace, read, trial, tried, history))
     if now:
         some += _of_search(workspace, read, added, tried, now)
     told = settle(some)
@@ -253,7 +251,6 @@ def _of_trial(workspace: Folder, read: Read, trial: Trial) -> Iterator[Finding]:
 def _of_run(
     workspace: Folder,
     read: Read,
-    added: Added,
     trial: Trial,
     tried: Tried | None,
     history: Sequence[Tried],
@@ -265,8 +262,7 @@ def _of_run(
     yield gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
     yield ended_early(workspace, trial, read.silent)
     if trial.candidate and (whole := _whole(read, task)):
-        yield left_afterwards(task, whole) or _told_once(workspace, added, whole)
-    yield swung(task, tried, trial, history)
+        yield left_afterwards(task, whole)
 
 
 def _of_search(
@@ -306,30 +302,6 @@ def _whole(read: Read, task: Task) -> Trial | None:
         return None
     more = replace(log, steps=task.horizon + math.ceil(COASTS / task.dt))
     return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
-
-
-def _told_once(workspace: Folder, added: Added, whole: Trial) -> Finding | None:
-    """Return how the robot moved on after its run, unless a run of this task told it before.
-
-    What is then to be changed is the target, [reward] or the robot's program, not the run. It is
-    told again if other states moved on, or much farther.
-    """
-    one, own = moved_on(workspace.planner, whole), added.sha256[:DIGITS]
-    if one is None:
-        return None
-    far = one.facts["far"]
-    assert isinstance(far, Quantity)
-    about = f"moved on, {workspace.task.hash}, {one.facts['what']}, "
-    told = {w: trial for w, trial in workspace.noted.told.items() if w.startswith(about)}
-    most = max((float(what.removeprefix(about)) for what in told), default=0.0)
-    if own not in told.values():
-        if far.value < FARTHER * most:
-            return None
-        what = f"{about}{far.value:.6g}"
-        with suppress(GroundedError):  # a folder that can't be written: it is told again
-            workspace.notes.add({"note": "told", "trial": own, "what": what}, again=False)
-        vars(workspace).pop("noted", None)
-    return one
 
 
 def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:

@@ -52,7 +52,6 @@ from grounded_trials.workspace.intake.recognising.read_otherwise import (
     exchanged_in,
     otherwise,
 )
-from grounded_trials.workspace.intake.remarks.control_loop import old_samples
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 
 if TYPE_CHECKING:
@@ -171,8 +170,6 @@ class Case:
             if start.rival_s is not None:
                 doubt = found("log.start_doubt", ran=self.ran, used=start.seconds)
                 read = read.telling(doubt.also(rival=start.rival_s))
-        if look.old is not None:
-            read = read.telling(*old_samples(self.workspace, self.own, self.whole, look.old))
         return read
 
 

@@ -14,16 +14,15 @@ counts. By the commands alone the two are one; `what_is_late` asks the robot's m
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
-from grounded.search.candidate import Candidate, Tried
-from grounded.search.feedback.oscillation import SWINGS, calm_ranges, periodic, swings
-from grounded.search.feedback.sample_age import different, sample_age
+from grounded.search.candidate import Candidate
+from grounded.search.feedback.sample_age import sample_age
 from grounded.search.returned.clipped import clipped
 from grounded.search.returned.late_commands import Late, what_is_late
 from grounded.search.returned.smoothed import smoothed
@@ -72,11 +71,7 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     ran = follows(own.policy, run, max(LATEST, latest(workspace.task)))
     if ran is None or not ran.alike:
         return _predicted_ahead(workspace, own, whole)
-    return (
-        _late(workspace, own, run, ran)
-        or _older(workspace, own, run, ran)
-        or _predicted_ahead(workspace, own, whole)
-    )
+    return _late(workspace, own, run, ran) or _predicted_ahead(workspace, own, whole)
 
 
 def _late(workspace: Folder, own: Candidate, run: Trial, ran: Following) -> Finding | None:
@@ -118,21 +113,6 @@ def _earlier(workspace: Folder, but: str, late: int | None = None) -> list[Trial
             if ran is not None and ran.alike and ran.late == (ran.late if late is None else late):
                 some.append(run)
     return some[::-1]
-
-
-def _older(workspace: Folder, own: Candidate, run: Trial, ran: Following) -> Finding | None:
-    """Return that a run acted on older samples than the earlier ones, or None.
-
-    Samples that are as old in every run are the robot's, and later candidates allow for them. Of a
-    single one, the next step would take its loss for its candidate's.
-    """
-    if own.sample_age or ran.steps_old < 1:
-        return None
-    before = _earlier(workspace, run.id)
-    each = [follows(workspace.candidate(one.candidate)[0].policy, one) for one in before]
-    if not each or any(one is None or one.steps_old for one in each):
-        return None
-    return found("run.older", ran=own.id, age=Quantity(ran.steps_old * run.dt, "s"))
 
 
 def _predicted_ahead(workspace: Folder, own: Candidate, trial: Trial) -> Finding | None:
@@ -200,80 +180,3 @@ def _unsent(off: Array, held: Array) -> int:
         float(np.median(off[part].max(axis=1))) for part in (slice(begins), slice(begins, None))
     )
     return begins if lacking > RESEMBLES and sent < UNLIKE * lacking else 0
-
-
-def old_samples(workspace: Folder, own: Candidate, trial: Trial, old: Array) -> Iterator[Finding]:
-    """Yield that the states that the program acted on had moved on by much of their errors.
-
-    Args:
-        workspace: whose task the run follows.
-        own: the candidate that was run, whose commands the log reproduces.
-        trial: its run.
-        old: mean age of each state's samples when commands were sent [s], (n,).
-    """
-    task, states = workspace.task, trial.states[: workspace.task.horizon + 1]
-    if own.policy.gain is None or len(states) < 2:
-        return
-    if planned := own.sample_age:
-        age = sample_age(task, own, [trial]) or float(np.median(old))
-        if not different(task, age, planned):
-            return
-        old = np.full(len(old), abs(age - planned))
-    error = task.model.difference(states, task.target[: len(states)])
-    moved_on = task.model.difference(states[1:], states[:-1]) / task.dt
-    off, speed = (
-        np.sqrt(np.nansum(e**2, axis=0) / np.isfinite(e).sum(axis=0).clip(1))
-        for e in (error, moved_on)
-    )
-    allowed = {n for one in _delays(workspace) for n in str(one["name"]).split(":")[1].split("+")}
-    fed = np.abs(own.policy.gain[..., : states.shape[1]]).max(axis=(0, 1)) > 0  # not past inputs
-    counts = fed & (task.reward.state > 0) & (old > 0) & (old * speed > LEADS * off)
-    told = [i for i in np.flatnonzero(counts) if task.model.state_names[i] not in allowed]
-    if not told and not planned:
-        return
-    i = max(told or np.flatnonzero(fed), key=lambda i: old[i] * speed[i] / max(off[i], 1e-300))
-    name, unit = list(task.model.states.items())[i]
-    yield found(
-        "run.samples",
-        ran=own.id,
-        state=name,
-        age=Quantity(float(old[i]) if not planned else age, "s"),
-        planned=Quantity(planned, "s"),
-        moved=Quantity(float(old[i] * speed[i]), unit),
-        error=Quantity(float(off[i]), unit),
-    )
-
-
-def swung(
-    task: Task, tried: Tried | None, trial: Trial, history: Sequence[Tried]
-) -> Finding | None:
-    """Return which inputs oscillated in a run, or None.
-
-    Args:
-        task: the manoeuvre.
-        tried: the candidate that was run; None if it is none of the search.
-        trial: its run.
-        history: all candidates with their trials.
-    """
-    if tried is None or tried.candidate.policy.gain is None:
-        return None
-    made, ids = tried.candidate, [one.candidate.id for one in history]
-    sizes = calm_ranges(task, history)[ids.index(made.id)]
-    counts = swings(made, trial, sizes)
-    some = np.flatnonzero(counts >= SWINGS).tolist()
-    if not some:
-        return None
-    off = trial.inputs[: len(made.predicted_inputs)] - made.predicted_inputs[: trial.steps]
-    others = [one for one in tried.trials if one.id != trial.id]
-    calm = [one.id for one in others if not (swings(made, one, sizes) >= SWINGS).any()]
-    i = max(some, key=lambda i: counts[i])
-    name, unit = list(task.model.inputs.items())[i]
-    return found(
-        "run.swings",
-        inputs=tuple(task.model.input_names[k] for k in some),
-        input=name,
-        swings=int(counts[i]),
-        size=Quantity(float(sizes[i]), unit),
-        irregular=not any(periodic(off[:, k]) for k in some),
-        calm=tuple(calm),
-    )

@@ -38,7 +38,6 @@ def checked(workspace: Folder, trial: Trial, last_s: float = math.nan) -> Iterat
         yield found("log.not_finite", name, at=Quantity(step * trial.dt, "s"))
     if not trial.candidate:
         yield from _still(whole)
-        yield from _halted(workspace, whole)
         yield from _beyond(workspace, whole)
         return
     if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
@@ -96,15 +95,6 @@ def _still(trial: Trial) -> Iterator[Finding]:
         yield found("log.still", trial=trial.id)
 
 
-def _halted(workspace: Folder, trial: Trial) -> Iterator[Finding]:
-    """Yield where the robot stood still in data under commands that had moved it before."""
-    from grounded.accounts.halted import halted
-
-    if stood := halted(workspace.base_model, trial):
-        one = found("log.halted", inputs=stood.inputs, trial=trial.id)
-        yield one.also(begins=stood.begins, ends=stood.ends)
-
-
 def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
     """Yield logged inputs that exceed [limits], which were taken from another log."""
     from grounded.accounts.inputs import beyond_limits, in_percent, limits_of, span
@@ -118,3 +108,24 @@ def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
             how = "percent" if in_percent(task, trial.inputs, i) else "flip" if turned else "widen"
             logged, limits = span(trial.inputs[:, i]), limits_of(task, i)
             yield found("log.limits", name, logged=logged, limits=limits, how=how)
+
+
+def left_afterwards(task: Task, whole: Trial) -> Finding | None:
+    """Return that the robot left [safety] after a run that stayed inside, or None.
+
+    Args:
+        task: with [safety] and the horizon.
+        whole: the run with the seconds that follow it.
+    """
+    assert task.safety_low is not None and task.safety_high is not None
+    states = whole.states[: whole.finite_steps + 1]
+    out = np.maximum(task.safety_low - states, states - task.safety_high)
+    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
+        return None
+    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
+    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
+    name, unit = list(task.model.states.items())[int(i)]
+    most = float(states[t, i])
+    bound = Quantity(float(np.clip(most, task.safety_low[i], task.safety_high[i])), unit)
+    after = Quantity(first * whole.dt, "s")
+    return found("run.after_safety", name, after=after, bound=bound, most=Quantity(most, unit))
