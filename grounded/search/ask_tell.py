@@ -23,9 +23,9 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
 from grounded.search.planner import Planner, planner_with
-from grounded.search.returned.told_trial import crashed, odd_trial
 from grounded.search.standing import Proposal, Standing
 from grounded.search.step.step_size import SearchOptions
+from grounded.search.told_trial import crashed, odd_trial
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 

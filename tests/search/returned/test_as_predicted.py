@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.search.returned.as_predicted import apart, like_predicted, multiplied, odd_columns
-from grounded.search.returned.stories import Kind, stories
-from grounded.search.returned.who_drove import follows
+from grounded.accounts.predicted import apart, like_predicted
+from grounded.accounts.returned import Kind, multiplied, stories
+from grounded.accounts.sent import follows
 from recorded import waiting
 
 
@@ -22,7 +22,7 @@ def made(tmp_path_factory):
 
 def said(made, trial):
     task, own, _ = made
-    return odd_columns(task.model, own, trial)
+    return units(task, trial, own, follows(own.policy, trial, 1))
 
 
 def units(task, run, own, plain):

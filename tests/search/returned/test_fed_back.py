@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import grounded as gr
+from grounded.accounts.returned import Kind, stories, unit_by_factor
+from grounded.accounts.sent import follows, latest
 from grounded.onboard import Runner
-from grounded.search.returned.stories import Kind, stories, unit_by_factor
-from grounded.search.returned.who_drove import follows, latest
 
 MODEL = gr.Model(
     states={"x": "m", "v": "m/s"},

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from grounded.accounts.returned import Kind, stories, suspicion
+from grounded.accounts.sent import follows, latest
 from grounded.onboard import Runner
 from grounded.search.ask_tell import Search
-from grounded.search.returned.stories import Kind, stories
-from grounded.search.returned.who_drove import follows, latest
-from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
 from small_tasks import rover_task
 

@@ -14,7 +14,7 @@ from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.recognising.read_otherwise import exchanged_in
+from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
 from workspaces import make
 
 MODEL = """import numpy as np
@@ -196,8 +196,8 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     said = str(refused.value)
     assert holds(said, plan.id, "port", "starboard") and "somebody" not in said
     recording = read_foreign(w, path, mapping_of(w, path)).recording
-    found = exchanged_in(recording, w.task, plan)
-    assert found and (found.finding.code, found.names) == ("log.exchange", ("port", "starboard"))
+    found = min(stories_of_log(recording, w.task, plan, None), key=lambda one: one.left)
+    assert (found.finding.code, found.names) == ("log.exchange", ("port", "starboard"))
     toml = w.folder / "grounded.toml"
     toml.write_text(
         toml.read_text()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from facts import of_code
-from grounded.search.returned.who_drove import evidence, follows
-from grounded.search.returned.whose_run import suspicion
+from grounded.accounts.returned import suspicion
+from grounded.accounts.sent import evidence, follows
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial

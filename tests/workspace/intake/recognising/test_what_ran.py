@@ -13,9 +13,9 @@ import pytest
 
 from cli import grounded
 from facts import holds, of_code
+from grounded.accounts.returned import suspicion
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Plant
-from grounded.search.returned.whose_run import suspicion
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial

@@ -16,12 +16,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from grounded.accounts.sent import as_sent
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Tried
-from grounded.search.returned.who_drove import as_sent
 from grounded.search.safety import COASTS
 from grounded.search.standing import Standing
 from grounded.task import Task

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.frozen import Array
-from grounded.policy import Policy
-from grounded.search.returned.who_drove import (
+from grounded.accounts.sent import (
     EXACT,
     FINE,
     LEAST,
     WINDOWS,
 )
+from grounded.frozen import Array
+from grounded.policy import Policy
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.samples import Samples, tidy
 

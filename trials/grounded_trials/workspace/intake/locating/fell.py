@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from grounded.accounts.sent import EXPLAINED, FEW, FINE, LEAST, SAME, Following
 from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import EXPLAINED, FEW, FINE, LEAST, SAME, Following
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.workspace.intake.locating.acted_on import acted_on

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.accounts.sent import LATEST
 from grounded.policy import Policy
-from grounded.search.returned.who_drove import LATEST
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start, instants_apart

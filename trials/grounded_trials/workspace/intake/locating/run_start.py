@@ -20,11 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.frozen import Array
-from grounded.policy import Policy
-from grounded.search.returned.who_drove import EXACT as TO_DIGITS
-from grounded.search.returned.who_drove import (
+from grounded.accounts.sent import EXACT as TO_DIGITS
+from grounded.accounts.sent import (
     FINE,
     LEAST,
     RESEMBLES,
@@ -33,6 +30,9 @@ from grounded.search.returned.who_drove import (
     UNLIKE,
     follows,
 )
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
@@ -95,6 +95,18 @@ class Recording:
     def first(self) -> float:
         """The time of the first command, the default start of a run [s]."""
         return (self.whole.start_ns - self.whole.origin_ns) * 1e-9
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The states that a column holds; the others are estimated."""
+        return tuple(name for name in self.names[0] if name in self.logged)
+
+    @property
+    def waits(self) -> bool:
+        """Whether the log begins before any run: with the input held then, for some steps."""
+        changed = self.changes[self.changes > self.first].min(initial=np.inf)
+        held = bool((self.whole.inputs[0] == self.past).all())
+        return held and changed - self.first > HELD * self.dt
 
     def trial_from(self, start: float) -> Trial | None:
         """Return the log as a trial from `start` [s] on, or None if a state is not known there."""

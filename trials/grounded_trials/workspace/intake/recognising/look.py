@@ -8,11 +8,11 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
+from grounded.accounts.returned import Suspicion, suspicion
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.search.returned.whose_run import Suspicion, suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell

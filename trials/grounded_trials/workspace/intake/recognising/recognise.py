@@ -18,24 +18,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.accounts.reported import scaled as scaled_columns
-from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, Weight, found
-from grounded.model import Model
-from grounded.policy import Policy
-from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import apart, multiplied, odd_columns
-from grounded.search.returned.stories import (
+from grounded.accounts.returned import (
+    OTHERS,
     Kind,
     Story,
-    fed_nothing,
     likeliest,
     of_full_scale,
     scored,
     stories,
     unit_by_factor,
 )
-from grounded.search.returned.who_drove import FINE, RESEMBLES, follows, latest
-from grounded.search.returned.whose_run import OTHERS
+from grounded.accounts.sent import FINE, RESEMBLES, follows, latest
+from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding, Quantity, Weight, found
+from grounded.policy import Policy
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
@@ -46,12 +43,7 @@ from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short,
 from grounded_trials.workspace.intake.opening.foreign import misread
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.recognising.look import Look
-from grounded_trials.workspace.intake.recognising.misused_run import misuses
-from grounded_trials.workspace.intake.recognising.read_otherwise import (
-    at_each_start,
-    exchanged_in,
-    otherwise,
-)
+from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 
 if TYPE_CHECKING:
@@ -214,6 +206,8 @@ def recognised(
         return cut_short(read, *fell)
     if story.kind is Kind.UNIT:
         story = _in_unit(case, story)
+    elif story.finding and story.finding.code == "log.exchange" and story.kind is Kind.LOG:
+        story = _exchanged(case, story)
     if candidate is not None:
         return _doubted(case, read, story)
     raise _refusal(case, story)
@@ -221,40 +215,31 @@ def recognised(
 
 def _of_trial(case: Case) -> Iterator[Story]:
     """Yield the stories of a trial as it is cut, of another unit or origin of its states."""
-    task, own, whole, ran = case.task, case.own, case.whole, case.seen.ran
     if case.rival:
         return
-    logged = [name for name in task.model.state_names if name not in case.guessed]
-    some = stories(task, own, whole, ran, logged=logged)
-    some = [one for one in some if one.kind is Kind.UNIT or (one.kind is Kind.LOG and case.log)]
-    yield from (one for one in some if one.kind is Kind.UNIT or not (case.named or case.seen.why))
-    if case.log and not case.seen.why and not some:
-        names, by = odd_columns(task.model, own, whole, logged)
-        if names:
-            run = multiplied(whole, names, by)
-            fit = follows(own.policy, run.until(task.horizon), latest(task))
-            yield scored(Kind.UNIT, None, own, run, fit.error if fit else 1.0, names=names, by=by)
+    logged = [name for name in case.task.model.state_names if name not in case.guessed]
+    some = stories(case.task, case.own, case.whole, case.seen.ran, logged=logged)
+    zeros = case.log and not (case.named or case.seen.why)
+    yield from (one for one in some if one.kind is Kind.UNIT or (zeros and one.kind is Kind.LOG))
 
 
 def _of_log(case: Case) -> Iterator[Story]:
     """Yield the stories of a log whose commands are not its candidate's."""
     log, task, own, fell = case.log, case.task, case.own, case.look.fell
     if case.rival:  # with the columns put back, the commands are those of the one that ran
-        swaps = [exchanged_in(log, task, one, case.proven) for one in (own, case.rival) if log]
-        yield from filter(None, swaps)
+        each = [
+            one for ran in (own, case.rival) if log for one in stories_of_log(log, task, ran, None)
+        ]
+        yield from (one for one in each if one.kind is Kind.LOG and len(one.names) == 2)
         return
     if fell and case.seen.ran:
         error = np.nanmean((case.seen.ran.off / case.seen.ran.fine)[: fell[0]] ** 2) ** 0.5
         part = case.whole.until(fell[0])
         yield scored(Kind.FELL, fell[1], own, part, FINE * float(error), price=SHORTER)
     if log:
-        yield from otherwise(log, task, own, case.proven)
-        yield from at_each_start(log, task, own)
-        yield from misuses(log, task, own, case.look.found)
+        yield from stories_of_log(log, task, own, case.look.found)
     if dead := [one for one in case.columns if one.code == "log.dead"]:
-        names = [name for one in dead for name in one.about]
-        plain, motion = case.as_logged.commands, apart(own, case.whole, names)
-        yield replace(next(_of_columns(case, dead)), commands=plain, motion=motion)
+        yield replace(next(_of_columns(case, dead)), commands=-np.inf)
     earlier = None if case.read.bare else of_earlier_task(case.workspace, log, case.whole)
     if earlier:
         yield earlier
@@ -266,7 +251,7 @@ def _of_motion(case: Case, story: Story) -> Iterator[Story]:
     Feedback with the wrong sign drives the states away from the prediction, so that the commands
     soon stay at their limits and do not tell where the run began.
     """
-    from grounded.search.returned.reversed_input import reversed_input
+    from grounded.accounts.reversed_input import reversed_input
 
     sent = case.log if case.whole.inputs.any() and not (case.rival or case.opens) else None
     trial = sent.trial_from(sent.first) if sent else None
@@ -301,12 +286,12 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
 
 
 def _in_unit(case: Case, story: Story) -> Story:
-    """Return the story of columns times a factor: in the log, or by the robot's program."""
-    names, by, model = story.names, story.by, case.task.model
-    its = case.log if _in_programs_unit(model, names, by) else None
-    for how in at_each_start(its, case.task, case.own) if its else ():
-        if how.kind is Kind.PROGRAM:
-            return how
+    """Return the story of columns times a factor: in the log, or sent so by the robot's program."""
+    names, by, model = (
+        tuple(n for n in story.names if n not in case.guessed),
+        story.by,
+        case.task.model,
+    )
     facts: dict[str, Any] = {"ran": case.ran}
     if shown := sent_otherwise(case.workspace, case.whole, names, by):
         told = found("run.sends", *names, times=1 / by, **facts, **shown)
@@ -316,6 +301,27 @@ def _in_unit(case: Case, story: Story) -> Story:
         units = {**model.states, **model.inputs}
         facts |= {"tables": (), "writes": tuple(dict.fromkeys(units[name] for name in names))}
     return replace(story, finding=scaled_columns(model, names, 1 / by, unit).also(**facts))
+
+
+def _exchanged(case: Case, story: Story) -> Story:
+    """Return what shows that two columns are exchanged: in the log, or by the robot's program.
+
+    If the model predicts the motion with the columns as they are read, the log is right, and the
+    program passed them on to the motors in each other's place. (With both [log] and the wires
+    exchanged a log looks the same, unless [log] read earlier trials well.)
+    """
+    from grounded.accounts.judge import contradicted
+    from grounded.accounts.table import Account
+
+    (a, b), model, run = story.names, case.task.model, case.whole
+    every = (*model.state_names, *model.input_names)
+    fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
+    facts = dict[str, Any](ran=case.ran, proven=tuple(case.proven(fault)))
+    if not contradicted(model, run.until(run.known_steps), range(model.n), fault):
+        return replace(story, finding=found("log.exchange", a, b, **facts))
+    parts = "states" if a in model.state_names else "outputs"
+    told = found("run.exchanged", a, b, parts=parts, moved="as the log says", **facts)
+    return replace(story, finding=told, rerun=True)
 
 
 def _refusal(case: Case, story: Story) -> GroundedError:
@@ -400,18 +406,6 @@ def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, fl
     return cut_log(read.log, read.trial.candidate, begins), begins
 
 
-def _in_programs_unit(model: Model, names: Sequence[str], by: float) -> bool:
-    """Return whether rather the robot's program than its log has states in another unit.
-
-    No unit has numbers that are smaller than radians by 57.3; but if a program works in degrees,
-    that is the ratio of the log to what it passed, for all angles and their rates.
-    """
-    mine = {model.states.get(name, "") for name in names}
-    turning = {name for name, unit in model.states.items() if unit.split("/")[0] in mine}
-    known = unit_by_factor(model, names, 1 / by) and not unit_by_factor(model, names, by)
-    return bool(known) and turning <= {*names}
-
-
 def _lasting_s(log: Recording) -> float:
     """Return how long a log lasts after its first command [s]."""
     end = min(int(one.t.max()) for one in log.logged.values())
@@ -420,7 +414,7 @@ def _lasting_s(log: Recording) -> float:
 
 def _guessed(log: Recording | None) -> set[str]:
     """Return the states that [estimate] finds: no column holds them, so none is in another unit."""
-    return {name for name in log.names[0] if name not in log.logged} if log else set()
+    return {*log.names[0]} - {*log.measured} if log else set()
 
 
 def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
@@ -440,13 +434,8 @@ def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
 
 
 def _unlike(case: Case) -> Finding | None:
-    """Return that a run whose commands are like its candidate's is not quite its run, or None.
-
-    It was driven without its candidate's feedback, little disturbed; or it is another workspace's.
-    """
+    """Return that a run whose commands are like its candidate's is another workspace's, or None."""
     ran = case.seen.ran
-    if ran is not None and fed_nothing(case.own, case.whole, ran):
-        return found("run.unfed", ran=case.ran, weight=Weight.WARN)
     if not case.read.bare or ran is None or np.nanmax(np.abs(ran.off) / ran.fine) < EXACT:
         return None
     return found("log.bare", ran=case.ran)

@@ -12,10 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.findings import Finding, found
-from grounded.policy import Policy
-from grounded.search.candidate import Candidate
-from grounded.search.returned.who_drove import (
+from grounded.accounts.sent import (
     FINE,
     LATEST,
     LEAST,
@@ -25,6 +22,9 @@ from grounded.search.returned.who_drove import (
     follows,
     steps_alike,
 )
+from grounded.findings import Finding, found
+from grounded.policy import Policy
+from grounded.search.candidate import Candidate
 from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import ActedOn, acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start

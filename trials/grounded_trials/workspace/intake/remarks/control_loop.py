@@ -19,14 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.findings import Finding, Quantity, found
-from grounded.frozen import Array
-from grounded.search.candidate import Candidate
-from grounded.search.feedback.sample_age import sample_age
-from grounded.search.returned.clipped import clipped
-from grounded.search.returned.late_commands import Late, what_is_late
-from grounded.search.returned.smoothed import smoothed
-from grounded.search.returned.who_drove import (
+from grounded.accounts.late_commands import Late, what_is_late
+from grounded.accounts.returned import Kind, stories
+from grounded.accounts.sent import (
     LATEST,
     LEAST,
     RESEMBLES,
@@ -37,6 +32,10 @@ from grounded.search.returned.who_drove import (
     follows,
     latest,
 )
+from grounded.findings import Finding, Quantity, found
+from grounded.frozen import Array
+from grounded.search.candidate import Candidate
+from grounded.search.feedback.sample_age import sample_age
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -61,14 +60,13 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
     if as_sent(own.policy, whole):
         return None
-    if cut := clipped(own, whole):
-        return cut.finding(own)
     if one := steps_skipped(workspace.task, own, whole):
         return one
-    if smooth := smoothed(workspace.base_model, own, whole):
-        return smooth.finding(own)
     run = whole.until(workspace.task.horizon)
     ran = follows(own.policy, run, max(LATEST, latest(workspace.task)))
+    some = stories(workspace.task, own, run, ran)
+    if some and some[0].kind is Kind.PROGRAM:
+        return some[0].finding
     if ran is None or not ran.alike:
         return _predicted_ahead(workspace, own, whole)
     return _late(workspace, own, run, ran) or _predicted_ahead(workspace, own, whole)

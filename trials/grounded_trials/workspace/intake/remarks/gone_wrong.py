@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.accounts.predicted import like_predicted
+from grounded.accounts.sent import LEAST
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.frozen import median
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import like_predicted
-from grounded.search.returned.who_drove import LEAST
 from grounded.search.step.mispredictions import STRAYED
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -57,7 +57,7 @@ def gone_wrong(
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
     """
-    from grounded.search.returned.reversed_input import beside_friction, reversed_input
+    from grounded.accounts.reversed_input import beside_friction, reversed_input
 
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
     missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
@@ -93,7 +93,7 @@ def _missed(
 
 def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
     """Return that an input acted the other way round, given the other trials."""
-    from grounded.search.returned.reversed_input import signs_of
+    from grounded.accounts.reversed_input import signs_of
 
     each = [
         (one.id, signs_of(workspace.planner, one)[turned.about[0]])

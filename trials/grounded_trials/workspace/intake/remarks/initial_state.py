@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.accounts.sent import LEAST
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.search.difference import student
-from grounded.search.returned.who_drove import LEAST
 from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
 from grounded.task import Task

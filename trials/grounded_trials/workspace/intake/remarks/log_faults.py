@@ -141,7 +141,7 @@ def without(workspace: Folder, trial: Trial, fault: Account) -> list[str]:
 
 def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
     """Return whether a run's commands are its candidate's, and would not be without an exchange."""
-    from grounded.search.returned.who_drove import follows, latest
+    from grounded.accounts.sent import follows, latest
 
     if trial.candidate not in workspace.candidate_ids():
         return False

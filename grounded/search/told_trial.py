@@ -12,13 +12,11 @@ import numpy as np
 
 from grounded.accounts.finding import UnusableTrials, in_the_log
 from grounded.accounts.reported import scaled
+from grounded.accounts.returned import Kind, stories, suspicion, unit_by_factor
 from grounded.accounts.sound_trials import sound_trials
 from grounded.findings import found
 from grounded.model import Model
 from grounded.search.candidate import Candidate
-from grounded.search.returned.as_predicted import odd_columns
-from grounded.search.returned.stories import Kind, stories, unit_by_factor
-from grounded.search.returned.whose_run import suspicion
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 
@@ -43,13 +41,10 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
     if unit := unit_by_factor(model, names, by):  # the columns may agree with each other
         return scaled(model, names, 1 / by, unit).also(ran=own.id).what
     columns = _odd_columns(model, whole) if first else ""
-    if not columns and not names and not seen.why:
-        odd, by = odd_columns(model, own, whole)
-        if odd:
-            return scaled(model, odd, 1 / by).what
-    if columns or not seen.why:
+    if columns or not (names or seen.why):
         return columns
-    return (scaled(model, names, 1 / by).also(ran=own.id) if names else seen.why).what
+    told = scaled(model, names, 1 / by).also(ran=own.id) if names else seen.why
+    return told.what if told else ""
 
 
 def crashed(task: Task, trial: Trial) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 
 from grounded.accounts.commands import Acts, how_inputs_act
 from grounded.accounts.motion import HALF, Ahead
+from grounded.accounts.returned import multiplied
 from grounded.findings import Finding, found
 from grounded.search.planner import Planner
-from grounded.search.returned.as_predicted import multiplied
 from grounded.trial import Trial
 
 STARTS = 120  # samples to predict from

@@ -1,0 +1,49 @@
+"""How far a run is from what was predicted for its candidate.
+
+A policy's commands alone don't tell which column is wrong: feedback on an angle of the other sign
+sends nearly what it sends on a speed of the other sign. But a run resembles its prediction, even
+by a crude model, since feedback keeps it there: a column in another unit, of the other sign or in
+another's place is far from it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.candidate import Candidate
+from grounded.trial import Trial
+
+NEAR = 0.3  # of a state's usual size: smaller differences from the prediction are alike
+ALIKE = 1.0  # largest usual difference of a run that is like its prediction; unrelated: 1.4
+
+
+def far(own: Candidate, trial: Trial, first: int = 0) -> Array:
+    """Return each state's rms difference from its prediction, relative to its size, (n,).
+
+    The size is the geometric mean of the standard deviations, so that a column that is too small is
+    as far as one that is too large. NaN for a state that is predicted not to move, or of which
+    nothing is finite.
+    """
+    predicted = own.predicted_states[first:]
+    T = min(trial.finite_steps, len(predicted) - 1)
+    if T < 0:
+        return np.full(trial.states.shape[1], np.nan)
+    seen, said = trial.states[: T + 1], predicted[: T + 1]
+    off = np.sqrt(((seen - said) ** 2).mean(axis=0))
+    moves, shown = said.std(axis=0), seen.std(axis=0)
+    with np.errstate(all="ignore"):
+        found: Array = off / np.sqrt(np.where(moves > 0, moves, np.nan) * (shown + 1e-6 * moves))
+    return found
+
+
+def apart(own: Candidate, trial: Trial, first: int = 0) -> float:
+    """Return how far a trial, from step `first` on, is from its prediction [nats] in all states."""
+    return float(np.nansum(np.log(np.fmax(far(own, trial, first), NEAR))))
+
+
+def like_predicted(own: Candidate, trial: Trial) -> bool:
+    """Return whether most states of a trial are near their prediction, as far as one is known."""
+    known = far(own, trial)
+    known = known[np.isfinite(known)]
+    return not len(known) or bool(np.median(known) < ALIKE)
