@@ -208,7 +208,6 @@ def stories(
     acts: bool = False,
     logged: Sequence[str] | None = None,
     waits: bool | None = None,
-    exactly: Callable[[Row], float] | None = None,
 ) -> list[Story]:
     """Return what explains a trial's commands clearly better than that they are as logged.
 
@@ -220,8 +219,6 @@ def stories(
         acts: whether other commands than those held before a run are sent elsewhere in its log.
         logged: the states that a column holds; None: all.
         waits: whether its log begins before any run; None if that is unknown.
-        exactly: returns what a row leaves of the commands on the samples that the program acted on,
-            if it explains them to the last digits, else infinity.
 
     Returns:
         The stories, the likeliest first.
@@ -234,21 +231,24 @@ def stories(
     rows += fitted_rows(task.model, own, trial, rows, logged, waits)
     some = list[Story]()
     for row in nearest(rows, trial):
-        some += _stories_of(row, task, own, trial, plain, exactly)
+        some += stories_of(row, task, own, trial, plain)
     if not some and not plain.beyond:
         some += _by_motion(task.model, own, trial, plain, logged)
     return sorted(some, key=lambda one: one.left)
 
 
-def _stories_of(
-    row: Row,
-    task: Task,
-    own: Candidate,
-    trial: Trial,
-    plain: Following,
-    exactly: Callable[[Row], float] | None,
+def stories_of(
+    row: Row, task: Task, own: Candidate, trial: Trial, plain: Following
 ) -> Iterator[Story]:
-    """Yield the stories of a row that explain a trial clearly better than as logged."""
+    """Yield the stories of a row that explain a trial clearly better than as logged.
+
+    Args:
+        row: of the table.
+        task: the task of the candidate.
+        own: the candidate.
+        trial: the trial, not longer than its run.
+        plain: the comparison of its commands with the policy's.
+    """
     run = row.of(trial)
     fit = follows(row.policy, run, latest(task))
     if fit is None:
@@ -274,9 +274,6 @@ def _stories_of(
         return
     share = _moved(own, trial, fit)
     known = fit.alike and tells and fit.error < EXPLAINED * share and _tells(plain, fit)
-    if not known and exactly is not None:
-        left, share = exactly(row), 1.0
-        known = bool(np.isfinite(left))
     if known and gained(left / share, row.program + least):
         told = _without_feedback(own, trial, fit, row)
         yield scored(Kind.PROGRAM, told, own, trial, left / share, first, price=row.program, **same)
@@ -738,13 +735,13 @@ def _later(own: Candidate, trial: Trial, waits: bool) -> Iterator[Row]:
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
     if not best:
         return
-    late = policy.dt * best
+    late, price = policy.dt * best, LEADS * (1 + best / policy.horizon)
     clock = found("run.clock", ran=own.id, step=best, seconds=late)
     begun = found("log.begun_late", ran=own.id, late=Quantity(late, "s"))
     yield Row(
         policy.after(best),
-        log=None if waits else LEADS,
-        program=LEADS if waits else None,
+        log=None if waits else price,
+        program=price if waits else None,
         told=clock,
         of_log=begun,
         steps=best,

@@ -11,12 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
-from grounded.accounts.predicted import like_predicted
-from grounded.accounts.returned import NEARLY_ALL, Kind, Row, Story, known_rows, scored, stories
+from grounded.accounts.predicted import apart, like_predicted
+from grounded.accounts.returned import (
+    NEARLY_ALL,
+    Kind,
+    Row,
+    Story,
+    known_rows,
+    scored,
+    stories,
+    stories_of,
+)
 from grounded.accounts.sent import EXACT, SLIGHT, follows, latest
 from grounded.findings import found
 from grounded.search.candidate import Candidate
@@ -52,7 +60,9 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
     some = list[Story]()
     for begins in dict.fromkeys(log.on_step(own.policy, one) for one in at):
         some += _from(log, task, own, begins)
-    return [*(some or _wherever(log, task, own)), *_at_other_rates(log, task, own)]
+    if min((one.commands for one in some), default=0.0) > np.log(APART):
+        some += _wherever(log, task, own)
+    return [*some, *_at_other_rates(log, task, own)]
 
 
 def _from(log: Recording, task: Task, own: Candidate, begins: float) -> list[Story]:
@@ -69,7 +79,6 @@ def _from(log: Recording, task: Task, own: Candidate, begins: float) -> list[Sto
         acts=_acts(log, own),
         logged=log.measured,
         waits=log.waits,
-        exactly=partial(_exactly, log, own, at=begins),
     )
 
 
@@ -83,9 +92,18 @@ def _wherever(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
     if every.steps < least_of(own.policy.horizon):
         return
     rows = known_rows(task, own, every, acts=_acts(log, own), logged=log.measured)
-    tried = sorted(one for row in rows for one in _begins(every, row))
-    for k in [*dict.fromkeys(k for _, k in tried)][:ALL]:
-        yield from _from(log, task, own, log.on_step(own.policy, first + k * log.dt))
+    tried = [(*one, row) for row in rows for one in _begins(every, row)]
+    for _, k, row in sorted(tried, key=lambda one: one[0])[:ALL]:
+        at = log.on_step(own.policy, first + k * log.dt)
+        if (trial := log.trial_from(at)) is None:
+            continue
+        trial = trial.until(min(trial.finite_steps, task.horizon))
+        if row.program is not None and apart(own, trial) <= apart(own, row.of(trial)):
+            if np.isfinite(left := _exactly(log, own, row, at)):
+                yield scored(Kind.PROGRAM, row.told, own, trial, left, price=row.program)
+        elif row.log is not None and (plain := follows(own.policy, trial, latest(task))):
+            each = stories_of(row, task, own, trial, plain)
+            yield from (one for one in each if one.kind is not Kind.PROGRAM)
 
 
 def _steps_of(log: Recording, own: Candidate) -> tuple[float, Trial]:
