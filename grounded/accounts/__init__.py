@@ -6,7 +6,9 @@ table         the accounts: units, signs, exchanges, offsets, dead sensors, stam
 kinematics    what positions, velocities and headings imply of each other
 motion        what the model predicts, calibrated on the log
 judge         scores each account by both, tells the best, corrects or refuses
-words         what is said of an account, and what to do about it
+reported      what is said of an account, and what to do about it
+returned      how the commands of a candidate's run came about: the same table, and what its
+              program did; by `sent` (commands beside a policy's) and `predicted`
 ages          late and filtered sensors, velocities computed from positions, biases; by `lag`
 commands      clocks that differ, inputs that act in reverse; `inputs` copies and limits
 signals       samples of one sensor

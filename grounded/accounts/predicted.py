@@ -8,17 +8,35 @@ another's place is far from it.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.candidate import Candidate
+from grounded.policy import Policy
 from grounded.trial import Trial
 
 NEAR = 0.3  # of a state's usual size: smaller differences from the prediction are alike
 ALIKE = 1.0  # largest usual difference of a run that is like its prediction; unrelated: 1.4
 
 
-def far(own: Candidate, trial: Trial, first: int = 0) -> Array:
+class Ran(Protocol):
+    """A candidate: its name, its policy, and the states (H + 1, n) predicted for it."""
+
+    @property
+    def id(self) -> str:
+        """Its name."""
+
+    @property
+    def policy(self) -> Policy:
+        """What it sends."""
+
+    @property
+    def predicted_states(self) -> Array:
+        """The states (H + 1, n) of its run in the model."""
+
+
+def far(own: Ran, trial: Trial, first: int = 0) -> Array:
     """Return each state's rms difference from its prediction, relative to its size, (n,).
 
     The size is the geometric mean of the standard deviations, so that a column that is too small is
@@ -37,12 +55,12 @@ def far(own: Candidate, trial: Trial, first: int = 0) -> Array:
     return found
 
 
-def apart(own: Candidate, trial: Trial, first: int = 0) -> float:
+def apart(own: Ran, trial: Trial, first: int = 0) -> float:
     """Return how far a trial, from step `first` on, is from its prediction [nats] in all states."""
     return float(np.nansum(np.log(np.fmax(far(own, trial, first), NEAR))))
 
 
-def like_predicted(own: Candidate, trial: Trial) -> bool:
+def like_predicted(own: Ran, trial: Trial) -> bool:
     """Return whether most states of a trial are near their prediction, as far as one is known."""
     known = far(own, trial)
     known = known[np.isfinite(known)]

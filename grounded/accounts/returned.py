@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.accounts.inputs import limits_of, span
 from grounded.accounts.judge import contradicted
-from grounded.accounts.predicted import apart, far
+from grounded.accounts.predicted import Ran, apart, far
 from grounded.accounts.sent import (
     CLEAR,
     DECISIVE,
@@ -44,7 +44,6 @@ from grounded.model import Model
 from grounded.places import velocities
 from grounded.policy import Policy
 from grounded.result import figure, number, with_unit
-from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -109,7 +108,7 @@ class Story:
 def scored(
     kind: Kind,
     finding: Finding | None,
-    own: Candidate,
+    own: Ran,
     run: Trial,
     error: float,
     first: int = 0,
@@ -201,7 +200,7 @@ def filtered(x: Array, shares: Array) -> Array:
 
 def stories(
     task: Task,
-    own: Candidate,
+    own: Ran,
     trial: Trial,
     plain: Following | None,
     *,
@@ -237,9 +236,7 @@ def stories(
     return sorted(some, key=lambda one: one.left)
 
 
-def stories_of(
-    row: Row, task: Task, own: Candidate, trial: Trial, plain: Following
-) -> Iterator[Story]:
+def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -> Iterator[Story]:
     """Yield the stories of a row that explain a trial clearly better than as logged.
 
     Args:
@@ -284,7 +281,7 @@ def _left(ran: Following) -> float:
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
 
 
-def _moved(own: Candidate, trial: Trial, fit: Following) -> float:
+def _moved(own: Ran, trial: Trial, fit: Following) -> float:
     """Return how far the commands that moved most did, relative to their size, at most 1.
 
     What a program sends that hardly moves is near to any commands that hardly move.
@@ -305,7 +302,7 @@ def _tells(plain: Following, fit: Following) -> bool:
     return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
 
 
-def _without_feedback(own: Candidate, trial: Trial, fit: Following, row: Row) -> Finding | None:
+def _without_feedback(own: Ran, trial: Trial, fit: Following, row: Row) -> Finding | None:
     """Return the finding of a row; of a policy without feedback, whether other states were fed.
 
     Commands without feedback depend on time alone, which may be off by one step.
@@ -322,7 +319,7 @@ def _without_feedback(own: Candidate, trial: Trial, fit: Following, row: Row) ->
 
 
 def _by_motion(
-    model: Model, own: Candidate, trial: Trial, plain: Following, logged: Sequence[str]
+    model: Model, own: Ran, trial: Trial, plain: Following, logged: Sequence[str]
 ) -> Iterator[Story]:
     """Yield the states in another unit or of the other sign that commands don't tell, at most one.
 
@@ -380,7 +377,7 @@ def nearest(rows: Sequence[Row], trial: Trial) -> list[Row]:
 
 
 def known_rows(
-    task: Task, own: Candidate, trial: Trial, *, acts: bool, logged: Sequence[str]
+    task: Task, own: Ran, trial: Trial, *, acts: bool, logged: Sequence[str]
 ) -> list[Row]:
     """Return the rows that hold for any trial.
 
@@ -401,7 +398,7 @@ def known_rows(
 
 def fitted_rows(
     model: Model,
-    own: Candidate,
+    own: Ran,
     trial: Trial,
     known: Sequence[Row],
     logged: Sequence[str],
@@ -426,7 +423,7 @@ def fitted_rows(
     ]
 
 
-def _scales(task: Task, own: Candidate, inputs: Array, logged: Sequence[str]) -> Iterator[Row]:
+def _scales(task: Task, own: Ran, inputs: Array, logged: Sequence[str]) -> Iterator[Row]:
     """Yield columns in another unit or of the other sign: of the log, or as a program passed them.
 
     At the limits one state may explain as much as all, but a program passes all in one unit.
@@ -481,7 +478,7 @@ def of_full_scale(task: Task, names: Sequence[str], by: float) -> str:
     return part and f"{part} of {with_unit(f'{full:g}', task.model.inputs[names[0]])}"
 
 
-def _orders(model: Model, own: Candidate, logged: Sequence[str]) -> Iterator[Row]:
+def _orders(model: Model, own: Ran, logged: Sequence[str]) -> Iterator[Row]:
     """Yield wrong orders that occur: two exchanged, some of the first ones last, sorted.
 
     A program has positions before velocities where the model has them after, for example; a log has
@@ -512,7 +509,7 @@ def _orders(model: Model, own: Candidate, logged: Sequence[str]) -> Iterator[Row
             )
 
 
-def _times(own: Candidate, *, unsent: bool, over: bool) -> Iterator[Row]:
+def _times(own: Ran, *, unsent: bool, over: bool) -> Iterator[Row]:
     """Yield the policy at other times than the run's, and without its feedback.
 
     Args:
@@ -621,7 +618,7 @@ def _off(policy: Policy, trial: Trial, states: Array, inputs: Array) -> Array:
     return off
 
 
-def _origins(model: Model, own: Candidate, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
+def _origins(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
     """Yield each state from another zero in the log, and all of them as a program passed them.
 
     States that are off by d change a command by the gains times d; of one state, its sensor's zero
@@ -658,7 +655,7 @@ def _origins(model: Model, own: Candidate, trial: Trial, logged: Sequence[str]) 
         )
 
 
-def _smoothed(model: Model, own: Candidate, trial: Trial) -> Iterator[Row]:
+def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
     """Yield the states that a first-order filter passed on, with the share that fits best.
 
     One filter serves all states, the velocities, or one of them.
@@ -681,7 +678,7 @@ def _smoothed(model: Model, own: Candidate, trial: Trial) -> Iterator[Row]:
         yield Row(policy, program=LEADS, names=group, share=share, told=told)
 
 
-def _clipped(own: Candidate, trial: Trial) -> Iterator[Row]:
+def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
     """Yield the policy with commands that are cut inside their limits.
 
     A cut repeats one value to the last digit wherever the policy asks for more, and nowhere else.
@@ -716,7 +713,7 @@ def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
     return at if enough and both >= 0.8 * max(at.sum(), more.sum()) else None
 
 
-def _later(own: Candidate, trial: Trial, waits: bool) -> Iterator[Row]:
+def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
     """Yield the policy from the later step that fits the first command best.
 
     The program's clock ran before, if the log begins before the run; else the log begins late.
@@ -761,7 +758,7 @@ class Suspicion:
 
 
 def suspicion(
-    task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate], *, told: bool = True
+    task: Task, trial: Trial, own: Ran, others: Sequence[Ran], *, told: bool = True
 ) -> Suspicion:
     """Check whether a trial is a run of its candidate, and if not, whose it is.
 

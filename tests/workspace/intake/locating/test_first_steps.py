@@ -58,7 +58,7 @@ def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discard
 ):
     log = unsent(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1)
     with monkeypatch.context() as before:
-        before.setattr(run_start, "missed_steps", lambda *_: 0)
+        before.setattr(run_start.Recording, "_before_first", lambda *_: None)
         late = w.ingest(log, candidate="c0002")
     w.discard(late.trial)
     found = w.ingest(log)

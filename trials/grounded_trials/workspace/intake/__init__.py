@@ -8,6 +8,5 @@ remarks/      what the user is told about a trial that is stored
 opening/      reading a file: a trial written by grounded, or any other log through [log]
 locating/     where in a log the run begins, and where it failed
 
-The rules for a run whose log was not seen yet (misuse, another scale, the commands alone) are in
-`grounded.search.returned`.
+How a run's commands may have come about is one table, in `grounded.accounts.returned`.
 """

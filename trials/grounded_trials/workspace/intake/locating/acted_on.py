@@ -35,8 +35,6 @@ AGES = 128  # largest number of ages tried per topic
 PARTS = 8  # number of ages tried in the time between samples
 ROUNDS = 2  # rounds of coordinate search over the topics' ages
 FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
-USUAL = 0.03  # median difference of commands on speeds that the program had differently, at most
-MOST = 0.75  # share of a run's parts in which commands must be that near, within 2x
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +70,6 @@ class ActedOn:
         """Whether the commands are exact, also in every part of the run."""
         parts = (one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS))
         return self.exact and all(len(one) < FEW or np.mean(one < EXACT) > FEWEST for one in parts)
-
-    @property
-    def usually(self) -> bool:
-        """Whether most commands are about the policy's, as with other estimates of the speeds."""
-        parts = [one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS)]
-        near = [np.median(one) < 2 * USUAL for one in parts if len(one) >= FEW]
-        return self.left < USUAL and bool(near) and float(np.mean(near)) >= MOST
 
     @property
     def left(self) -> float:

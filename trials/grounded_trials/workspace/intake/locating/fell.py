@@ -8,17 +8,13 @@ candidate's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
-from grounded.accounts.sent import EXPLAINED, FEW, FINE, LEAST, SAME, Following
+from grounded.accounts.sent import EXPLAINED, FEW, FINE, LEAST, Following
 from grounded.findings import Finding, Quantity, found
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.workspace.intake.locating.acted_on import acted_on
-from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 
 
 def fall_in(
@@ -85,34 +81,3 @@ def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
     if T - held >= FEW and after > max(EXPLAINED**2, 4 * before):
         return held
     return None if ran.alike else round(ran.until_s / task.dt)
-
-
-def who_fell(
-    log: Recording,
-    own: Candidate,
-    candidates: Sequence[Candidate],
-    start_of: Callable[[Candidate], Start | None],
-    end: float,
-) -> str:
-    """Return another candidate whose commands were sent until a fall; "" if the own fits as well.
-
-    Args:
-        log: the log with the failed run.
-        own: the candidate that it is said to have run.
-        candidates: candidates that may have been run instead.
-        start_of: returns where a candidate's run seems to begin in the log.
-        end: when the run had failed, seconds after the log's first sample.
-    """
-
-    def left(one: Candidate) -> float:
-        start = start_of(one)
-        fit = acted_on(log, one.policy, start.seconds) if start and start.opens_alike else None
-        if start is None or fit is None:
-            return np.inf
-        off = fit.off[: max(0, round((end - start.seconds) / log.dt))]
-        off = off[np.isfinite(off)]
-        return float(np.median(off)) if len(off) >= LEAST else np.inf
-
-    others = {one.id: left(one) for one in candidates if one.id != own.id}
-    nearest = min(others, key=others.__getitem__, default="")
-    return nearest if nearest and others[nearest] < SAME * max(left(own), FINE) else ""

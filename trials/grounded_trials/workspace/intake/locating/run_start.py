@@ -39,10 +39,9 @@ from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
-from grounded_trials.workspace.intake.locating.missed_steps import missed_steps
 
 TRIED = 5  # number of best-fitting instants that are examined
-BESIDE = 4  # steps before the best of them that are checked for an exact fit
+MISSED = 5  # largest number of first steps that may not have been sent
 HELD = 3.5  # steps without a change of commands before an instant that may begin a run
 FINEST = 8  # largest number of instants per step at which a start is tried
 KNOWN = 0.25  # largest std, in rows, with which feedback determines the start within a row
@@ -155,13 +154,7 @@ class Recording:
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
         if not only_alike and (found is None or not found.alike):
             found = self._by_its_samples(policy, strays) or found
-        found = found and self._exactly(policy, found)
-        first, _ = self._on_step(policy, self.first)
-        missed = missed_steps(self, policy, first, found.seconds if found else first)
-        if not missed:
-            return found
-        apart_s = found.apart if found else np.inf
-        return Start(first - missed * self.dt, apart_s, True, True, missed=missed)
+        return self._before_first(policy, found) or found
 
     def _related(self, policy: Policy) -> list[int]:
         """Return the instants from which the first commands are not those of something else."""
@@ -228,21 +221,23 @@ class Recording:
             return None
         return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
 
-    def _exactly(self, policy: Policy, found: Start) -> Start:
-        """Move a start some steps earlier if the commands are exactly the policy's there.
+    def _before_first(self, policy: Policy, found: Start | None) -> Start | None:
+        """Return a start before the first command, if the first steps were not sent; or None.
 
-        With high gains that amplify noise, the mean difference may be smaller some rows off.
+        A program whose timer fires late skips step 0, as the runner does for missed calls. Taken as
+        step 0, each command is compared with the gains and reference of its neighbour, and may
+        still look alike. The commands that were sent tell, with the input held before the others.
         """
-        here = acted_on(self, policy, found.seconds) if found.opens_alike else None
-        if policy.gain is None or here is None or here.exact:
-            return found
-        for steps in range(1, BESIDE + 1):  # not later: a log with late commands fits there too
-            at = found.seconds - steps * self.dt
-            fit = acted_on(self, policy, at)
-            if fit is not None and fit.throughout:
-                apart = self.apart_at(policy, at)
-                return replace(found, seconds=at, apart=apart, alike=True, exact=True)
-        return found
+        first, _ = self._on_step(policy, self.first)
+        usual = acted_on(self, policy, found.seconds if found else first)
+        if usual is not None and usual.exact:
+            return None
+        tried = [first - k * self.dt for k in range(1, MISSED + 1)]
+        k = int(np.argmin(self._misfits(policy, tried)))
+        there, least = acted_on(self, policy, tried[k]), UNLIKE * (usual.left if usual else 0.0)
+        if there is None or there.told.sum() < LEAST or there.left > max(least, TO_DIGITS):
+            return None
+        return Start(tried[k], found.apart if found else np.inf, True, True, missed=k + 1)
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """Return the likeliest starts, by the difference of the commands from each instant on."""

@@ -3,6 +3,5 @@
 Read `recognise.py` first: the stories of a log, the judge's choice, and how each is refused.
 `grounded.accounts.returned` has the terms by which all are scored. `look.py` cuts the run
 from the log and judges it by its commands; `sender.py` compares the candidates that may have sent
-them. The stories come from `read_otherwise.py` (the log in other units, at another rate, with
-exchanged columns) and `misused_run.py` (programs that passed their candidate the wrong things).
+them; `stories_of_log.py` asks the table wherever the run may begin.
 """

@@ -9,26 +9,25 @@ from functools import cache, partial
 from typing import TYPE_CHECKING
 
 from grounded.accounts.returned import Suspicion, suspicion
+from grounded.accounts.sent import LATEST
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.workspace.intake.locating.fell import fall_in, who_fell
-from grounded_trials.workspace.intake.locating.late_start import late_start
-from grounded_trials.workspace.intake.locating.missed_steps import not_sent
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.intake.locating.fell import fall_in
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.cutting import cut_log
 from grounded_trials.workspace.intake.opening.reading import Read
-from grounded_trials.workspace.intake.recognising.sender import on_other_speeds, rival_in, sender_of
+from grounded_trials.workspace.intake.recognising.sender import sender_of
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
-STEP_OLD = 0.4  # of a step: commands on older samples may as well be late ones
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
@@ -53,7 +52,7 @@ class Look:
     ) -> None:
         self.read, self.own, self.candidates, self.task = read, own, candidates, task
         self.found: Start | None = None
-        self.exact = self.moved = False
+        self.exact = False
         self.old: Array | None = None  # ages of the samples acted on [s], (n,), if it is surely its
         # set if judged on other samples than stored
         self.apart = None if log is read.log else log
@@ -71,11 +70,8 @@ class Look:
             given = Start(begins, 0.0, alike=True, opens_alike=True)
             if sender_of(log.anywhere, own, [], lambda _: given).sure:
                 seen = replace(seen, why=None, other="")
-        if self.log and seen.why and not seen.other:
-            seen = self._from_opening(self.log, seen)
-        self.fell: tuple[int, Finding] | None = None
-        if read.log and not seen.other:
-            seen = self._fallen(seen)
+        judged = read.log is not None and not seen.other
+        self.fell = fall_in(task, own, self.read.trial, seen.ran) if judged else None
         self.suspicion = seen
 
     def _judged(
@@ -93,7 +89,7 @@ class Look:
         self.exact = sender.own is not None and sender.own.exact
         if sender.own is not None and sender.sure:
             self.old = sender.own.old
-        behind = _behind(log, own.policy, start, self.old)
+        behind = _behind(log, start, self.old)
         if behind:
             self.found, self.exact, self.old = behind, True, None
             if abs(behind.seconds - log.first) > ALIGNED * log.interval:
@@ -106,41 +102,6 @@ class Look:
             seen = replace(seen, why=None, other="")
         elif sender.other:
             seen = replace(seen, why=sender.why, other=sender.other)
-        elif (rival := rival_in(log, own, candidates, start_of)) is not None:
-            best = self._judged(rival)  # cut where the other candidate fits best
-            told = best if best.other else seen if seen.why else replace(seen, why=best.why)
-            seen = replace(told, ran=seen.ran)
-        guessed = [name for name in log.names[0] if name not in log.logged]
-        doubted = start and guessed and seen.why and not sender.sure
-        if start and doubted and on_other_speeds(log, own, candidates, start_of):
-            if not self.moved:
-                self._cut(stored, start)
-            seen = replace(self._judged(), why=None, other="")
-            self.read = self.read.telling(found("log.speeds", *guessed, ran=own.id))
-        return seen
-
-    def _from_opening(self, log: Recording, seen: Suspicion) -> Suspicion:
-        """Return why it is nobody's from its first commands on: beside the rest all differ more."""
-        if self.found and self.found.opens_alike:
-            return seen
-        for at in log.openings[:1]:
-            trial = log.trial_from(log.on_step(self.own.policy, at))
-            there = self._judged(trial) if trial else None
-            if there and there.ran and seen.ran and there.ran.rms < seen.ran.rms:
-                seen = replace(seen, why=there.why) if there.why and not there.other else seen
-        return seen
-
-    def _fallen(self, seen: Suspicion) -> Suspicion:
-        """Find where the run failed; another candidate's may fall as its own does not."""
-        own, task = self.own, self.task
-        self.fell = fall_in(task, own, self.read.trial, seen.ran)
-        if self.fell and self.log:
-            first, steps = self.found.seconds if self.found else self.log.first, self.fell[0]
-            end = first + steps * task.dt
-            if name := who_fell(self.log, own, self.candidates, self.start_of, end):
-                self.fell = None
-                why = found("log.another", ran=own.id, other=name)
-                return replace(seen, other=name, why=why)
         return seen
 
     def _cut(self, stored: ForeignLog, start: Start) -> None:
@@ -149,13 +110,19 @@ class Look:
         begins = start.seconds + (_sooner(apart, stored) if apart else 0)
         kept = [one for one in self.read.findings if one.weight is Weight.NOTE]
         cut_there = replace(cut_log(stored, ran, begins), before=self.read.before)
-        self.read, self.moved = cut_there.telling(*kept), True
+        self.read = cut_there.telling(*kept)
         if start.missed:
-            self.read = self.read.telling(not_sent(self.task, ran, start.missed))
+            self.read = self.read.telling(self._not_sent(start.missed))
         elif begins > 0:
             self.read = self.read.telling(found("log.earlier_rows", ran=ran, seconds=begins))
         cut = apart.cut(ran, start.seconds)[0] if apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
+
+    def _not_sent(self, missed: int) -> Finding:
+        """Return that the first steps of a run were not sent."""
+        pairs = zip(self.task.model.inputs.items(), self.task.past, strict=True)
+        held = tuple(with_unit(f"{name} = {value:g}", unit) for (name, unit), value in pairs)
+        return found("run.missed", ran=self.own.id, steps=missed, held=held)
 
     @property
     def doubt(self) -> tuple[bool, float]:
@@ -169,28 +136,26 @@ def _start_of(log: Recording | None, candidate: Candidate) -> Start | None:
     return log.start_of(candidate.policy) if log else None
 
 
-def _behind(log: Recording, policy: Policy, found: Start | None, old: Array | None) -> Start | None:
+def _behind(log: Recording, found: Start | None, old: Array | None) -> Start | None:
     """Return where a run begins whose commands are some steps late, or None.
 
-    The same commands are exact a step later, too, on samples that were a step old; but there the
+    The same commands are exact that many steps later, on samples that were as old; but there the
     program had sent something before its first step.
 
     Args:
         log: the log.
-        policy: the candidate's.
         found: the start that fits best with commands in time.
         old: ages of the samples [s] with which the commands are exact there; None if they are not.
     """
-    if old is not None and not (old.size and old.max() > STEP_OLD * log.dt):
+
+    def opens(at: float) -> bool:
+        return any(abs(one - at) < ALIGNED * log.interval for one in log.openings)
+
+    late = 0 if old is None or not old.size else round(float(old.max()) / log.dt)
+    if not found or not 1 <= late <= LATEST or opens(found.seconds):
         return None
-    late = late_start(log, policy, found)
-    if late is None or old is None or found is None:
-        return late
-    near = ALIGNED * log.interval
-    here, there = (
-        any(abs(at - one.seconds) < near for at in log.openings) for one in (late, found)
-    )
-    return late if here and not there else None
+    begun = found.seconds - late * log.dt
+    return replace(found, seconds=begun, exact=True) if opens(begun) else None
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:

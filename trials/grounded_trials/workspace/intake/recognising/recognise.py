@@ -251,11 +251,11 @@ def _of_motion(case: Case, story: Story) -> Iterator[Story]:
     Feedback with the wrong sign drives the states away from the prediction, so that the commands
     soon stay at their limits and do not tell where the run began.
     """
-    from grounded.accounts.reversed_input import reversed_input
+    from grounded.search.run_motion import reversed_input
 
     sent = case.log if case.whole.inputs.any() and not (case.rival or case.opens) else None
     trial = sent.trial_from(sent.first) if sent else None
-    if trial and (turned := reversed_input(case.workspace.planner, trial)):
+    if trial and (turned := reversed_input(case.workspace.planner, trial, astray=True)):
         yield replace(story, kind=Kind.ROBOT, finding=turned)
     if story.kind is Kind.UNKNOWN:
         yield from _of_columns(case, case.columns)

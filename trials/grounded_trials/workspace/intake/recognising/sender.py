@@ -17,7 +17,6 @@ from grounded.accounts.sent import (
     LATEST,
     LEAST,
     RESEMBLES,
-    SAME,
     Following,
     follows,
     steps_alike,
@@ -25,7 +24,6 @@ from grounded.accounts.sent import (
 from grounded.findings import Finding, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
-from grounded.trial import Trial
 from grounded_trials.workspace.intake.locating.acted_on import ActedOn, acted_on
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 
@@ -102,52 +100,6 @@ def sender_of(
     why = found("log.another", ran=own.id, other=name, nats=best)
     left = {"theirs": max(theirs.left, FINE), "mine": max(mine.left, FINE)}
     return Sender(mine, name, why.also(**left))
-
-
-def on_other_speeds(
-    log: Recording,
-    own: Candidate,
-    candidates: Sequence[Candidate],
-    start_of: Callable[[Candidate], Start | None],
-) -> bool:
-    """Return whether a log is the own candidate's run, whose program had other speeds than it has.
-
-    A program that differentiates positions has speeds that lag those of the smoother. Its commands
-    then differ most where they change fastest, by more than those of some candidates: so the usual
-    difference tells whose run it is, not the mean square.
-
-    Args:
-        log: the log, with speeds that were estimated.
-        own: the candidate that it is said to have run.
-        candidates: candidates that may have been run instead.
-        start_of: returns where a candidate's run seems to begin in the log.
-    """
-    start = start_of(own)
-    mine = acted_on(log, own.policy, log.first if start is None else start.seconds)
-    if mine is None or not mine.usually:
-        return False
-    for one in candidates:
-        begun = None if one.id == own.id else start_of(one)
-        fit = begun and acted_on(log, one.policy, begun.seconds)
-        if fit and not _one(mine, fit) and fit.left <= mine.left:
-            return False
-    return True
-
-
-def rival_in(
-    log: Recording,
-    own: Candidate,
-    candidates: Sequence[Candidate],
-    start_of: Callable[[Candidate], Start | None],
-) -> Trial | None:
-    """Return the log cut where another candidate fits much better than the own one anywhere."""
-    start = start_of(own)
-    best, bound = None, SAME * start.apart if start and start.alike else np.inf
-    for one in candidates:
-        begun = start_of(one) if one.id != own.id else None
-        if begun is not None and begun.alike and begun.apart < bound:
-            best, bound = log.trial_from(begun.seconds), begun.apart
-    return best
 
 
 def _one(mine: ActedOn, fit: ActedOn) -> bool:

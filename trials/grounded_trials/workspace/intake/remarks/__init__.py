@@ -2,6 +2,6 @@
 
 Read `trial_check.py` first (gaps, limits, [safety]), then `gone_wrong.py`, which asks whether the
 trial should be discarded, also in `status`. `initial_state.py` warns of a start away from s_0,
-`control_loop.py` of skipped steps, old samples and oscillation, `log_faults.py` of columns in other
-units, negated or exchanged. `after_run.py` says where the robot goes once the candidate has ended.
+`control_loop.py` of skipped steps and late commands, `log_faults.py` of columns in other units,
+negated or exchanged.
 """

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.late_commands import Late, what_is_late
 from grounded.accounts.returned import Kind, stories
 from grounded.accounts.sent import (
     LATEST,
@@ -36,6 +35,7 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
 from grounded.search.feedback.sample_age import sample_age
+from grounded.search.run_motion import Late, what_is_late
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder

@@ -57,13 +57,13 @@ def gone_wrong(
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
     """
-    from grounded.accounts.reversed_input import beside_friction, reversed_input
+    from grounded.search.run_motion import reversed_input
 
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
     missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
     astray = missed > FAR * usual
     run = trial.until(workspace.task.horizon) if trial.candidate else trial
-    if turned := (reversed_input if astray else beside_friction)(workspace.planner, run):
+    if turned := reversed_input(workspace.planner, run, astray=astray):
         return _is_it_wired(workspace, trial, turned)
     if tried is None:
         return None
@@ -93,7 +93,7 @@ def _missed(
 
 def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
     """Return that an input acted the other way round, given the other trials."""
-    from grounded.accounts.reversed_input import signs_of
+    from grounded.search.run_motion import signs_of
 
     each = [
         (one.id, signs_of(workspace.planner, one)[turned.about[0]])
