@@ -9,7 +9,7 @@ from functools import cache, partial
 from typing import TYPE_CHECKING
 
 from grounded.accounts.returned import Suspicion, suspicion
-from grounded.accounts.sent import LATEST
+from grounded.accounts.sent import LATEST, RESEMBLES
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
@@ -17,6 +17,7 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
+from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.locating.fell import fall_in
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.cutting import cut_log
@@ -89,7 +90,7 @@ class Look:
         self.exact = sender.own is not None and sender.own.exact
         if sender.own is not None and sender.sure:
             self.old = sender.own.old
-        behind = _behind(log, start, self.old)
+        behind = _behind(log, own.policy, start, sure=sender.sure)
         if behind:
             self.found, self.exact, self.old = behind, True, None
             if abs(behind.seconds - log.first) > ALIGNED * log.interval:
@@ -98,10 +99,16 @@ class Look:
         elif start and elsewhere(log, start, own.policy, why=bool(seen.why)):
             self._cut(stored, start)
             seen = self._judged()
+        guessed = {*log.names[0]} - {*log.measured}
         if behind or sender.sure:
             seen = replace(seen, why=None, other="")
         elif sender.other:
             seen = replace(seen, why=sender.why, other=sender.other)
+        elif start and guessed and seen.why and sender.own and sender.own.left < RESEMBLES:
+            # a program that differentiates positions has speeds that lag the estimated ones
+            self._cut(stored, start)
+            seen = replace(self._judged(), why=None, other="")
+            self.read = self.read.telling(found("log.speeds", *guessed, ran=own.id))
         return seen
 
     def _cut(self, stored: ForeignLog, start: Start) -> None:
@@ -136,7 +143,7 @@ def _start_of(log: Recording | None, candidate: Candidate) -> Start | None:
     return log.start_of(candidate.policy) if log else None
 
 
-def _behind(log: Recording, found: Start | None, old: Array | None) -> Start | None:
+def _behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) -> Start | None:
     """Return where a run begins whose commands are some steps late, or None.
 
     The same commands are exact that many steps later, on samples that were as old; but there the
@@ -144,18 +151,22 @@ def _behind(log: Recording, found: Start | None, old: Array | None) -> Start | N
 
     Args:
         log: the log.
+        policy: the candidate's.
         found: the start that fits best with commands in time.
-        old: ages of the samples [s] with which the commands are exact there; None if they are not.
+        sure: the commands are exact there.
     """
 
     def opens(at: float) -> bool:
         return any(abs(one - at) < ALIGNED * log.interval for one in log.openings)
 
-    late = 0 if old is None or not old.size else round(float(old.max()) / log.dt)
-    if not found or not 1 <= late <= LATEST or opens(found.seconds):
+    if found is None or policy.gain is None or (sure and opens(found.seconds)):
         return None
-    begun = found.seconds - late * log.dt
-    return replace(found, seconds=begun, exact=True) if opens(begun) else None
+    for late in range(1, LATEST + 1):
+        for begun in filter(opens, (found.seconds, found.seconds - late * log.dt)):
+            fit = acted_on(log, policy, begun + late * log.dt)
+            if fit and fit.throughout and round(float(fit.old.max()) / log.dt) == late:
+                return replace(found, seconds=begun, alike=True, exact=True, loose_s=0.0)
+    return None
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
