@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded import places
 from grounded.accounts.finding import (
     AS_LATE,
     Finding,
@@ -29,9 +28,7 @@ from grounded.accounts.finding import (
     scaled,
 )
 from grounded.accounts.kinematics import (
-    SHORT,
     Row,
-    Turned,
     kinematic_rows,
     per_step,
     pieces,
@@ -51,14 +48,13 @@ from grounded.accounts.lag import (
 from grounded.accounts.signals import quantum
 from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.model import Model
-from grounded.places import Integral, heading, integrals, partner, speed, true_values
+from grounded.places import Integral, integrals, partner, true_values
 from grounded.result import SMALL, with_error
 from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
-SAME_WAY = 0.95  # coherence of speed and distance: below it something drifts or slips
 COPIED = 1e-3  # of a velocity: rounding of a log; a separate sensor would differ by more
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
@@ -68,7 +64,6 @@ CARRIED = 0.75  # of the noise that the weights take from the position: more is 
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
 FINE = 0.02  # of the rms: so small a bias would have been seen
-SPEEDY = 0.5  # share of the squares that a constant leaves, below which the speed explains more
 CLOSE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
 AGREE, UNSURE = 2.5, 0.25  # standard deviations; and of a delay: larger ones show none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
@@ -98,7 +93,7 @@ class Ages:
             *self.with_message(self.pairs(), one_message),
             *self.with_message(self.positions(), one_message),
         ]
-        return [*found, *self.speeds()]
+        return found
 
     def put(self, i: int, columns: Sequence[Array]) -> None:
         """Replace the samples of one state in all trials."""
@@ -254,15 +249,10 @@ class Ages:
         if found.refuted:
             self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
         elif found.found:
-            unit, v = self.model.states[w], speed(self.model)
-            more = "more" if (found.pull or found.value) > 0 else "less"
-            text = f"shows {abs(found.value):.3g} {unit} {more} than the rate of {q} throughout"
-            why = f"a sensor bias, or {q} drifts"
-            if found.pull and v:
-                size = f"{abs(found.pull):.3g} {unit} per {self.model.states[v]} of {v}"
-                text = f"shows {size} {more} than the rate of {q}"
-                why = "wheels of unequal size, or a pull to one side"
-            yield Finding(w, f"{text}: {why}", "offset")
+            size = f"{abs(found.value):.3g} {self.model.states[w]}"
+            more = "more" if found.value > 0 else "less"
+            text = f"shows {size} {more} than the rate of {q} throughout"
+            yield Finding(w, f"{text}: a sensor bias, or {q} drifts", "offset")
 
     def positions(self) -> Iterator[Finding]:
         """Correct both positions of a plane that share a delay."""
@@ -271,28 +261,6 @@ class Ages:
         if len(both) == 2 and (lag := late_positions(self.model, self.trials, both)):
             for row in both:
                 yield self.in_time(row.i, lag, "the motion by velocities and angles")
-
-    def speeds(self) -> Iterator[Finding]:
-        """Report a speed that is late or wrongly scaled against the distance travelled.
-
-        It is not corrected: wheel slip and drift look the same, so the identification decides. A
-        body that also moves sideways is skipped, since noise biases the length of its velocity.
-        """
-        plane = turned(self.model)
-        shown = plane is not None and {plane.i, plane.j, plane.k, *plane.speed} <= {*self.shown}
-        if plane is None or not shown or len(plane.speed) != 1:
-            return
-        lag = _along(self.model, plane, self.trials)
-        if lag is None or lag.coherence < SAME_WAY or lag.sign < 0:
-            return
-        where, name = f"{self.names[plane.i]}+{self.names[plane.j]}", self.names[plane.speed[0]]
-        d = float(abs(lag.delay))
-        if d > max(SURE * lag.std, 0.5 * self.dt):
-            text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than the motion of {where}"
-            yield Finding(name, text, "delay", float(lag.delay), lag.std)
-        if lag.off(OFF):
-            text = f"shows {100 * lag.scale:.3g} % of the speed of {where}: a sensor error, or slip"
-            yield Finding(name, text, "scale", scale=lag.scale)
 
 
 def _size(delay: float, lag: Lag) -> str:
@@ -452,13 +420,11 @@ class Bias:
         value: the bias, in the velocity's unit; positive if the velocity is too large.
         std: its standard deviation.
         rms: rms of the velocity itself.
-        pull: the difference per unit of the speed, if that explains it better; 0 if not.
     """
 
     value: float
     std: float
     rms: float
-    pull: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -474,74 +440,29 @@ class Bias:
 def bias_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Bias | None:
     """Return the bias of a logged velocity against its position; None with too little data.
 
-    The rate of a heading may differ in proportion to the speed instead: two wheels of unequal size
-    turn a vehicle that their encoders see going straight.
+    It is fitted over stretches, beside a scale: the velocity's mean less the position's rate.
     """
-    rows, rms = _stretches(model, relation, trials)
-    if len(rows) < STRETCHES // 2:
-        return None
-    off, rates, counts = np.array(rows).T[:3]
-    fitted, left, inverse = _line(off, [np.ones_like(rates), rates], counts)
-    variance = left / (len(rows) - 2) * float(inverse[0, 0])
-    found = Bias(float(fitted[0]) / relation.c, variance**0.5 / abs(relation.c), rms)
-    driven = speed(model)
-    if not found.found or model.state_names[relation.i] != heading(model) or driven is None:
-        return found
-    also, _ = _stretches(model, relation, trials, model.state_names.index(driven))
-    if len(also) < len(rows):
-        return found
-    off, rates, counts, speeds = np.array(also).T
-    along, less, _ = _line(off, [speeds, rates], counts)
-    return replace(found, pull=float(along[0]) / relation.c if less < SPEEDY * left else 0.0)
-
-
-def _line(off: Array, columns: Sequence[Array], counts: Array) -> tuple[Array, float, Array]:
-    """Return a weighted fit of the columns, the sum of squares that it leaves, and its inverse."""
-    design = np.stack(columns, axis=1)
-    square = design.T @ (counts[:, None] * design)
-    inverse = np.asarray(np.linalg.pinv(square, hermitian=True), np.float64)
-    fitted = inverse @ (design.T @ (counts * off))
-    return fitted, float(counts @ (off - design @ fitted) ** 2), inverse
-
-
-def _stretches(
-    model: Model, relation: Integral, trials: Sequence[Trial], beside: int | None = None
-) -> tuple[list[tuple[float, ...]], float]:
-    """Return the difference, the position's rate and the steps of each stretch; the velocity's rms.
-
-    With `beside`, a state, its mean over each stretch is appended.
-    """
-    columns = (relation.i, relation.j, *(() if beside is None else (beside,)))
-    dt, whole = trials[0].dt, list(pieces(trials, columns))
-    steps = sum(len(piece) - 1 for piece in whole)
-    rows: list[tuple[float, ...]] = []
-    for piece in whole:
-        moved = wrapped(np.diff(piece[:, :1], axis=0), [model.angle_mask[relation.i]])
-        rate, w = moved[:, 0] / dt, relation.c * 0.5 * (piece[1:, 1] + piece[:-1, 1])
+    dt, whole = trials[0].dt, list(_rates(model, relation, trials))
+    steps, rows = sum(len(moved) for _, moved, _ in whole), list[tuple[float, float, float]]()
+    for _, moved, w in whole:
+        rate, off = moved / dt, 0.5 * (w[1:] + w[:-1]) - moved / dt
         parts = max(1, min(-(-STRETCHES * len(rate) // steps), len(rate) // SHORTEST))
         for some in np.array_split(np.arange(len(rate)), parts):
-            row = float((w - rate)[some].mean()), float(rate[some].mean()), float(len(some))
-            rows.append((*row, *piece[:-1, 2:][some].mean(axis=0)))
-    every = np.concatenate([piece[:, 1] for piece in whole]) if whole else np.zeros(1)
-    return rows, float(np.sqrt((every**2).mean()))
+            rows.append((float(off[some].mean()), float(rate[some].mean()), float(len(some))))
+    if len(rows) < STRETCHES // 2:
+        return None
+    off, rates, counts = np.array(rows).T
+    design = np.stack([np.ones_like(rates), rates], axis=1)
+    inverse = np.linalg.pinv(design.T @ (counts[:, None] * design), hermitian=True)
+    fitted = inverse @ (design.T @ (counts * off))
+    left = float(counts @ (off - design @ fitted) ** 2)
+    std = (left / (len(rows) - 2) * float(inverse[0, 0])) ** 0.5
+    every = np.concatenate([w for *_, w in whole])
+    rms = float(np.sqrt((every**2).mean())) / abs(relation.c)
+    return Bias(float(fitted[0]) / relation.c, std / abs(relation.c), rms)
 
 
 # --- a plane --------------------------------------------------------------------------------------
-
-
-def _along(model: Model, plane: Turned, trials: Sequence[Trial]) -> Lag | None:
-    """Return the lag and scale of a speed against the distance travelled along the heading."""
-    dt, xy, short = trials[0].dt, [plane.i, plane.j], places.probe(model, SHORT)
-    some = []
-    for piece in pieces(trials, (*xy, plane.k, *plane.speed)):
-        middle = np.zeros((len(piece) - 1, model.n))
-        middle[:, [*xy, plane.k, *plane.speed]] = 0.5 * (piece[1:] + piece[:-1])
-        u = np.zeros((len(middle), model.m))
-        rate = ((model.system.step(middle, u, model.values, short) - middle) / short)[:, xy]
-        along = np.hypot(*rate.T)
-        unit = rate / np.maximum(along, 1e-12)[:, None]
-        some.append(((np.diff(piece[:, :2], axis=0) / dt * unit).sum(axis=1), along))
-    return lag_between(some, dt) if some else None
 
 
 def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -> Lag | None:

@@ -147,10 +147,10 @@ class Recording:
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
         wanted = self._related(policy) if only_alike else None
-        apart, until, strays = instants_apart(self.whole, self.parts, policy, wanted)
+        apart, strays = instants_apart(self.whole, self.parts, policy, wanted)
         whole = self._starts(policy, apart)
         if (found := self._surest(policy, whole)) is None:
-            begun = [one for one in self._starts(policy, until) if one.opens_alike]
+            begun = [one for one in self._starts(policy, strays) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
         if not only_alike and (found is None or not found.alike):
             found = self._by_its_samples(policy, strays) or found
@@ -407,8 +407,8 @@ def _bridged(series: Series) -> Series:
 
 def instants_apart(
     log: Gridded, parts: int, policy: Policy, instants: Sequence[int] | None = None
-) -> tuple[Array, Array, Array]:
-    """Return three measures for every instant, infinite where no run can begin, (N,) each.
+) -> tuple[Array, Array]:
+    """Return two measures for every instant, infinite where no run can begin, (N,) each.
 
     Args:
         log: states and inputs at N instants.
@@ -418,15 +418,14 @@ def instants_apart(
 
     Returns:
         The mean difference of the commands, if the log has the complete run or commands are
-        constant before it; the share of the run after which commands are no longer the policy's,
-        for runs that were cut or stopped; and the share of the first commands that are not the
-        policy's.
+        constant before it; and the share of the first commands that are not the policy's, for
+        runs that were cut or stopped.
     """
     sent, H = np.clip(log.inputs, policy.low, policy.high), policy.horizon
     changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
     count, quiet = np.cumsum(changed), round(QUIET_S / policy.dt * parts)
-    apart, until, strays = np.full((3, len(sent)), np.inf)
-    least, steps = least_of(H), np.arange(1, H + 1)
+    apart, strays = np.full((2, len(sent)), np.inf)
+    least = least_of(H)
     asked = range(len(sent)) if instants is None else instants
     lasting = [(len(sent) - k - parts // 2 - 1) // parts + 1 for k in asked]
     enough = min(least, H - LAST)
@@ -437,13 +436,9 @@ def instants_apart(
         begun = count[before] == count[np.maximum(ks - 1 - quiet, 0)]
         whole = (left >= H - LAST) | (begun & (left >= least))
         apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
-        mean = np.where(known, np.cumsum(off, axis=1) / steps, np.inf)
-        alike = np.where(mean < SLIGHT, steps, 0).max(axis=1)
-        at = mean[np.arange(len(ks)), np.maximum(alike - 1, 0)]
-        lost = 1 - alike / H + 0.1 * at / SLIGHT  # one more step must not cost a worse fit
-        until[ks] = np.where(alike >= least, lost, np.inf)
-        strays[ks] = (off[:, :least] > SLIGHT).mean(axis=1)
-    return apart, until, strays
+        # the mean tells those with as many strays apart
+        strays[ks] = (off[:, :least] > SLIGHT).mean(axis=1) + SLIGHT * off[:, :least].mean(axis=1)
+    return apart, strays
 
 
 def least_of(horizon: int) -> int:

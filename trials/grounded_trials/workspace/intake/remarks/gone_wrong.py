@@ -35,7 +35,7 @@ from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
-from grounded_trials.workspace.last_diagnosis import diagnosable, paths_of, read_by
+from grounded_trials.workspace.last_diagnosis import diagnosable
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -102,18 +102,7 @@ def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
     ]
     right, wrong = (tuple(name for name, sign in each if sign == s) for s in (1, -1))
     said = turned.also(others=right, alike=() if right else wrong, trial=trial.id)
-    if right and trial.candidate and _elsewhere(workspace, turned.about[0], right):
-        return said.also(column=f"[log.input.{turned.about[0]}]")
     return said if right or trial.candidate else said.weighing(Weight.WARN)
-
-
-def _elsewhere(workspace: Folder, name: str, trials: Sequence[str]) -> bool:
-    """Return whether [log] read an input of all of some trials from another column than now."""
-    if workspace.log_mapping is None:
-        return False
-    own = paths_of(read_by(workspace.log_mapping), [name])
-    metas = {one.stored.id: one.meta for one in workspace.whole_trials()}
-    return all(paths_of(metas[one], [name]) not in ((), own) for one in trials if one in metas)
 
 
 def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Finding | None:
