@@ -47,7 +47,6 @@ class Following:
     opens: bool  # they are alike until then, at least `LEAST` steps, not only at their limits
     late: int  # steps by which the log is late
     age: float  # of the states that it acted on, where its commands are logged [steps]
-    steps_old: int  # by which these are old at the present time; 0 if that is not clear
     moved: float  # squared difference at `late`, relative to that without shift
     foreign: bool  # that input differs by about as much as unrelated commands do
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
@@ -86,7 +85,6 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
             fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
     _, error, asked, sent, size = fits[back, late]
-    aged = late == 0 and BACK[back] >= 1 and error < UNLIKE * fits[0, 0][1]
     apart = np.full(policy.feedforward[:T].shape, np.nan)
     apart[max(0, late) :][: len(sent)] = sent - asked
     unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
@@ -118,7 +116,6 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
         late=late,
         age=late + BACK[back],
-        steps_old=round(BACK[back]) if aged else 0,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
         foreign=bool(off[:, j].mean() > FOREIGN * unrelated[j]),
         off=apart,
@@ -136,18 +133,16 @@ class Commanded:
     size: Array  # of each command, (m,)
 
 
-def commanded(policy: Policy, trial: Trial, past: Array | None = None) -> Commanded:
+def commanded(policy: Policy, trial: Trial) -> Commanded:
     """Return a run's commands beside its policy's, without an age of the states or of the inputs.
 
     Args:
         policy: of its candidate.
         trial: of the policy's states and inputs, without gaps; what is beyond it is left out.
-        past: the commands held before the run (m,); those of the trial, or of the policy, if None.
     """
     T = min(trial.finite_steps, policy.horizon)
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    if past is None:
-        past = policy.past if trial.start_inputs is None else trial.start_inputs
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
     asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
     return Commanded(sent, asked, past, size)

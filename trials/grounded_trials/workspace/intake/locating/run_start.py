@@ -150,7 +150,8 @@ class Recording:
         apart, strays = instants_apart(self.whole, self.parts, policy, wanted)
         whole = self._starts(policy, apart)
         if (found := self._surest(policy, whole)) is None:
-            begun = [one for one in self._starts(policy, strays) if one.opens_alike]
+            few = np.where(strays < 0.5, strays, np.inf)
+            begun = [one for one in self._starts(policy, few) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
         if not only_alike and (found is None or not found.alike):
             found = self._by_its_samples(policy, strays) or found
