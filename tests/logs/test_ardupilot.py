@@ -1,4 +1,4 @@
-"""ArduPilot's logs: topics, units and instances as the log says; damage; three commands."""
+"""ArduPilot's logs: topics, units and instances as the log says; damage."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import rolling
-from cli import grounded
 from dataflash import dataflash
 from grounded.errors import GroundedError
-from grounded_trials import Workspace
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import column_units
 from grounded_trials.logs.signals import SignalSpec, read_signals
-from rolling import DT, MODEL, N, T
+from rolling import DT, N, T
 
 WANTED, ROLL = 50 * rolling.WANTED, 50 * rolling.ROLL  # [deg]
 ROLL += 0.05 * np.random.default_rng(0).normal(size=N)
@@ -79,12 +77,3 @@ def test_damage_costs_the_messages_in_it(log: Path) -> None:
     log.write_bytes(whole[:200])
     with pytest.raises(GroundedError):
         inspect_log(log)
-
-
-@pytest.mark.slow
-def test_three_commands_lead_to_a_diagnosis(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(log.parent)
-    Path("roll.py").write_text(MODEL)
-    assert grounded("init", "quad", "--from", log.name, "--model", "roll.py", "--yes").code == 0
-    assert grounded("-C", "quad", "ingest", "--data", log.name).code == 0
-    assert "tau" in Workspace("quad").diagnose().verdict.parameters

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import holding
 from grounded.errors import GroundedError
-from grounded_trials import Workspace
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
@@ -127,21 +125,3 @@ def test_a_damaged_file_is_refused(tmp_path: Path, write: Any) -> None:
     log.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(GroundedError, match=holding("log.mat")):
         inspect_log(log)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("write", [mat5, mat73])
-def test_three_commands_lead_to_a_diagnosis(
-    tmp_path: Path, write: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    t = np.arange(300) * 0.02
-    u = np.sign(np.sin(2 * t)) + np.sin(5 * t)
-    w = np.zeros(300)
-    for i in range(1, 300):
-        w[i] = w[i - 1] + (1 - np.exp(-0.02 / 0.3)) * (2 * u[i - 1] - w[i - 1])
-    w += 0.005 * np.random.default_rng(0).normal(size=300)
-    write(tmp_path / "run.mat", {"run": {"t": t, "w": w, "u_cmd": u}})
-    assert grounded("init", "motor", "--from", "run.mat", "--yes").code == 0
-    assert grounded("-C", "motor", "ingest", "--data", "run.mat").code == 0
-    assert {"tau_w", "gain_w_u_cmd"} <= {*Workspace("motor").diagnose().verdict.parameters}

@@ -9,8 +9,6 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from cli import grounded
-from grounded_trials import Workspace
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from ros_bags import START, header
@@ -66,15 +64,3 @@ def test_what_joints_did_is_the_state_and_what_they_should_do_the_input(
     base = "/arm/controller_state"
     assert [one.path for one in states] == [f"{base}.{done}.positions[{i}]" for i in (1, 0)]
     assert [one.path for one in inputs] == [f"{base}.{aim}.positions[{i}]" for i in (1, 0)]
-
-
-@pytest.mark.slow
-def test_three_commands_lead_to_a_diagnosis(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    controller(tmp_path / "bag", "new")
-    assert grounded("init", "arm", "--from", "bag", "--yes").code == 0
-    assert grounded("-C", "arm", "ingest", "--data", "bag").code == 0
-    found = Workspace("arm").diagnose().verdict.parameters
-    assert sum(name.startswith("tau_") for name in found) == 2
