@@ -5,9 +5,11 @@ import pytest
 
 from cli import grounded
 from grounded.challenge import judge, make, of_crude, summary
+from grounded.challenge.draws import draw_withheld, values_of
 from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
 from grounded.challenge.score import Oracle, share
 from grounded.challenge.systems import SYSTEMS
+from grounded.effects import Library, Scales
 
 
 def case_of(system, **about):
@@ -21,6 +23,39 @@ def test_kinked_systems_run_closed_loop_at_a_rate_of_theirs(system):
     assert len(case.trials) >= 3 and len(case.fresh) == 2
     assert all(np.isfinite(t.states).all() for t in case.trials)
     assert all((t.inputs >= case.low).all() and (t.inputs <= case.high).all() for t in case.trials)
+
+
+@pytest.mark.parametrize("system", ["car", "lift", "aircraft"])
+def test_every_effect_is_drawn_in_a_size_that_its_bounds_allow(system):
+    model, rng = SYSTEMS[system]().model, np.random.default_rng(0)
+    names = (*model.state_names, *model.input_names)
+    scales = Scales(dict.fromkeys(names, -1.0), dict.fromkeys(names, 1.0), dt=0.05, duration=8.0)
+    visited = rng.normal(size=(9, model.n))
+    for effect in Library().candidates(model, scales):
+        for mechanism in (False, True):
+            values = values_of(effect, scales, rng, visited, mechanism)
+            assert np.isfinite([*values.values()]).all()
+            assert any(values[q.name] for q in effect.free), effect.name
+            assert effect.complete(values) == values
+
+
+@pytest.mark.parametrize("mechanism", [False, True])
+def test_what_no_family_describes_changes_inputs_or_rates(mechanism):
+    model, drawn = SYSTEMS["car"]().model, {}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        one = draw_withheld(rng, model, np.ones(model.m), "v", 1.0, 8.0, mechanism)
+        drawn[one.name] = one
+        if one.joint:
+            continue
+        own, t = {"rng": rng, "v": 1.0}, 0.02 * np.arange(400)
+        commands = np.outer(0.63 * np.sin(3 * t), np.ones(model.m))
+        each = list(zip(commands, t, strict=True))
+        sent = [act(u, own, k, 0.02) for act in one.actuators for u, k in each]
+        rates = [rate(None, u, k, own)["v"] for rate in one.rates for u, k in each]
+        assert any(rates) or not np.allclose(sent, commands)
+    known = {"resonance", "dropouts", "fault", "quantised", "crosstalk"}
+    assert drawn.keys() == known | ({"spring", "hung"} if mechanism else {"gusts", "hysteresis"})
 
 
 def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():

@@ -69,6 +69,15 @@ def test_help_needs_no_numpy():
     assert done.stderr.strip() == "[]"
 
 
+def test_a_code_is_explained():
+    one = grounded("explain", "log.unit")
+    assert one.code == 0 and "log.unit" in one.out
+    listed = grounded("explain", "--json").json["findings"]
+    assert {"log.unit", "plan.no_limits"} <= {*listed} and len(listed) > 300
+    wrong = grounded("explain", "log.unti")
+    assert wrong.code == 1 and "log.unit" in wrong.err
+
+
 def test_version():
     done = grounded("--version")
     assert done.code == 0 and re.search(r"\d+\.\d+\.\d+", done.out)

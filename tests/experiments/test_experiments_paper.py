@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.experiments import (
+    car,
     flight,
     footnote9,
     nondeterminism,
@@ -107,3 +108,13 @@ def test_end_points_spread_as_the_paper_says():
     }
     assert max(by_level[0.0]) == 0.0
     assert min(by_level[1.0]) > 0.01 and max(by_level[3.0]) < 0.5
+
+
+def test_the_car_learns_its_turn_though_its_runs_scatter():
+    result = car.run((0,), manoeuvres=("turn",))
+    for run in result.runs:  # without scatter, and with it
+        assert 0.97 < run.improvement <= (run.optimum - run.true[0]) / -run.true[0] + 0.005
+    assert result.runs[0].improvement == pytest.approx(0.989, abs=0.002)
+    document = plain(result)
+    assert {run["noisy"] for run in document["runs"]} == {False, True}
+    assert {"target", "iteration 0"} <= {*document["figures"]["turn"]}

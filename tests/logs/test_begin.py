@@ -309,6 +309,24 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     assert found.then.verb == "ingest" and done.code == 0
 
 
+def test_who_is_asked_decides_which_number_a_signal_is(tmp_path, mine):
+    asked = []
+
+    def ask(guess):
+        asked.append(guess.name)
+        return guess.others[0] if guess.name == "q1" and guess.others else guess.path
+
+    log = arm_bag(tmp_path / "bag")
+    plain = {g.name: g for g in begin(tmp_path / "plain", log, model=mine).states}
+    found = {g.name: g for g in begin(tmp_path / "arm", log, model=mine, ask=ask).states}
+    assert set(asked) == {"q1", "q2", "w1", "w2", "tau1", "tau2"} - {
+        name for name, guess in plain.items() if guess.sure
+    }
+    assert all(found[name].sure for name in ("q1", "q2"))
+    if plain["q1"].others:
+        assert found["q1"].path == plain["q1"].others[0]
+
+
 def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung, tmp_path):
     model = tmp_path / "boom.py"
     model.write_text(workspaces.MODEL.replace('"m"', '"rad"').replace('"m/s"', '"rad/s"'))

@@ -132,3 +132,18 @@ def test_a_heading_in_degrees_beside_its_positions_is_refused(path, heading, ok)
         return refuse_degrees({**path, "psi": heading}, rover)
     with pytest.raises(GroundedError, match=holding("psi", "rad")):
         refuse_degrees({**path, "psi": heading}, rover)
+
+
+def test_a_target_that_was_drawn_in_readings_of_a_biased_sensor_is_told(w):
+    text = w.config.file.read_text()
+    bias = 'effects = [{ name = "sensor_bias:theta", b = 0.2 }]'
+    w.config.file.write_text(text.replace("[model]", f"[model]\n{bias}"))
+
+    def told(end):
+        drawn = grounded("-C", w.folder, "target", "step", "--to", f"theta={end}", "--json").json
+        codes = {one["code"]: one for one in drawn["findings"]}
+        return codes.get("target.readings")
+
+    found = told(1.0)
+    assert found["about"] == ["theta"] and found["facts"]["end"]["value"] == 1.0
+    assert "end" not in told(0.2)["facts"]  # it ends where the sensor shows 0
