@@ -11,73 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from grounded.errors import GroundedError, alike
-from grounded.findings import Weight, found
 from grounded.frozen import readonly
+from grounded.refusals import near as near
+from grounded.refusals import refused as refused
+from grounded.refusals import unknown as unknown
+from grounded.refusals import wrong as wrong
 
 T = TypeVar("T")
-MOST = 40  # most names listed in a message
-
-
-def refused(code: str, *about: object, then: Any = None, **facts: Any) -> GroundedError:
-    """Return the error of a finding.
-
-    Args:
-        code: its entry in the catalogue.
-        about: what it is about.
-        then: the command that mends it.
-        **facts: by slot; those that are None are left out.
-    """
-    names = [str(one) for one in about]
-    return GroundedError(found(code, *names, then=then, weight=Weight.REFUSE, **facts))
-
-
-def wrong(
-    name: str, given: object = None, got: str | None = None, **expected: Any
-) -> GroundedError:
-    """Return an error about a value that was given.
-
-    Args:
-        name: the argument or key.
-        given: the value that was found, None if there is none.
-        got: what was found instead of that, in words.
-        **expected: facts of the entry `given.value`: `must` (a word of it), `type`, `shape`, `low`,
-            `high`, `choices`, `like` (an example), `of` (the object that it belongs to).
-    """
-    text = got or (None if given is None else f"{given!r:.60}")
-    facts = {key: _text(value) for key, value in expected.items()}
-    return refused("given.value", name, given=text, **facts)
-
-
-def _text(value: Any) -> Any:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return str(value) if isinstance(value, int) else value
-
-
-def unknown(
-    kind: str, name: object, valid: Iterable[str], of: str = "", where: str = ""
-) -> GroundedError:
-    """Return an error about a name that is not among those that exist.
-
-    Args:
-        kind: what it should name, such as "state".
-        name: what was given.
-        valid: the names that exist.
-        of: what has them, such as "model 'car'".
-        where: the file or key that has the name.
-    """
-    place = {"where": where} if where else {}
-    return refused("given.name", name, kind=kind, of=of, **place, **near(str(name), valid))
-
-
-def near(name: str, valid: Iterable[str]) -> dict[str, Any]:
-    """Return the nearest valid name as the fact `near`, or all as `known`."""
-    names = [str(one) for one in valid]
-    if close := alike(name, names):
-        return {"near": close}
-    more = [f"{len(names) - MOST} more"] * (len(names) > MOST)
-    return {"known": (*names[:MOST], *more)}
 
 
 def known(

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-MOST, COMPARED = 40, 2000  # most names listed in a message; most names compared with a wrong one
+COMPARED = 2000  # most names compared with a wrong one
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,6 @@ def _copied(kind: type[GroundedError], args: tuple[Any, ...], fields: dict[str, 
 def type_of(value: object) -> str:
     """Return the name of a value's type, for a message: "str", "Candidate"."""
     return type(value).__name__
-
-
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """Return "did you mean 'x'?" for the valid name closest to `name`, or list the valid names.
-
-    Args:
-        name: the name that was given.
-        valid: the names that are accepted.
-    """
-    names = list(valid)
-    if close := alike(name, names):
-        return f"did you mean '{close}'?"
-    if not names:
-        return "none is defined"
-    more = f" and {len(names) - MOST} more" if len(names) > MOST else ""
-    return "valid names: " + ", ".join(names[:MOST]) + more
 
 
 def alike(name: str, valid: Iterable[str]) -> str:

@@ -22,8 +22,7 @@ import numpy as np
 
 from grounded.checks import finite, known, of_type, one_of, refused, unknown, whole_number, wrong
 from grounded.compile import System, system_of
-from grounded.errors import GroundedError, alike
-from grounded.findings import found
+from grounded.errors import alike
 from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
@@ -71,9 +70,7 @@ class Param:
         low = -np.inf if self.low is None else self.low
         high = np.inf if self.high is None else self.high
         if low > high:
-            raise GroundedError(
-                found("given.order", "a parameter", low=f"{low:g}", high=f"{high:g}")
-            )
+            raise wrong("bounds of a parameter", [low, high], must="ascending")
         if not low <= self.value <= high:
             raise wrong("a parameter's value", self.value, low=low, high=high)
         if self.std is not None and not (np.isfinite(self.std) and self.std > 0):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded import onboard
+from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
 from grounded.onboard import FORMAT, NUMBERS, Runner, misfit
@@ -66,7 +67,7 @@ class Policy:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name)))
         if wrong := misfit(self):
-            raise GroundedError(f"a policy does not fit together: {wrong}")
+            raise refused("model.fails", "policy", why=wrong)
 
     def __repr__(self) -> str:
         names = f"states {', '.join(self.state_names)}; inputs {', '.join(self.input_names)}"
@@ -284,10 +285,7 @@ def _proposed(
 
     readers = [p for p in entry_points(group="grounded.policies") if p.name == path.suffix[1:]]
     if not readers:
-        raise GroundedError(
-            f"{path}: no installed package reads {path.suffix}; install grounded with "
-            "grounded_trials, or export the candidate with --format npz"
-        )
+        raise refused("file.unreadable", path, why=path.suffix, mend="trials")
     policy, made_for = readers[0].load()(path)
     assert isinstance(policy, Policy)
     try:

@@ -126,12 +126,12 @@ class Task:
         assert self.safety_low is not None and self.safety_high is not None
         for i, name in enumerate(self.model.state_names):
             if not self.safety_low[i] < self.safety_high[i]:
-                ends = {"low": f"{self.safety_low[i]:g}", "high": f"{self.safety_high[i]:g}"}
-                raise refused("given.order", f"[safety] {name}", **ends)
+                ends = [float(self.safety_low[i]), float(self.safety_high[i])]
+                raise wrong(f"[safety] {name}", ends, must="ascending")
         for i, name in enumerate(self.model.input_names):
             if not self.low[i] < self.high[i]:
-                ends = {"low": f"{self.low[i]:g}", "high": f"{self.high[i]:g}"}
-                raise refused("given.order", f"[limits] {name}", **ends)
+                ends = [float(self.low[i]), float(self.high[i])]
+                raise wrong(f"[limits] {name}", ends, must="ascending")
             if not 0 <= self.latency[i] <= 50 * self.dt:
                 most = f"{50 * self.dt:g} s (50 control steps)"
                 raise wrong(

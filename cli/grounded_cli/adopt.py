@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import as_json, misuse
 from grounded_cli.console.terminal import LABEL, field, sentence, show, show_json, tell
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
@@ -38,7 +38,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     effects and parameters that [model] had before the last adoption; repeat it to go further back.
     """
     if undo == bool(effects) or (undo and effect_only):
-        raise click.UsageError("name the effects to adopt, EFFECT..., or give --undo alone")
+        raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()
     if undo:
         _undo(workspace, json_)
@@ -50,15 +50,15 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
         return
     for name in dict.fromkeys((*effects, *done.along)):
         alone = ALONE * (name in done.jointly)
-        sentence(f"{name} is part of the model now ({workspace.config.file}){alone}")
+        show(field("adopted", f"{name}{alone}"))
     tell(done.findings)
     if done.params:
-        show("written to [model] params, calibrated beside the effects:")
+        show("[model] params:")
     for name, value in done.params.items():
         text = moved(before[name].value, value, before[name].unit, DIGITS)
         show(field(name, text + ALONE * (name in done.jointly), "  "))
     if done.rewritten:
-        show("rewritten in [model] effects, fitted again beside the others:")
+        show("[model] effects:")
         _rewritten(done.rewritten)
     show(f"\n{next_line(done.then)}")
 
@@ -83,8 +83,8 @@ def _undo(workspace: Workspace, json_: bool) -> None:
         if was.value != now[name].value:
             show(field(name, moved(was.value, now[name].value, was.unit, DIGITS), "  "))
     if done.rewritten:
-        show("back in [model] effects:")
+        show("[model] effects:")
         _rewritten(done.rewritten)
     rest = ", ".join(str(effect["name"]) for effect in done.effects)
-    sentence(f"still part of the model: {rest}" if rest else "no effect is adopted now")
+    show(field("adopted", rest or "none"))
     show(f"\n{next_line(done.then)}")

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.errors import GroundedError
 from grounded.findings import Weight
+from grounded.refusals import wrong
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, chosen_trials, parallel
 from grounded_cli.console.terminal import (
     field,
     names_in,
-    remark,
     show,
     show_json,
     stages,
     table,
+    tell,
     tinted,
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
@@ -85,15 +85,12 @@ def command(
     from grounded_trials.workspace.last_diagnosis import left_out
 
     if compare and not all(_GROUP.fullmatch(text) for text in compare):
-        with stages() as tell:
-            compared = workspace.compare(*compare, trials, progress=tell)
+        with stages() as stage:
+            compared = workspace.compare(*compare, trials, progress=stage)
         return show_json(compared.to_json()) if json_ else _models(compared)
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
-        raise GroundedError(
-            "--compare takes two groups of different trials, like --compare t0001,t0002 "
-            "t0003,t0004, and no --trials"
-        )
+        raise wrong("--compare", got=" ".join(compare), like="t0001,t0002 t0003,t0004")
     if instruments:
         findings = workspace.preflight(trials)
         alone = unheld_in(workspace, trials)
@@ -104,7 +101,7 @@ def command(
         _unheld(alone, bool(findings))
         return show(f"\n{next_line(workspace.status().then)}")
     families = [name for text in without for name in names_in(text)]
-    with stages() as tell:
+    with stages() as stage:
         found = workspace.diagnose(
             trials or first,
             max_effects=max_effects,
@@ -112,11 +109,10 @@ def command(
             compare=second,
             probe=probe,
             engine=engine,
-            progress=tell,
+            progress=stage,
         )
     left = () if trials or first else left_out(workspace)
-    for note in [*(one.sentence for one in left), *unwritten_in(workspace)]:
-        remark("note", note)
+    tell([*left, *unwritten_in(workspace)], all_=True)
     if json_:
         show_json(found.to_json())
     else:
@@ -175,7 +171,7 @@ def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> N
         places = [(c.name, percent(c.share)) for c in found.where.channels if c.share > 0]
         places += [(f"where {r.told}", percent(r.share)) for r in found.where.regions]
         if places:
-            show("\n" + table(places, ("one-step errors beyond the noise", "share")))
+            show("\n" + table(places, ("one-step errors", "share")))
 
 
 def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
@@ -192,8 +188,6 @@ def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
 def _unheld(alone: Sequence[str], odd: bool) -> None:
     """Name the sensors that have no other sensor to be checked against."""
     if alone:
-        of = "its" if len(alone) == 1 else "their"
-        text = f"{', '.join(alone)}: no other sensor to compare with, so {of} sign, unit and delay"
-        show(field("unchecked", f"{text} were not checked"))
+        show(field("unchecked", f"{', '.join(alone)} (no other sensor)"))
     if not odd:
-        show("no fault found in the sensors" + " by themselves" * bool(alone))
+        show(field("sensors", "no fault"))

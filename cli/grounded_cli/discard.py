@@ -48,11 +48,9 @@ def _tell(done: SetAside, json_: bool) -> None:
         return
     for name in done.trials:
         if name not in done.unchanged:
-            show(f"{name} {'is set aside' if name in done.discarded else 'counts again'}")
-        elif name in done.discarded:
-            show(f"{name} was set aside before; nothing was changed")
+            show(f"{name} {'discarded' if name in done.discarded else 'counts again'}")
         else:
-            show(f"{name} was not set aside; nothing was changed")
+            show(f"{name}: nothing was changed")
     for name, why in done.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
     show(f"\nrun {done.run}, record a log, then" if done.run else "")

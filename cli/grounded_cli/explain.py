@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from grounded.errors import GroundedError, nearest
 from grounded.findings.catalogue import codes, entry_of
+from grounded.refusals import unknown
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, show, show_json
 
@@ -17,7 +17,7 @@ def command(code: str, json_: bool) -> None:
     """Print what a finding's CODE means and what to do about it; without CODE, list all."""
     known = codes()
     if code and code not in known:
-        raise GroundedError(f"no finding has the code '{code}': {nearest(code, known)}")
+        raise unknown("code", code, known)
     chosen = [code] if code else known
     if json_:
         show_json({"findings": {one: vars(entry_of(one)) for one in chosen}})

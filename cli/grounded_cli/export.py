@@ -7,23 +7,17 @@ from pathlib import Path
 import click
 
 from grounded.errors import NextCommand
+from grounded.findings import found
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import anyway, as_json
-from grounded_cli.console.terminal import sentence, show, show_json, table, tell
+from grounded_cli.console.options import anyway, as_json, misuse
+from grounded_cli.console.terminal import field, show, show_json, table, tell
 from grounded_cli.console.workspace_option import (
     in_workspace,
     next_line,
     open_workspace,
-    typed,
 )
 
-# each format and how to use it
-USES = {
-    "csv": "one row per control step; the control law is in its head",
-    "npz": "on the robot: grounded.policy.load; --runner adds a file for numpy alone",
-    "bag": "a ROS 2 bag of the run: `ros2 bag play`, RViz, Foxglove, PlotJuggler",
-    "json": "the control law, names and units are in it (docs/robot.md)",
-}
+FORMATS = ("csv", "npz", "bag", "json")
 
 
 @click.command("export")
@@ -31,7 +25,7 @@ USES = {
 @click.option(
     "--format",
     "form",
-    type=click.Choice(list(USES)),
+    type=click.Choice(FORMATS),
     help="Default: by the ending of FILE, without one json; of a trial a bag.",
 )
 @click.option(
@@ -83,39 +77,23 @@ def command(
     if library is not None and not (model or output or for_robot):
         return _library(library, candidate, json_)
     if (candidate is None) != model or library or (model and for_robot):
-        raise click.UsageError(
-            "expected a candidate, --model or --library, each without options of another"
-        )
+        raise misuse("ID", "--model", "--library")
     if candidate is None:
         return _model(output, json_)
     named = Path(output or "").suffix.lstrip(".").lower()
-    run = candidate.lower().startswith("t") or form == "bag"
-    if form is not None and named in USES and named != form:
-        raise click.UsageError(f"-o {output} has the extension {named}, but --format is {form}")
+    if form is not None and named in FORMATS and named != form:
+        raise misuse(f"-o {output}", f"--format {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
     tell((*done.overridden, *done.findings), all_=True)
     if json_:
         show_json(done.to_json())
     else:
         show(f"{done.candidate} is written to {done.file}")
-        if run and done.format != "bag":
-            show("  one column per state and input, one row per control step, t in seconds")
-        elif done.runner is None:
-            show(f"  {USES[done.format]}")
-        else:
-            show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")
+        if done.runner is not None:
+            show(field("runner", str(done.runner)))
             then = NextCommand("next", ("LOG", *done.named))
-            if done.ended:
-                again = typed(then)
-                show("")
-                sentence(
-                    f"the search has ended with {done.candidate}; `grounded status` says how sure "
-                    "that is. Copy both to the robot to use it; a log of another run can be "
-                    f"added with `{again}`"
-                )
-                show(next_line(NextCommand("report", ("--html",))))
-            else:
-                show(f"\ncopy both to the robot, run it, record a log, then\n{next_line(then)}")
+            tell([found("search.to_robot", done.candidate, ended=done.ended)], all_=True)
+            show(next_line(NextCommand("report", ("--html",)) if done.ended else then))
 
 
 def _model(output: str | None, json_: bool) -> None:
@@ -126,7 +104,7 @@ def _model(output: str | None, json_: bool) -> None:
         return show_json(done.to_json())
     show(f"the model is written to {', '.join(map(str, (done.file, *done.others)))}")
     rows = [(one.name, f"{one.was:g}", one.now.text) for one in done.values]
-    show("\n" + table(rows, ("", "was", "now")) if rows else "  nothing in it is changed")
+    show("\n" + table(rows, ("", "was", "now")) if rows else "  unchanged")
 
 
 def _library(file: str, actuator: str | None, json_: bool) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.refusals import wrong
 from grounded.result import listed
 from grounded_cli.console.options import as_json, chosen_trials, parallel
 from grounded_cli.console.terminal import (
@@ -59,13 +60,10 @@ def command(
     """
     workspace = open_workspace()
     from grounded.diagnosis.tables import instrument_lines
-    from grounded.errors import GroundedError
 
     names = names_in(params) or None
     if params is not None and names is None:
-        raise GroundedError(
-            "--params names no parameter: expected names such as a1,L; omit it to fit all"
-        )
+        raise wrong("--params", got=params, like="a1,L")
     with stages() as stage:
         done = workspace.fit(
             names, trials=trials, latency=latency, apply=apply_, engine=engine, progress=stage
@@ -82,12 +80,7 @@ def command(
         show(f"\n{_errors(found, workspace.base_model)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
     tell(done.findings)
-    if apply_:
-        show("\nwritten to grounded.toml [model] params")
-    elif found.helps:
-        show("\nto write the values to grounded.toml, add --apply")
-    else:
-        show("\nnothing was written: these values don't clearly reduce the held-out errors")
+    show(field("written", "[model] params" if apply_ else "nothing"))
     show(next_line(done.then))
 
 

@@ -13,13 +13,12 @@ import click
 from grounded.findings import found as finding
 from grounded.result import listed
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json, table_layout
+from grounded_cli.console.options import as_json, misuse, table_layout
 from grounded_cli.console.terminal import (
     LABEL,
     field,
     names_in,
     progress,
-    remark,
     sentence,
     show,
     show_json,
@@ -102,15 +101,11 @@ def command(
     if list_:
         _list(json_)
     elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
-        raise click.UsageError(
-            "expected a folder and one source: a log, grounded init DIR --from run1.mcap; an "
-            "example, grounded init DIR --example car-turn (`grounded init --list` names them); or "
-            "a model alone, grounded init DIR --blank --model model.py"
-        )
+        raise misuse("DIR --from LOG", "DIR --example NAME", "DIR --blank --model FILE")
     elif foreign := [key for key, given in sorts if given and not log]:
-        raise click.UsageError(f"{foreign[0]} only works with --from LOG")
+        raise misuse("--from LOG", foreign[0], how="first")
     elif name is not None and (model or dt):
-        raise click.UsageError("an example has its own model and dt: edit its files afterwards")
+        raise misuse("--example", "--model or --dt")
     elif blank:
         _blank(folder, model, dt, json_)
         _with(folder, actuators)
@@ -137,7 +132,7 @@ def _with(folder: str, actuators: Sequence[str]) -> None:
         from grounded_trials import Workspace
 
         effects = Workspace(folder).begin_with(*actuators)
-        tell([finding("model.begun", *(str(effect["name"]) for effect in effects))], all_=True)
+        tell([finding("model.adopted", *(str(effect["name"]) for effect in effects))], all_=True)
 
 
 def _ask(guess: Guess) -> str:
@@ -149,18 +144,22 @@ def _ask(guess: Guess) -> str:
     for i, path in enumerate(paths, start=1):
         show(f"  {i}  {path}")
     first = "1" if guess.path else ""
-    none = "- for none" if guess.path else "- for none (model.py must change then, or see --inputs)"
+    none = "- for none"
     answer = click.prompt(f"  a number, another message path, or {none}", default=first or "-")
     if answer == "-":
         return ""
     return paths[int(answer) - 1] if answer.isdigit() and 0 < int(answer) <= len(paths) else answer
 
 
+def _made(folder: str, of: str) -> None:
+    sentence(f"{folder} is a workspace for {of}")
+
+
 def _tell(begun: Begun) -> None:
     from grounded_trials.logs.inspection.guessed_table import estimating
 
-    what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
-    sentence(f"{begun.workspace} is a workspace for {begun.log}")
+    what = f"{begun.kind}: {begun.why}" if begun.kind else begun.why
+    _made(begun.workspace, begun.log)
     show(field("model", what, "  "))
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
@@ -181,13 +180,8 @@ def _tell(begun: Begun) -> None:
         if known and guess in begun.states and not guess.path:
             names = listed(one.name for one in known)
             show(aligned("", f"the smoother estimates it from {names} ([estimate])"))
-    for note in begun.notes:
-        remark("note", note)
-    look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
-    if begun.then == begun.look:
-        look = "; map its states and inputs in [log] to numbers of the log"
-    show()
-    sentence(f"read {begun.workspace}/model.py and {begun.workspace}/grounded.toml{look}")
+    tell(begun.findings, all_=True)
+    show(field("read", f"{begun.workspace}/model.py, {begun.workspace}/grounded.toml"))
     show(next_line(begun.then, None if begun.again else begun.workspace))
 
 
@@ -202,7 +196,7 @@ def _list(json_: bool) -> None:
 
 def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> None:
     if model is None:
-        raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
+        raise misuse("--model FILE", "--blank", how="first")
     from grounded_trials import Workspace
     from grounded_trials.starting.blank import left_open
 
@@ -212,18 +206,11 @@ def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> Non
         findings = [one.to_json() for one in notes]
         show_json({"workspace": folder, "model": model, "findings": findings})
         return
-    show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
-    show("  grounded.toml  dt, start, the input held before it, weights, limits")
-    show("  target.csv     the desired states over time")
-    show("  drive.py       measure() and send() of your robot")
+    _made(folder, f"{model}:")
+    show("  grounded.toml, target.csv, drive.py")
     tell(notes)
-    inputs, start = made.base_model.input_names, made.config.task.start
-    if held := {name: value for name, value in start.items() if name in inputs}:
-        told = ", ".join(f"{name} = {value:.6g}" for name, value in held.items())
-        where = "at its start" if len(held) < len(start) else "at zero"
-        sentence(f"{told} holds the model {where}: [task] start sets it as the input before a run")
     where = f"cd {shlex.quote(folder)} && " * (folder != ".")
-    show(f"\nnext: edit these, then {where}grounded propose")
+    show(f"\nnext: {where}grounded propose")
 
 
 def _example(folder: str, name: str, json_: bool) -> None:
@@ -231,14 +218,8 @@ def _example(folder: str, name: str, json_: bool) -> None:
 
     Workspace.create(folder, example=name)
     if json_:
-        show_json({"workspace": folder, "example": name})
+        show_json({"workspace": folder, "example": name, "findings": []})
         return
-    files = [
-        ("grounded.toml", "the task: target, reward, limits, search"),
-        ("model.py", "the crude model, plain NumPy"),
-        ("target.csv", "the desired states over time"),
-        ("real.py", "a simulated real system, in place of your robot"),
-    ]
-    show(f"{folder} is a workspace for {name}:")
-    show("\n".join(f"  {a:14} {b}" for a, b in files))
+    _made(folder, f"{name}:")
+    show("  grounded.toml, model.py, target.csv, real.py")
     show("\nnext: " + f"cd {shlex.quote(folder)} && " * (folder != ".") + "grounded propose")

@@ -46,15 +46,14 @@ def command(log: str, layout: Layout, json_: bool) -> None:
     show(
         f"{', '.join(str(f) for f in report.files)}: {what}{chr(10) + '  ' if what else ''}"
         f"{count(report.messages, 'message')} in {report.duration_s:.2f} s, "
-        f"written by {report.library or 'an unknown writer'}"
+        f"written by {report.library or '?'}"
     )
     for topic in report.topics:
         _tell(topic)
     for one in (*report.remarks, *found.odd):
         remark("note", one)
     if found.log_table:
-        look = "; look at what is marked unsure" if "# unsure" in found.log_table else ""
-        show(f"\n# for grounded.toml{look}\n{found.log_table}")
+        show(f"\n# for grounded.toml\n{found.log_table}")
     else:
         show()
     show(_next(found))
@@ -63,15 +62,13 @@ def command(log: str, layout: Layout, json_: bool) -> None:
 def _tell(topic: TopicReport) -> None:
     show(f"\n{topic.topic}  {topic.type} ({topic.encoding})")
     rate = (
-        f", {topic.rate_hz:.1f} Hz by log times, jitter {1e3 * topic.jitter_s:.1f} ms, largest gap "
-        f"{topic.largest_gap_s:.3f} s"
+        f", {topic.rate_hz:.1f} Hz, jitter {1e3 * topic.jitter_s:.1f} ms, "
+        f"gap {topic.largest_gap_s:.3f} s"
     )
     show(f"  {count(topic.messages, 'message')}{rate * (topic.messages > 1)}")
     if topic.skew_s is not None:
         side = "before" if topic.skew_s < 0 else "after"
-        show(f"  header stamps {1e3 * abs(topic.skew_s):.1f} ms {side} the log's own times")
-    if topic.problem:
-        show(f"  can't be read: {topic.problem}")
+        show(f"  header stamps {1e3 * abs(topic.skew_s):.1f} ms {side}")
     if rows := _rows(topic.fields):
         show(table(rows, ("  field", "low", "high")))
 
@@ -106,8 +103,8 @@ def _what(found: Inspected) -> str:
     damaged = ["DAMAGED"] * bool(found.report.damage)
     ran = found.report.meta.get("candidate", "")
     kinds = {
-        TRIAL: f"a trial{f' of {ran}' * bool(ran)} that grounded wrote",
-        CANDIDATE: "a candidate: the policy to run, not a trial",
+        TRIAL: f"trial{f' of {ran}' * bool(ran)}",
+        CANDIDATE: "candidate",
     }
     return ", ".join(damaged + [text for form, text in kinds.items() if form == found.format])
 
@@ -116,12 +113,9 @@ def _next(found: Inspected) -> str:
     """Return the lines that say what to do with the file."""
     from grounded_trials.store.own_files import TRIAL
 
-    if found.log_table and found.mapped:
-        return f"# your [log] has all of these already. next: {typed(found.then)}"
     if found.log_table:
-        return f"# next: put this table into grounded.toml, then: {typed(found.then)}"
+        return f"# next: {typed(found.then)}"
     line = next_line(found.then)
     if found.format != TRIAL or found.report.damage:
         return line
-    stored = "is stored already, and " * found.stored
-    return f"it {stored}needs no [log] table\n{line}"
+    return line

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.findings import Finding, Weight
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import anyway, as_json
 from grounded_cli.console.terminal import (
@@ -21,7 +22,6 @@ from grounded_cli.console.terminal import (
 )
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_cli.status import summary
-from grounded_trials.wording import ranges
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -44,8 +44,8 @@ def run(candidate: str | None, anyway: bool, json_: bool) -> None:
     """
     workspace = open_workspace()
 
-    def warn(text: str) -> None:
-        remark("warning", text)
+    def warn(one: Finding) -> None:
+        tell([one.weighing(Weight.WARN)])
 
     with progress(f"running {candidate or 'the candidate'}"):
         ran = workspace.run(candidate, anyway=anyway, warn=warn)
@@ -73,7 +73,6 @@ def command(trials: int | None, json_: bool) -> None:
 
 def narrated(workspace: Workspace, trials: int | None = None) -> Status:
     """Run the learning loop and print a line for each trial."""
-    told = dict[str, str]()
     with stages() as stage:
 
         def each(candidate: Candidate, found: Ingested) -> None:
@@ -85,11 +84,7 @@ def narrated(workspace: Workspace, trials: int | None = None) -> Status:
                 f"{number(candidate.predicted_utility):>9}  real {number(found.utility):>9}  "
                 f"{tinted(found.verdict)}"
             )
-            told[candidate.id] = found.verdict
 
         status = workspace.learn(trials, progress=stage, each=each)
-    now = {t.candidate.id: t.verdict() for t in status.standing.history}
-    if sure := [n for n, then in told.items() if (then, now.get(n)) == ("maybe better", "better")]:
-        remark("note", f"{ranges(sure)}: maybe better when run, better by what repeats told since")
     tell(status.findings, all_=True)
     return status

@@ -21,7 +21,8 @@ from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
+from grounded.refusals import unknown
 from grounded_cli.console.workspace_option import given, next_line
 from grounded_trials.wording import placed
 
@@ -97,7 +98,7 @@ class LazyGroup(click.Group):
         name = args[0]
         if name in COMMANDS or name.startswith("-"):
             return super().resolve_command(ctx, args)
-        ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
+        ctx.fail(str(unknown("command", name, COMMANDS)))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; append the command to type next to the message of a GroundedError."""

@@ -51,12 +51,12 @@ def tell_proposed(proposed: Proposed, *, last: bool = True, details: bool = Fals
     standing, candidate = proposed.standing, proposed.candidate
     tell(proposed.findings, all_=details)
     if candidate is None:
-        show(field("end", f"nothing to run: {standing.sentence}"))
+        show(field("end", standing.sentence))
         show(f"\n{next_line(proposed.then)}")
         return
-    waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
+    waiting = "" if proposed.proposal.is_new else " (waiting)"
     show(f"Run {candidate.id}{' once more' if proposed.again else waiting}: {proposed.file}")
-    errors = "; ".join(one.summary() for one in proposed.off_target)
+    errors = "; ".join(one.finding.what for one in proposed.off_target)
     rows = (
         ("why", standing.sentence if proposed.again else ""),
         ("what", proposed.made),

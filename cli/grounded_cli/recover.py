@@ -10,7 +10,7 @@ import click
 from grounded.errors import GroundedError, NextCommand
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, progress, say, show, show_json
-from grounded_cli.console.workspace_option import open_workspace, typed
+from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
@@ -66,15 +66,14 @@ def _tell(found: Recovery) -> None:
     for loss in found.losses:
         say(field("lost", loss.sentence))
     if found.complete:
-        show(f"{found.source} is not damaged; {found.target} is a copy")
+        show(field("lost", "nothing"))
     saved = count(sum(found.messages.values()), "message")
     show(field("saved", f"{saved} in {found.duration_s:.2f} s: {found.target}"))
     for topic, number in found.messages.items():
         lost = found.lost_messages.get(topic, 0)
         show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
     if found.unverified:
-        these = "1 message has" if found.unverified == 1 else f"{found.unverified} messages have"
-        show(field("unchecked", f"{these} no checksum that could vouch for the numbers"))
+        show(field("unchecked", count(found.unverified, "message")))
     if _is_trial(found):
         show(field("trial", _steps(found)))
     show(f"\n{_next(found)}")
@@ -88,9 +87,9 @@ def _is_trial(found: Recovery) -> bool:
 
 def _steps(found: Recovery) -> str:
     """Describe how much of a trial written by grounded is left."""
-    ran = f"of {found.candidate}" if found.candidate else "that ran no candidate"
+    ran = f" of {found.candidate}" * bool(found.candidate)
     planned = f" of {found.planned}" if found.planned is not None else ""
-    return f"{found.steps}{planned} steps of a trial {ran}{', with a hole' * found.hole}"
+    return f"{found.steps}{planned} steps{ran}{', with a hole' * found.hole}"
 
 
 def _of_foreign(found: Recovery, target: str) -> NextCommand:
@@ -121,20 +120,12 @@ def _next(found: Recovery) -> str:
 
     target = str(found.target)
     if found.format == CANDIDATE:
-        return (
-            f"a damaged candidate can't be used: remove {found.source}\n"
-            f"next: {typed(NextCommand('propose'))}   writes the outstanding candidate again"
-        )
+        return next_line(NextCommand("propose"))
     if not _is_trial(found):
-        return f"next: {typed(_of_foreign(found, target))}"
+        return next_line(_of_foreign(found, target))
     if found.hole:
-        why = "a trial with a hole can't be used: run it again"
-        again = NextCommand("run", (found.candidate,))
-        return f"{why}\nnext: {typed(again)}" if found.candidate else why
+        return next_line(NextCommand("run", (found.candidate,) if found.candidate else ()))
     short = found.planned is None or found.steps < found.planned
     if found.complete or not (found.candidate and short):
-        return f"next: {typed(NextCommand('ingest', (target,)))}"
-    return (
-        f"next: {typed(NextCommand('ingest', ('--data', target)))}   for fit and diagnose only;\n"
-        "without --data it counts as a failed run that ended early"
-    )
+        return next_line(NextCommand("ingest", (target,)))
+    return next_line(NextCommand("ingest", ("--data", target)))

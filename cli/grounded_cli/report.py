@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.errors import GroundedError
+from grounded.refusals import refused
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import (
     number,
@@ -79,7 +80,7 @@ def _watch(workspace: Workspace) -> None:
             trials = count(len(findings.runs) + findings.left_runs, "trial")
             show(f"{path}: {trials}{known}")
     except KeyboardInterrupt:
-        say("stopped; the page stays as last written")
+        say("stopped")
 
 
 @click.command("view")
@@ -107,16 +108,12 @@ def _open(path: Path) -> None:
     import shutil
     import subprocess
 
-    by_hand = f"copy {path} to a computer with a screen and open it there: rerun {path.name}"
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        raise GroundedError(f"there is no screen here: {by_hand}")
+        raise refused("run.viewer", path, screen=True)
     beside = Path(sys.executable).with_name("rerun")
     program = str(beside) if beside.exists() else shutil.which("rerun")
     if program is None:
-        raise GroundedError(
-            "the viewer is not installed: run pip install '.[view]' in grounded's own folder, "
-            f"then: rerun {path}"
-        )
+        raise refused("run.viewer", path, missing=True)
     # A new viewer, bound to this machine only: by default it listens on every address.
     words = [program, "--new", "--bind", "127.0.0.1", str(path)]
     viewer = subprocess.Popen(words, stdout=2, start_new_session=True)
@@ -124,7 +121,7 @@ def _open(path: Path) -> None:
         code = viewer.wait(timeout=2.0)
     except subprocess.TimeoutExpired:
         viewer.returncode = 0  # it keeps running: Popen must not warn about it
-        say(f"{path} is open in the viewer")
+        say(f"{path} is open")
         return
     if code != 0:
-        raise GroundedError(f"the viewer ended with exit code {code}: {by_hand}")
+        raise refused("run.viewer", path, exit=code)

@@ -88,7 +88,7 @@ def summary(status: Status) -> str:
             text += "; the model's own policy failed" if failed else f"; {lead.lead.sentence}"
         lines.append(field("best", text))
     if status.off_target:
-        lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
+        lines.append(field("off target", "; ".join(one.finding.what for one in status.off_target)))
     if status.certainty:
         certain = "; ".join(one.sentence for one in status.certainty)
         lines.append(field("certainty", certain))

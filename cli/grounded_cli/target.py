@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded.result import listed
-from grounded_cli.console.options import as_json, values_by_name
+from grounded_cli.console.options import as_json, misuse, values_by_name
 from grounded_cli.console.options import details as with_details
 from grounded_cli.console.terminal import field, number, show, show_json, tell
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
@@ -91,11 +91,9 @@ def command(
     paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
     drive = Drive(size=size, lateral=lateral, laps=laps, hold=hold, **paces)
     if shape == "line" and seconds is not None and len(paces) > 1:
-        raise click.UsageError("a line takes only two of --seconds, --speed and --accel: omit one")
+        raise misuse("--seconds", "--speed with --accel")
     if at_rest and shape != "line":
-        raise click.UsageError(
-            "--rest is for a line: a swing-up ends at rest as it is, a path with --hold"
-        )
+        raise misuse("line", "--rest", how="first")
     asked = Manoeuvre(shape, drive, values_by_name(to, "--to"), seconds, paces, at_rest)
     drawn = open_workspace().draw(asked)
     if json_:

@@ -55,7 +55,7 @@ def folded(model: Model, i: int) -> Finding:
     """Return that an angle in degrees was unwrapped as if it were in radians."""
     names = names_of(model, [i])
     unit = model.states[names[0]]
-    return found("log.folded", *names, own=unit, tables=tables(model, names), by=np.pi / 180)
+    return found("log.unit", *names, folded=unit, tables=tables(model, names), by=np.pi / 180)
 
 
 def reported(model: Model, told: Told, column: int | None = None) -> list[Finding]:

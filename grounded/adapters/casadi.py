@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from grounded.adapters.stepper import Stepper, library, model_of
-from grounded.errors import GroundedError
+from grounded.checks import refused
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
@@ -47,11 +47,9 @@ def model(
     wanted = [len(states), len(inputs), len(params), 1]
     short = 2 if not params else 3
     if found not in (wanted[:short], wanted[:3], wanted) or function.numel_out(0) != len(states):
-        raise GroundedError(
-            f"the CasADi function {function.name()} must take {wanted[:short]} numbers (and dt "
-            f"last, after the parameters) and return {len(states)}; it takes {found} and returns "
-            f"{function.numel_out(0)}"
-        )
+        sizes = {"theirs": f"{found} -> {function.numel_out(0)}"}
+        sizes["own"] = f"{wanted[:short]} -> {len(states)}"
+        raise refused("given.fit", function.name(), what="sizes", **sizes)
     stepper = CasadiStepper(function, states, inputs, params)
     fields = {"states": states, "inputs": inputs, "params": params, "angles": angles, "name": name}
     return model_of(stepper, **fields)

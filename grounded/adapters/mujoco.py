@@ -53,9 +53,9 @@ from grounded.adapters.mujoco_names import (
 )
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
+from grounded.checks import refused, unknown, wrong
 from grounded.compile.run.differenced import stencil
 from grounded.engine import cores
-from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -209,11 +209,8 @@ class MujocoStepper(Stepper):
         self._base = np.zeros(mj.mj_stateSize(compiled, whole))
         mj.mj_getState(compiled, self._data[0], self._base, whole)
         if len(self._base) != 1 + compiled.nq + compiled.nv + compiled.na:
-            raise GroundedError(
-                "the MuJoCo model has state beyond qpos, qvel and act (an actuator delay, a "
-                "plugin), which the model's states can't hold: remove it from the file; a delay of "
-                "an input belongs in [task] latency"
-            )
+            sizes = {"theirs": str(len(self._base)), "own": "that of qpos, qvel and act"}
+            raise refused("given.fit", "MuJoCo model", what="state", **sizes)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k not in PRIVATE}
@@ -376,11 +373,8 @@ class MujocoStepper(Stepper):
         steps = round(dt / h)
         off = abs(steps * h - dt)
         if steps < 1 or off > NEAR * dt:
-            raise GroundedError(
-                f"the control step of {dt:g} s is not a whole multiple of the simulation's "
-                f"timestep of {h:g} s: give timestep={dt / max(1, steps):.12g}, "
-                "or another dt (a simulated real system needs `substeps = 1` in real.py)"
-            )
+            like = f"{dt / max(1, steps):.12g}"
+            raise wrong("timestep", h, must="divisor", like=like, of=f"{dt:g} s")
         return steps, h if off <= EXACT * dt else dt / steps
 
     def _set(self, p: Array) -> None:
@@ -451,11 +445,11 @@ def _reference(compiled: Any, given: str | Sequence[float] | None) -> Array:
     if isinstance(given, str):
         keys = [compiled.key(i).name for i in range(compiled.nkey)]
         if given not in keys:
-            raise GroundedError(f"there is no keyframe '{given}': {nearest(given, keys)}")
+            raise unknown("keyframe", given, keys)
         return np.array(compiled.key(given).qpos)
     found = np.array(given, dtype=float)
     if found.shape != (compiled.nq,):
-        raise GroundedError(f"reference must be a qpos of {compiled.nq} numbers, got {found.shape}")
+        raise wrong("reference", found.shape, shape=f"({compiled.nq},)")
     return found
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from grounded.adapters.beside import located, remember
 from grounded.adapters.stepper import library
-from grounded.errors import GroundedError
+from grounded.checks import refused
 
 
 def load(xml: Any) -> Any:
@@ -23,7 +23,7 @@ def load(xml: Any) -> Any:
     if str(xml).lstrip().startswith("<"):
         shown, path = "the MJCF text", None
     elif not (path := located(xml)).is_file():
-        raise GroundedError(f"there is no MJCF or URDF file {xml}")
+        raise refused("file.missing", xml)
     else:
         shown = str(path)
     try:
@@ -31,7 +31,7 @@ def load(xml: Any) -> Any:
             return mj.MjModel.from_xml_string(str(xml).lstrip())
         compiled = mj.MjModel.from_xml_path(shown)
     except ValueError as error:
-        raise GroundedError(f"MuJoCo can't load {shown}: {error}") from error
+        raise refused("file.unreadable", shown, why=str(error), kind="MuJoCo model") from error
     remember(xml, files_of)
     return compiled
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import refused, unknown, wrong
 from grounded.model import Param
 
 FREE, BALL, SLIDE, HINGE = 0, 1, 2, 3  # mjtJoint
@@ -48,7 +48,7 @@ def states_of(compiled: Any) -> dict[str, str]:
             unit = "m" if kind == SLIDE else "rad"
             positions[name], velocities[f"{name}_vel"] = unit, f"{unit}/s"
     if not positions:
-        raise GroundedError("the MuJoCo model has no joint, so it has no state")
+        raise refused("given.no_input", "MuJoCo model", what="joint")
     activations: dict[str, str] = {}
     for i in range(_actuators(compiled)):
         count = int(compiled.actuator_actnum[i]) if compiled.actuator_actadr[i] >= 0 else 0
@@ -70,10 +70,10 @@ def kept_states(compiled: Any, without: Sequence[str]) -> NDArray[np.bool_]:
     names = [joint_name(compiled, j) for j in range(compiled.njnt)]
     for name in without:
         if name not in names:
-            raise GroundedError(f"without: there is no joint '{name}': {nearest(name, names)}")
+            raise unknown("joint", name, names, where="without")
     moving = np.array([names[j] not in without for j in compiled.dof_jntid], bool)
     if not moving.any():
-        raise GroundedError("without names all joints: at least one must be left as a state")
+        raise wrong("without", list(names), below=str(len(names)))
     activations = len(states_of(compiled)) - 2 * compiled.nv
     return np.concatenate([moving, moving, np.ones(activations, bool)])
 
@@ -145,7 +145,7 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
         inputs = "actuators" if compiled.nu else "torques"
     if inputs == "actuators":
         if not compiled.nu:
-            raise GroundedError('the MuJoCo model has no actuator: give inputs="torques"')
+            raise refused("given.no_input", "MuJoCo model", what="actuator")
         names: list[str] = []
         units: list[str] = []
         columns: list[int] = []
@@ -160,15 +160,12 @@ def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str,
         return Controls(names, units, columns, torques=False)
     chosen = list(by_name) if inputs == "torques" else inputs
     if inputs == "torques" and not chosen:
-        raise GroundedError("the MuJoCo model has no hinge, slide or actuator: add an actuator")
+        raise refused("given.no_input", "MuJoCo model", what="actuator")
     if isinstance(chosen, str) or not chosen:
-        raise GroundedError(
-            'inputs must be "auto", "actuators", "torques" or the names of hinge and slide joints, '
-            f"got {inputs!r}"
-        )
+        raise wrong("inputs", inputs, known=("auto", "actuators", "torques", *by_name))
     for name in chosen:
         if name not in by_name:
-            raise GroundedError(f"there is no hinge or slide '{name}': {nearest(name, by_name)}")
+            raise unknown("joint", name, by_name)
     slides = [compiled.jnt_type[by_name[name]] == SLIDE for name in chosen]
     return Controls(
         [
@@ -285,10 +282,7 @@ class Setting:
         if isinstance(given, int | float):
             return Param(float(given), self.unit)
         if len(given) not in (2, 3):
-            raise GroundedError(
-                f"parameter '{self.name}': expected a value, (low, high) or (value, low, high), "
-                f"found {given!r}"
-            )
+            raise wrong(f"parameter '{self.name}'", given, like="(value, low, high)")
         value, low, high = (self.nominal, *given) if len(given) == 2 else given
         return Param(value, self.unit, low, high)
 
@@ -301,20 +295,14 @@ def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
     """
     element, dot, name = spec.rpartition(".")
     if not dot or name not in FIELDS:
-        raise GroundedError(
-            f"a MuJoCo parameter is named element.field, such as pole.mass; found '{spec}': "
-            + nearest(name, FIELDS)
-        )
+        raise unknown("parameter", spec, [f"{element or 'pole'}.{one}" for one in FIELDS])
     field = FIELDS[name]
     kind = getattr(mj.mjtObj, f"mjOBJ_{field.element.upper()}").value
     at = mj.mj_name2id(compiled, kind, element)
     if at < 0:
         count = {"body": "nbody", "joint": "njnt", "geom": "ngeom"}.get(field.element, "nu")
         known = [mj.mj_id2name(compiled, kind, i) for i in range(getattr(compiled, count))]
-        raise GroundedError(
-            f"'{spec}': the MuJoCo model has no {field.element} '{element}': "
-            + nearest(element, [k for k in known if k])
-        )
+        raise unknown(field.element, element, [k for k in known if k], where=spec)
     places, unit = _places(compiled, field, at), field.unit
     if field.element == "joint" and compiled.jnt_type[at] == 2:
         unit = SLIDE_UNITS[unit]

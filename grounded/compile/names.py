@@ -48,7 +48,9 @@ class Named(Mapping[str, Any]):
 
     def __setattr__(self, name: str, value: Any) -> None:
         what = self.__dict__[" what"]
-        raise refused("model.assigned", line_of(sys._getframe(1)), what=what, name=name)
+        raise refused(
+            "model.name_only", line_of(sys._getframe(1)), what=what, name=name, assigned=True
+        )
 
     def __iter__(self) -> Iterator[str]:
         what = self.__dict__[" what"]

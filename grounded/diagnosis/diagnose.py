@@ -57,7 +57,7 @@ from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.effects import Effect, Library, param_name
 from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
-from grounded.findings import found
+from grounded.findings import Weight, found
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.result import listed
@@ -198,7 +198,10 @@ def diagnose(
     older = late_as_positions(looked.findings, delays, options.but)
     result = replace(result, preflight=(*result.preflight, *older))
     if loop.cut_short:
-        again, cut = replace(result.verdict, again=True), found("gap.interrupted")
+        again, cut = (
+            replace(result.verdict, again=True),
+            found("gap.more", interrupted=True, weight=Weight.WARN),
+        )
         result = replace(result, verdict=again, findings=(*result.findings, cut))
     return result
 

@@ -12,7 +12,7 @@ from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.errors_told import errors, excess, lost_most, open_noise
 from grounded.diagnosis.levels import ALIKE, SAME, SURE
 from grounded.diagnosis.parts import Diagnosed, Estimate
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 
 
@@ -38,10 +38,11 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
         own = not first.startswith("parameter:")  # a fit writes these
         yield found(code, *group, effect=first, others=tuple(others), own=own)
     for one in d.lookalikes:
-        if one.share >= 1.0:
-            yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
-        elif one.share > SAME:
-            yield found("gap.alike", one.effect, effect=one.effect, like=one.like)
+        if one.share > SAME:
+            nearly = one.share < 1.0
+            yield found(
+                "gap.equivalent", one.effect, effect=one.effect, others=(one.like,), nearly=nearly
+            )
     for seen in d.unconfirmed:
         yield found(
             "gap.unconfirmed",
@@ -80,7 +81,7 @@ def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
             "gap.changed", one.effect, nats=one.evidence, value=value, first=first, second=second
         )
     if d.changed is not None and not d.changed:
-        yield found("gap.unchanged")
+        yield found("gap.changed", weight=Weight.NOTE)
     for test in d.agreement if d.changed is None else ():
         values = [v for v in d.per_trial if (v.effect, v.quantity) == (test.effect, test.quantity)]
         if test.agrees or len(values) < 2:
@@ -127,7 +128,7 @@ def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
     for on, names in rests.items():
         yield found("model.given", *names, rests=on)
     if d.jointly:
-        yield found("model.jointly", *(value_called(name, adopted) for name in sorted(d.jointly)))
+        yield found("model.given", *(value_called(name, adopted) for name in sorted(d.jointly)))
     if stopped := [name for name, e in d.parameters.items() if e.stopped]:
         yield found("model.at_bound", *stopped)
     if lost := [name for name in d.parameters if name not in d.known_parameters]:
@@ -159,8 +160,8 @@ def _of_model(d: Diagnosed, model: Model) -> Iterator[Finding]:
     if any(name.startswith("sensor_scale:") for name in names):
         for state, rate in places.only_read(model).items():
             if f"sensor_scale:{state}" in names:
-                yield found("model.gear", state, state=state, rate=rate)
+                yield found("model.sensor", state, rate=rate)
     if any(name.startswith("sensor_bias:") for name in names):
         level = [name for name in places.levelled(model) if f"sensor_bias:{name}" in names]
-        yield from [found("model.level", *level)] * bool(level)
+        yield from [found("model.sensor", *level)] * bool(level)
     yield from joints_without_input(model, d.effects)

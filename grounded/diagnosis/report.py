@@ -15,8 +15,8 @@ from grounded.figures.figure import Figure
 from grounded.result import html_table
 
 UNKNOWABLE = (  # codes of what the trials can't show
-    *("model.one_trial", "model.few_steps", "model.still", "model.unmeasured", "model.stretches"),
-    *("model.share", "model.copy", "model.joint_friction", "gap.not_compared"),
+    *("model.few", "model.still", "model.unmeasured", "model.share", "model.copy"),
+    *("model.joint_friction",),
 )
 
 

@@ -21,8 +21,7 @@ from grounded.findings.catalogue import entry_of
 from grounded.result import measured, number, percent
 
 LINES = frozenset(  # codes of the lines, which are made from the facts
-    f"gap.{name}"
-    for name in ("causes", "none", "unknown", "too_few", "errors", "left", "lacks", "where")
+    f"gap.{name}" for name in ("causes", "none", "unknown", "too_few", "errors", "left", "where")
 )
 CAUSES = 2  # told in words; the table has all
 FINDINGS = 3  # told beside the lines; the others with --details
@@ -147,7 +146,7 @@ def open_line(d: Diagnosed) -> Iterator[Finding]:
         place = None if left.region is None else left.region.told
         if not math.isfinite(left.error) or (not left.above and math.isfinite(left.size)):
             size = Quantity(left.size, left.unit) if math.isfinite(left.size) else None
-            yield found("gap.lacks", left.channel, state=left.channel, size=size, place=place,
+            yield found("gap.left", left.channel, rate=left.channel, size=size, place=place,
                         others=others)  # fmt: skip
             return
         noise = Quantity(left.floor, left.error_unit) if 0 < left.floor < math.inf else None

@@ -17,7 +17,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import wrong
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
 from grounded.experiments.jobs import (
     Running,
@@ -161,7 +161,7 @@ def run(
     seed = first_seed
     while sum(not r.discarded for r in found) < count:
         if len(found) >= 5 * count:
-            raise GroundedError(f"fewer than {count} of {len(found)} models were flyable")
+            raise wrong("flyable models", len(found), low=count)
         missing = count - sum(not r.discarded for r in found)
         cases = ({"seed": s, "step": step} for s in range(seed, seed + missing))
         found += run_study(FlightRun, flight_job, cases, **how)

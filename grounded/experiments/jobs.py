@@ -30,8 +30,8 @@ from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.engine import Engine
-from grounded.errors import GroundedError
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 ROUNDS = 5  # most rounds in which jobs of lost workers are run again
@@ -106,10 +106,7 @@ def run_jobs(
         waiting = [job for job in waiting if job.key not in results]
         if not waiting:
             return [results[job.key] for job in jobs]
-    raise GroundedError(
-        f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); "
-        f"finished jobs are kept: run the study again with fewer --jobs: {lost}"
-    )
+    raise refused("run.workers", lost=len(waiting), total=total, why=str(lost))
 
 
 def every(**axes: Iterable[Any]) -> list[dict[str, Any]]:
@@ -149,10 +146,7 @@ def _round(
     except _lost() as error:
         return error
     if foreign:
-        raise GroundedError(
-            "a worker has another version of grounded than this process: install the same one on "
-            "every machine of the cluster"
-        )
+        raise refused("run.workers")
     return None
 
 

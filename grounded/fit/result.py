@@ -24,7 +24,7 @@ from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.errors import GroundedError
-from grounded.findings import Finding
+from grounded.findings import Finding, Weight
 from grounded.findings import found as finding
 from grounded.frozen import Array
 from grounded.model import Model
@@ -278,7 +278,10 @@ def nothing(
     for name, inputs in delayed.items():
         start = float(data.latency[inputs[0]])
         params[name] = FittedValue(start, np.inf, 0.0, np.inf, "s", False, start)
-    said, samples = finding("model.fit_failed", why=str(why)), int(data.seen[1:].sum())
+    said, samples = (
+        finding("model.fitted", why=str(why), weight=Weight.WARN),
+        int(data.seen[1:].sum()),
+    )
     return Fit(params, model, data.latency, -np.inf, "diverged", samples, findings=(said,))
 
 
@@ -288,6 +291,7 @@ def _said(found: Fit) -> Iterator[Finding]:
         "model.fitted",
         settled="yes" if found.status == "converged" else "no",
         samples=found.samples,
+        no_better=not found.helps,
     )
     lost = [name for name, e in found.params.items() if not e.identified]
     tied = {one: [n for n, e in found.params.items() if one in e.only_with] for one in lost}
@@ -298,5 +302,3 @@ def _said(found: Fit) -> Iterator[Finding]:
             yield finding("model.given", *others, rests=(one,))
     if found.at_bounds:
         yield finding("model.at_bound", *found.at_bounds)
-    if not found.helps:
-        yield finding("model.fit_no_better")

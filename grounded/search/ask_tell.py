@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.checks import known, list_of, of_type, refused, same_dt, same_names, wrong
 from grounded.errors import GroundedError
+from grounded.findings import Finding, Weight
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
@@ -33,19 +34,18 @@ if TYPE_CHECKING:
     from grounded.effects import Library
 
 
-MEND = "Correct the function that runs the robot"
-
-
 class TrialRefused(GroundedError):
     """Raised by `learn` for a trial that is not its candidate's run.
 
     Args:
-        message: what is wrong with the trial.
+        why: what is wrong with the trial: correct the function that runs the robot, or pass
+            `check=False` if it is mistaken.
         search: the search without this trial; `ask` and `tell` continue it.
     """
 
-    def __init__(self, message: str, search: Search) -> None:
-        super().__init__(message)
+    def __init__(self, why: Finding, search: Search) -> None:
+        super().__init__(why.what)
+        self.finding = why.weighing(Weight.REFUSE)
         self.search = search
 
 
@@ -211,13 +211,12 @@ class Search:
         self._add(trial)
         trial = self._trials[-1]
         if odd := self._odd():
-            told = f"the trial of {trial.candidate} looks wrong: {odd}. {MEND}, and begin a new "
-            warnings.warn(f"{told}search without this trial", stacklevel=2)
+            warnings.warn(f"{trial.candidate}: {odd.what}", stacklevel=2)
         elif crash := crashed(self.task, trial):
-            warnings.warn(crash, stacklevel=2)
+            warnings.warn(f"{trial.candidate}: {crash.what}", stacklevel=2)
 
-    def _odd(self) -> str:
-        """Return what is wrong with the last trial, or ""."""
+    def _odd(self) -> Finding | None:
+        """Return what is wrong with the last trial, if anything is."""
         first = len(self._trials) == 1
         return odd_trial(self.task, self._candidates, self._trials[-1], first=first)
 
@@ -282,13 +281,9 @@ def learn(
         trial = search.trials[-1]
         if check and (odd := search._odd()):
             search._forget_last()
-            raise TrialRefused(
-                f"the trial of {trial.candidate} can't be used: {odd}. {MEND}, or pass check=False "
-                "if this is mistaken",
-                search,
-            )
+            raise TrialRefused(odd, search)
         if check and (crash := crashed(task, trial)):
-            warnings.warn(crash, stacklevel=2)
+            warnings.warn(f"{trial.candidate}: {crash.what}", stacklevel=2)
 
 
 def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:

@@ -158,7 +158,7 @@ class Candidate(Result):
         if self.unlike(best.utility) or not self.grounded:  # told by what the model gives the best
             return None
         return found(
-            "plan.less_in_log", self.id, candidate=self.id, best=self.base, gain=gain, log=in_log
+            "plan.small", self.id, candidate=self.id, best=self.base, gain=gain, log=in_log
         )
 
     def doubt(self, best: Tried | None) -> Finding | None:

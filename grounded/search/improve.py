@@ -279,7 +279,7 @@ def _below_noise(
         return None
     own = best.candidate.id
     less = found(
-        "search.below_noise",
+        "search.no_step",
         own,
         best=own,
         lost=_steps_lost(make, own),
@@ -349,10 +349,10 @@ def _ended(make: Maker, incumbent: Tried, rejected: _Rejected, options: SearchOp
     if doubted is None and rejected.promised and not finite:
         return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
     if doubted is None and most < -rejected.least and not lost:
-        why = found("search.every_step_loses", own, best=own, least=-most)
+        why = found("search.diverges", own, best=own, least=-most)
         return ended(make.now, Ending.EVERY_STEP_LOSES, why, ask)
     ending = Ending.NO_STEP if lost or doubted else Ending.NOTHING_PROMISED
-    why = found("search.nothing_promised", own, best=own, least=options.tolerance)
+    why = found("search.no_step", own, best=own, least=options.tolerance)
     if lost or doubted:
         why = found(
             "search.no_step",

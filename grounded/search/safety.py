@@ -95,7 +95,7 @@ def objections(
         bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         if bad.any():
             at = Quantity(int(np.argmax(bad)) * task.dt, "s")
-            return (found("plan.not_finite", name, candidate=name, what=what, at=at),)
+            return (found("plan.none", name, what=what, at=at),)
     against = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
     return tuple(one for one in (*against, too_strong(task, candidate)) if one)
 
@@ -140,11 +140,12 @@ def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) ->
     name = task.model.state_names[i]
     blamed = strays is not None and beyond.max() <= 0
     return found(
-        "plan.outside_safety",
+        "plan.outside",
         candidate.id,
         candidate=candidate.id,
         alpha=candidate.alpha,
         state=name,
+        table="safety",
         value=Quantity(value[t], task.model.states[name], stray[t]),
         at=Quantity(t * task.dt, "s"),
         low=f"{low:g}",

@@ -361,7 +361,7 @@ def _none_stood(now: Standing, options: SearchOptions, model: str) -> Standing:
     if not crashes:
         return now
     last = now.history[-1].candidate
-    why = found("search.gentler", last.id, crashed=last.id)
+    why = found("search.first", last.id, crashed=last.id)
     if crashes >= LOST and last.model == model:
         why = found("search.crashes", then=DIAGNOSE, crashes=crashes)
     return replace(now, findings=(why,))

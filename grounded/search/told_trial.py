@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,15 +15,17 @@ from grounded.accounts.finding import UnusableTrials, in_the_log
 from grounded.accounts.reported import scaled
 from grounded.accounts.returned import Kind, stories, suspicion, unit_by_factor
 from grounded.accounts.sound_trials import sound_trials
-from grounded.findings import found
+from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 
 
-def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool) -> str:
-    """Return why a trial can't be a run of its candidate as it is, or "".
+def odd_trial(
+    task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool
+) -> Finding | None:
+    """Return why a trial can't be a run of its candidate as it is, if it can't.
 
     Args:
         task: the task of the candidates.
@@ -33,31 +36,26 @@ def odd_trial(task: Task, candidates: Sequence[Candidate], trial: Trial, *, firs
     whole, model = interpolate_gaps(trial).trial, task.model
     own = next(one for one in candidates if one.id == trial.candidate)
     if whole.finite_steps < 1 and (unknown := _unknown(trial)):
-        return found("log.unknown", *unknown).what
+        return found("given.value", *unknown, must="finite")
     seen = suspicion(task, whole, own, candidates)
     some = [] if seen.other else stories(task, own, whole, seen.ran)
     units = [(one.names, one.by) for one in some if one.kind is Kind.UNIT]
     names, by = units[0] if units else ((), 1.0)
     if unit := unit_by_factor(model, names, by):  # the columns may agree with each other
-        return scaled(model, names, 1 / by, unit).also(ran=own.id).what
-    columns = _odd_columns(model, whole) if first else ""
+        return scaled(model, names, 1 / by, unit).also(ran=own.id)
+    columns = _odd_columns(model, whole) if first else None
     if columns or not (names or seen.why):
         return columns
-    told = scaled(model, names, 1 / by).also(ran=own.id) if names else seen.why
-    return told.what if told else ""
+    return scaled(model, names, 1 / by).also(ran=own.id) if names else seen.why
 
 
-def crashed(task: Task, trial: Trial) -> str:
-    """Return that a trial counts as a crash, and why; "" if it does not."""
+def crashed(task: Task, trial: Trial) -> Finding | None:
+    """Return that a trial counts as a crash, if it does."""
     if np.isfinite(task.utility(whole := interpolate_gaps(trial).trial)):
-        return ""
-    until, steps = whole.finite_steps, task.horizon
-    why = "it has values that are too large"
-    if until < min(whole.steps, steps):
-        why = f"it has no known values after {max(until, 0)} of {steps} steps"
-    elif whole.steps < steps:
-        why = f"it ends after {whole.steps} of {steps} steps"
-    return f"the trial of {trial.candidate} counts as a crash: {why}"
+        return None
+    until, large = min(whole.finite_steps, whole.steps), whole.finite_steps >= task.horizon
+    facts: dict[str, Any] = {"steps": max(until, 0), "horizon": task.horizon, "large": large}
+    return found("run.failed", trial.candidate, **facts)
 
 
 def _unknown(trial: Trial) -> list[str]:
@@ -68,10 +66,14 @@ def _unknown(trial: Trial) -> list[str]:
     return [name for name, is_known in zip(names, known, strict=False) if not is_known]
 
 
-def _odd_columns(model: Model, trial: Trial) -> str:
-    """Return what is wrong with the columns of a trial, in units, signs or names; or ""."""
+def _odd_columns(model: Model, trial: Trial) -> Finding | None:
+    """Return what is wrong with the columns of a trial, in units, signs or names."""
     try:
         looked = sound_trials(model, [replace(trial, id="")])
     except UnusableTrials as error:
-        return "; ".join(one.what for one in error.findings)
-    return "; ".join(f"{one.signal} {one.finding}" for one in in_the_log(looked.findings))
+        return error.findings[0]
+    for one in in_the_log(looked.findings):
+        own = model.states[one.signal]
+        sign = one.kind == "sign"
+        return found("log.sign", one.signal) if sign else found("log.unit", one.signal, folded=own)
+    return None

@@ -170,7 +170,7 @@ def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
     with pytest.raises(UnusableTrials) as error:
         preflight(BOAT, logged(BOAT, folded))
     (one,) = error.value.findings
-    assert (one.code, one.about) == ("log.folded", ("psi",))
+    assert (one.code, one.about) == ("log.unit", ("psi",))
     assert one.facts["by"] == pytest.approx(np.pi / 180)
 
 

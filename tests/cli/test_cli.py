@@ -89,7 +89,7 @@ def test_version():
         (["propse"], "no command 'propse': did you mean 'propose'"),
         (["propose", "--jsn"], "--json"),
         (["target", "circle", "--radius", "1"], "'--size'"),
-        (["init"], "--from run1.mcap"),
+        (["init"], "--from LOG"),
         (["init", "x"], "--blank --model"),
         (["ingest"], "Missing argument"),
         (["learn", "--trials", "0"], "0 is not in the range"),

@@ -48,7 +48,7 @@ SLIPS = [
     (["export", "best", "--format", "csv", "-o", "x.npz"], 2, "--format"),
     (["target", "line", "--to", "x=1", "--seconds", "1e9"], 1, "200000"),
     *(
-        (["target", "line", "--to", f"x={value}", "--seconds", "2"], 2, f"--to x={value}")
+        (["target", "line", "--to", f"x={value}", "--seconds", "2"], 2, f"x={value}")
         for value in ("nan", "-inf", "fast", "")
     ),
 ]

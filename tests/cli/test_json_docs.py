@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cli import grounded
@@ -95,6 +96,10 @@ def _is(value, name):
     return isinstance(value, TYPES[name]) and (name == "boolean" or not isinstance(value, bool))
 
 
+LOG = "t,theta,omega,torque\n" + "".join(
+    f"{k / 50:.3f},{np.sin(k / 9):.5f},{50 / 9 * np.cos(k / 9):.5f},{np.sign(k % 40 - 20)}\n"
+    for k in range(200)
+)
 COMMANDS = [
     ("status",),
     ("report", "--html"),
@@ -109,6 +114,15 @@ COMMANDS = [
     ("export", "--model", "-o", "{folder}/found.py"),
     ("inspect", "{trial}"),
     ("ingest", "{trial}"),
+    ("run", "best"),
+    ("learn", "--trials", "1"),
+    ("restore", "t0001"),
+    ("target", "line", "--to", "x=1"),
+    ("init", "{folder}/more", "--example", "pendulum"),
+    ("init", "{folder}/more", "--from", "{log}"),
+    ("init", "--list"),
+    ("recover", "{trial}", "-o", "{folder}/saved.mcap"),
+    ("explain", "log.unit"),
 ]
 
 
@@ -116,7 +130,8 @@ COMMANDS = [
 def test_every_key_is_documented(cart, tmp_path, words):
     folder = copied(cart, tmp_path / "w")
     trial = next((folder / "trials").glob("t0001*"))
-    words = [word.format(folder=folder, trial=trial) for word in words]
+    (log := tmp_path / "log.csv").write_text(LOG)
+    words = [word.format(folder=folder, trial=trial, log=log) for word in words]
     done = grounded("-C", folder, *words, "--json")
     assert done.code == 0, done.err
     assert not unknown(words[0], done.json)
@@ -137,7 +152,7 @@ def test_the_schema_is_that_of_the_types():
 def test_what_does_not_fit_a_schema_is_found():
     wrong = {"checked": "3", "damaged": [{"file": "x"}], "more": 1}
     found = set(misfits(wrong, SCHEMA["properties"]["verify"]))
-    assert found == {"checked", "damaged[].reason", "more"}
+    assert found == {"checked", "damaged[].reason", "findings", "more"}
 
 
 def test_a_key_that_is_not_there_is_found():

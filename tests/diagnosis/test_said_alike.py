@@ -86,7 +86,7 @@ def test_three_lines_say_what_how_good_and_what_is_open():
     [
         (Verdict("none"), (ERRORS,), "gap.none"),
         (Verdict("unknown"), (ERRORS,), "gap.unknown"),
-        (Verdict("unknown", limit="model.one_trial"), (ERRORS,), "gap.too_few"),
+        (Verdict("unknown", limit="model.few"), (ERRORS,), "gap.too_few"),
     ],
 )
 def test_without_a_cause_the_first_line_says_so(verdict, rows, code):

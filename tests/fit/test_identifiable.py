@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facts import holding
+from facts import holding, of_code
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.effects import Library
@@ -99,5 +99,5 @@ def test_parameters_that_are_known_only_together_are_written_together():
     assert total == pytest.approx(1.2, abs=0.01)
     written = diagnosis.to_json()["identifiable"]
     assert all(one["jointly"] for one in written)
-    (one,) = [one for one in diagnosis.findings if one.code == "model.jointly"]
+    (one,) = of_code(diagnosis, "model.given")
     assert one.about == ("a", "b")

@@ -96,7 +96,7 @@ def test_ctrl_c_while_one_more_effect_is_sought_keeps_what_was_found(trials):
 
     found = diagnose(MODEL, trials, DiagnosisOptions(max_effects=5), progress=stop)
     assert found.effects == whole.effects and found.verdict.again
-    assert "gap.interrupted" in {one.code for one in found.findings}
+    assert "gap.more" in {one.code for one in found.findings}
     assert any(stage.startswith("more effects (one more effect; Ctrl-C") for stage in told)
 
 

@@ -174,9 +174,9 @@ def test_big_endian_and_xcdr2() -> None:
     for message in (big, xcdr2):
         assert found([message], type, read, "/t.d") == [[-7]]
         assert found([message], type, read, '/t{c=="abc"}.b') == [[2.5]]
-    with pytest.raises(BadMessage, match="variant of CDR, 3"):
+    with pytest.raises(BadMessage, match=holding("CDR", 3)):
         found([b"\0\3\0\0"], type, read, "/t.d")
-    with pytest.raises(BadMessage, match="variant of CDR") as odd:
+    with pytest.raises(BadMessage, match=holding("CDR")) as odd:
         found([big, xcdr2], type, read, "/t.d")
     assert odd.value.message == 1
     with pytest.raises(BadMessage, match="header"):
@@ -203,7 +203,7 @@ def test_nested_counts_do_not_overflow() -> None:
     part = "=" * 80 + "\nMSG: x/{}\n{}[100000000] v\n"
     text = "A[100000000] a\nfloat64 d\n" + part.format("A", "B") + part.format("B", "float64")
     type = parse_ros(text, "x/msg/M", ros1=False)
-    with pytest.raises(BadPath, match="larger than"):
+    with pytest.raises(BadPath, match=holding("type")):
         found([b"\0\1\0\0" + bytes(100)], type, lambda b, s, e: cdr_messages(b, type, s, e), "/t.d")
 
 
@@ -273,14 +273,14 @@ def test_idl_definitions_are_the_same_types_as_ros_ones() -> None:
 def test_idl_definitions_that_can_not_be_read() -> None:
     for bad, says in (
         ("module a { union U switch(long) { case 1: long x; }; };", "union"),
-        ("struct M { Missing a; };", "define 'Missing'"),
-        ("struct M { M a; };", "nested too deep"),
+        ("struct M { Missing a; };", "Missing"),
+        ("struct M { M a; };", "nested"),
         ("struct M { @optional double a; };", "@optional"),
-        ("struct M { double a[999999999]; };", "too many items: .999999999"),
+        ("struct M { double a[999999999]; };", "999999999"),
         ("struct M { long double a; };", "long"),
-        ("struct N { long a; };", "define 'M'"),
+        ("struct N { long a; };", "M"),
         ("struct M {", "damaged"),
-        ("what", "is none at .what"),
+        ("what", "what"),
     ):
         with pytest.raises(BadSchema, match=says):
             parse_idl(bad, "M")
@@ -324,13 +324,13 @@ def test_any_damaged_idl_is_told(seed: int) -> None:
 
 def test_ros_definitions_that_are_none() -> None:
     for text, says in (
-        ("Missing a", "define 'Missing'"),
-        ("what is this?", "define 'what'"),
-        ("???", "is none at"),
-        ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "nested too deep"),
-        ("float64[999999999] a", "too many items: .999999999"),
-        (f"float64[{'9' * 5000}] a", "too many items: .99999"),
-        ("int8 a\n" + "=" * 80 + "\nIDL: x/A\n", "is none at 'IDL"),
+        ("Missing a", "Missing"),
+        ("what is this?", "what"),
+        ("???", "unexpected"),
+        ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "nested"),
+        ("float64[999999999] a", "999999999"),
+        (f"float64[{'9' * 5000}] a", "99999"),
+        ("int8 a\n" + "=" * 80 + "\nIDL: x/A\n", "IDL"),
     ):
         with pytest.raises(BadSchema, match=says):
             parse_ros(text, "x/msg/M", ros1=False)
@@ -464,7 +464,7 @@ def test_protobuf_definitions_that_are_none() -> None:
 
     rng = np.random.default_rng(1)
     good, _ = random_proto(random.Random(3), 3)
-    with pytest.raises(BadSchema, match=r"define .p\.Nothing"):
+    with pytest.raises(BadSchema, match=holding("p.Nothing")):
         parse_protobuf(good, "p.Nothing")
     for number, code in ((0, 1), (2**29, 1), (1, 10)):
         file = descriptor_pb2.FileDescriptorProto(name="a")
@@ -496,11 +496,11 @@ def test_json() -> None:
     assert found([b'{"v": {"x": 3, "y": 4}}'], Dynamic(), json_messages, "/t.v.@norm") == [[5]]
     assert found([b'{"v": [3, 4]}'], Dynamic(), json_messages, "/t.v.@norm") == [[5]]
     assert found([b'{"v": 1' + b"0" * 400 + b"}"], Dynamic(), json_messages, "/t.v") == [[np.inf]]
-    with pytest.raises(BadMessage, match="not JSON"):
+    with pytest.raises(BadMessage, match=holding("JSON")):
         found([b"{}", b"{"], Dynamic(), json_messages, "/t.a")
-    with pytest.raises(BadMessage, match="not JSON"):
+    with pytest.raises(BadMessage, match=holding("JSON")):
         found([b"[" * 100_000], Dynamic(), json_messages, "/t.a")
-    with pytest.raises(BadPath, match=holding("text", "message 0")):
+    with pytest.raises(BadPath, match=holding("str", "message 0")):
         found([b'{"a": "1"}'], Dynamic(), json_messages, "/t.a")
 
 
@@ -529,16 +529,16 @@ def test_paths_that_do_not_fit_name_what_would() -> None:
     type = parse_ros(text, "x/msg/M", ros1=False)
     for path, says in (
         ("/t.sped", "did you mean 'speed'"),
-        ("/t.name", "ends at a string"),
-        ("/t", "add one of its fields, speed, name, list and q"),
-        ("/t.list", "not at a number"),
-        ("/t.list.x", "select an item first"),
-        ("/t.speed.x", "needs a message"),
-        ("/t.q[0]", "needs a list"),
-        ("/t.q.@rpy.yaw", "needs x, y, z and w"),
-        ("/t.speed.@norm", "needs numbers"),
-        ('/t.list[:]{x=="a"}.x', "x needs str"),
-        ("/t{name==1}.speed", "name needs float"),
+        ("/t.name", "found string"),
+        ("/t", "speed, name, list and q"),
+        ("/t.list", "expected number"),
+        ("/t.list.x", "expected .0."),
+        ("/t.speed.x", "expected message"),
+        ("/t.q[0]", "expected list"),
+        ("/t.q.@rpy.yaw", "expected x, y, z, w"),
+        ("/t.speed.@norm", "expected numbers"),
+        ('/t.list[:]{x=="a"}.x', "expected str at x"),
+        ("/t{name==1}.speed", "expected float at name"),
     ):
         with pytest.raises(BadPath, match=says):
             bind(parse_path(path), type)

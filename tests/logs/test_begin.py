@@ -10,6 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 import workspaces
 from cli import grounded
+from facts import of_code
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded.models.cart_pole import model as cart_pole
@@ -272,8 +273,8 @@ def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     rows[:, 6:] += np.random.default_rng(0).normal(0, 1e-3, (len(rows), 2))  # nothing is held
     np.savetxt(log, rows, "%.5f", ",", header=log.read_text().splitlines()[0], comments="")
     found = begin(tmp_path / "w", log)
-    assert any("bb" in note for note in found.notes)
-    assert any("--inputs" in note for note in found.notes)
+    assert any("bb" in one.about for one in of_code(found, "start.unused"))
+    assert of_code(found, "given.no_input")
     assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
     done = grounded("init", tmp_path / "v", "--from", log, "--inputs", "aa,bb", "--json").json
     assert [one["name"] for one in done["signals"]][-2:] == ["aa", "bb"]

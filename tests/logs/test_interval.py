@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facts import holds
+from facts import of_code
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.interval import changes_every
 
@@ -70,8 +70,8 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     found = begin(tmp_path / "w", table(tmp_path / "r.csv", every), model=tmp_path / "m.py")
     assert found.dt == dt
     assert 'seen_in = "r.csv"' in (tmp_path / "w/grounded.toml").read_text()
-    assert any("0.05 s" in note for note in found.notes) == (every == 5)
+    assert bool(of_code(found, "start.interval")) == (every == 5)
     given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
-    told = [note for note in given.notes if "--dt" in note]
+    told = of_code(given, "start.interval")
     assert given.dt == 0.02 and len(told) == (every == 1)  # else each command has its steps
-    assert all(holds(one, "10 ms", "20 ms", "one in 2", "--dt 0.01") for one in told)
+    assert all(one.facts["every"] == 0.01 and one.facts["dt"] == 0.02 for one in told)

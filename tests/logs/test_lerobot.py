@@ -60,7 +60,7 @@ def _bare() -> list[str]:
 
 
 def test_an_episode_that_is_not_there_is_refused(folder: Path) -> None:
-    with pytest.raises(GroundedError, match=holding("episode_000009", 3)):
+    with pytest.raises(GroundedError, match=holding("episode_000009", 2)):
         inspect_log(folder / "episode_000009")
 
 

@@ -71,7 +71,7 @@ def test_a_folder_of_split_files_is_one_log(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("files:\n  - path: ../../etc/passwd.mcap\n")
     with pytest.raises(GroundedError, match=holding("metadata.yaml", "passwd.mcap")):
         log_files(tmp_path)
-    with pytest.raises(GroundedError, match=r"no \*\.mcap"):
+    with pytest.raises(GroundedError, match=holding("MCAP")):
         log_files(Path(__file__).parent)
     with pytest.raises(GroundedError, match=holding("no.mcap")):
         log_files([tmp_path / "bag_0.mcap", tmp_path / "no.mcap"])
@@ -152,28 +152,28 @@ def test_messages_that_do_not_fit_their_definition(tmp_path: Path) -> None:
     schema = ("x/msg/M", "ros2msg", b"float64 v\nstring s\nfloat64[] l")
     spec = SignalSpec("/a.v", "log")
     short = one_message(tmp_path / "1.mcap", "cdr", schema, b"\0\1\0\0abc")
-    refused(short, spec, "it ends inside a float64")
+    refused(short, spec, "float64")
     odd = one_message(tmp_path / "2.mcap", "cdr", schema, b"\0\3\0\0" + bytes(50))
-    refused(odd, spec, "its variant of CDR, 3, can't be read")
+    refused(odd, spec, "its CDR can't be read at '3'")
     other = one_message(tmp_path / "3.mcap", "flatbuffer", schema, b"")
-    refused(other, spec, "encoded as 'flatbuffer'")
+    refused(other, spec, "'flatbuffer'")
     idl = one_message(tmp_path / "4.mcap", "cdr", ("x/msg/M", "what", b"x"), b"\0\1\0\0")
-    refused(idl, spec, "language 'what' can't be read")
+    refused(idl, spec, "'what'")
     bad = one_message(tmp_path / "5.mcap", "json", ("x", "jsonschema", b"{}"), b"{")
-    refused(bad, spec, "it is not JSON")
+    refused(bad, spec, "JSON")
     body = b"\0\1\0\0" + struct.pack("<dI3xxIIdd", 1, 1, 2, 0, 2.0, 3.0)
     many = one_message(tmp_path / "6.mcap", "cdr", schema, body)
-    refused(many, SignalSpec("/a.l[:]", "log"), "has several values for it")
+    refused(many, SignalSpec("/a.l[:]", "log"), "expected one value")
     assert read_signals(many, {"l": SignalSpec("/a.l[1]", "log")})["l"].values.tolist() == [3]
-    refused(many, SignalSpec("/a.l[2]", "log"), "none with it")
+    refused(many, SignalSpec("/a.l[2]", "log"), "none of 1 message")
 
 
 @needs_data
 def test_wrong_encodings_and_damage_in_real_files() -> None:
     (wrong,) = files("mcap_format_fixtures/rosbag2/*wrong_rmw*")
-    refused(wrong, SignalSpec("/test_topic.float64_value"), "encoded as 'wrong_format'")
+    refused(wrong, SignalSpec("/test_topic.float64_value"), "'wrong_format'")
     empty = data("mcap_format_fixtures", "misc", "empty_zero_messages.mcap")
-    refused(empty, U, "the log has no topic '/u'")
+    refused(empty, U, "no topic '/u'")
     for path in files("mcap_format_fixtures/derived_corrupt/*.mcap"):
         with pytest.raises(GroundedError):
             read_signals(path, {"u": SignalSpec("/vicon/jetracer1.pose.pose.position.x")})
@@ -256,12 +256,12 @@ def test_reading_takes_memory_for_what_is_mapped_only(tmp_path: Path) -> None:
 
 def test_what_a_person_is_told(tmp_path: Path) -> None:
     path = floats(tmp_path / "a.mcap", 0, 10)
-    refused(path, SignalSpec("/v.data"), "the log has no topic '/v'")
+    refused(path, SignalSpec("/v.data"), "no topic '/v'")
     refused(path, SignalSpec("/u.datum"), "has no field 'datum': did you mean 'data'?")
-    refused(path, SignalSpec("/u.data"), 'no header stamp; set clock = "log"')
-    refused(path, SignalSpec("/u"), "it ends at a std_msgs/Float32")
+    refused(path, SignalSpec("/u.data"), "header stamp")
+    refused(path, SignalSpec("/u"), "found std_msgs/Float32")
     refused(path, SignalSpec("/u.data.@jaw", "log"), "not '@jaw'")
     refused(tmp_path / "no.mcap", U, "does not exist")
-    refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u'")
+    refused(floats(tmp_path / "b.mcap", 0, 0), U, "no topic '/u'")
     (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
     refused(tmp_path / "c.mcap", U, "`recover` saves")

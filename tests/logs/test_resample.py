@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from facts import holding
+from facts import holding, of_code
 from grounded.errors import GroundedError
 from grounded_trials.logs.resample import END, START, Crossing, Span, to_grid
 from grounded_trials.logs.signals import Series, SignalSpec
@@ -91,13 +91,13 @@ def test_a_gap_is_refused_where_it_is_and_bridged_where_allowed() -> None:
     x = pose(np.sin)
     keep = (x.t < EPOCH + 1.0e9) | (x.t > EPOCH + 1.9e9)
     gap = replace(x, t=x.t[keep], values=x.values[keep], log_times=x.log_times[keep])
-    with pytest.raises(GroundedError, match=r"\bgap .*\b0.9\d\d s .*\b0.99\d s .*\b1.9\d\d s") as e:
+    with pytest.raises(GroundedError, match=r"\b0.99\d s .*\b1.9\d\d s") as e:
         grid(gap)
     assert "'x' (/x.data)" in str(e.value)
     found = grid(replace(gap, spec=replace(gap.spec, max_age_s=1.0)))
     (report, _) = found.reports
     assert report.bridged == 19 and 0.9 < report.largest_gap_s < 0.93
-    assert 0.98 < report.largest_gap_at_s < 1.0 and "19 values bridged" in found.warnings[0]
+    assert 0.98 < report.largest_gap_at_s < 1.0 and found.findings[0].facts["bridged"] == 19
     assert grid(gap, span=Span(end=1.4)).states.shape == (19, 1)  # before the gap all is well
 
 
@@ -105,7 +105,7 @@ def test_held_inputs_grow_old() -> None:
     u = series(np.array([0.0, 0.1, 1.0]), np.arange(3), SignalSpec("/u", "log"))
     assert grid(pose(np.sin), u).inputs.shape[0] > 50  # a command is in force until the next
     strict = replace(u, spec=replace(u.spec, max_age_s=0.5))
-    with pytest.raises(GroundedError, match=r"\bgap .*\b0.5\d* s .*\b0.100 s"):
+    with pytest.raises(GroundedError, match=r"\b0.100 s"):
         grid(pose(np.sin), strict)
 
 
@@ -163,7 +163,7 @@ def test_the_span() -> None:
     with pytest.raises(GroundedError, match="0 steps"):
         grid(x, u, span=Span(1.0, 0.5))
     late = grid(pose(np.sin), command(-1.0))
-    assert late.late_s == pytest.approx(0.495, abs=0.001) and "late" in late.warnings[0]
+    assert late.late_s == pytest.approx(0.495, abs=0.001) and of_code(late, "file.vanished")
 
 
 def driven(rows: np.ndarray, every: float, **spec: object) -> Series:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from facts import holding
-from grounded.errors import GroundedError, nearest
+from grounded.checks import near
+from grounded.errors import GroundedError
 from grounded.model import Model, Param
 from small_tasks import black_box, cart, cart_dynamics, rover
 
@@ -71,7 +72,7 @@ def test_a_parameter_is_a_number(value):
 def test_a_parameter_lies_between_its_bounds():
     with pytest.raises(GroundedError, match=holding("2.0", "0 to 1")):
         Param(2.0, "1", 0.0, 1.0)
-    with pytest.raises(GroundedError, match=holding("lower", "1", "0")):
+    with pytest.raises(GroundedError, match=holding("1.0", "0.0")):
         Param(0.5, "1", 1.0, 0.0)
     with pytest.raises(GroundedError):
         Param(0.5, std=0.0)
@@ -129,6 +130,5 @@ def test_a_black_box_step_is_a_model_too():
 
 
 def test_the_nearest_name():
-    assert nearest("steerng", ["steering", "throttle"]) == "did you mean 'steering'?"
-    assert nearest("zzz", ["a", "b"]) == "valid names: a, b"
-    assert nearest("zzz", []) == "none is defined"
+    assert near("steerng", ["steering", "throttle"]) == {"near": "steering"}
+    assert near("zzz", ["a", "b"]) == {"known": ("a", "b")}

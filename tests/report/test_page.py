@@ -135,7 +135,7 @@ def hostile(folder):
     document["where"]["regions"][0]["when"] = EVIL
     document["where"]["whiteness"][EVIL] = 0.0
     document["lookalikes"][0]["like"] = EVIL
-    standing = replace(findings.standing, findings=(found("search.gentler", crashed=EVIL),))
+    standing = replace(findings.standing, findings=(found("search.first", crashed=EVIL),))
     model = replace(
         findings.task.model,
         name=EVIL,

@@ -211,7 +211,7 @@ def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     window.draw_all()
     assert window.run("return document.documentElement.scrollWidth") <= width
     gap = "Gap: model against reality"
-    for heading in ("What improved", "Why the model was wrong", "What to run next", "Paths", gap):
+    for heading in ("Results", "Why the model was wrong", "What to run next", "Paths", gap):
         found = window.run(
             "return [...document.querySelectorAll('h2')].filter(h => h.textContent === arguments[0]"
             " && h.getBoundingClientRect().height > 10).length",

@@ -50,7 +50,7 @@ def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
     proposal = propose(task, [], [], SearchOptions())
     assert proposal.candidate is None and proposal.standing.phase == "stopped"
     assert proposal.findings == proposal.standing.findings
-    assert [one.code for one in proposal.findings] == ["plan.outside_safety"]
+    assert [one.code for one in proposal.findings] == ["plan.outside"]
 
 
 def test_the_run_that_most_of_the_spread_comes_from_is_named(made):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facts import holding
+from facts import holding, of_code
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials import Workspace
@@ -78,8 +78,9 @@ def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(sled, tmp_path
 def test_the_first_plan_says_what_the_task_leaves_open(sled):
     sled.target({"x": np.linspace(0, 1, 41)})
     edit(sled.folder, horizon="30")
-    notes = sled.propose().notes
-    assert [("force" in one, "41 rows" in one) for one in notes[-2:]] == [(1, 0), (0, 1)]
+    told = sled.propose()
+    assert [one.about for one in of_code(told, "plan.no_limits")] == [("force",)]
+    assert [one.facts["used"] for one in of_code(told, "file.rows")] == [31]
 
 
 HOVER = """from grounded import Model, Param

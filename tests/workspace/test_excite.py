@@ -36,9 +36,9 @@ CERTAIN = MODEL.replace(', "kg", 0.1, 10.0', "").replace(', "N s/m", 0.0, 5.0', 
     ("files", "seconds", "code"),
     [
         ({"config": BARE}, None, "plan.drive_unbounded"),
-        ({"config": SAFE.replace("force = [-5.0, 5.0]", "")}, None, "plan.drive_unlimited"),
-        ({"config": SAFE, "model": CERTAIN}, None, "plan.nothing_uncertain"),
-        ({"config": SAFE}, 0.01, "plan.drive_length"),
+        ({"config": SAFE.replace("force = [-5.0, 5.0]", "")}, None, "plan.no_limits"),
+        ({"config": SAFE, "model": CERTAIN}, None, "given.constant"),
+        ({"config": SAFE}, 0.01, "given.value"),
         ({"config": SAFE + "v = [0.5, 0.6]\n"}, None, "plan.no_drive"),
     ],
 )

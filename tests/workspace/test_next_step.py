@@ -35,7 +35,7 @@ NONE = {"kind": "none", "effects": [], "sentence": "None."}
 LATE = SECOND | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
 BOTH = {"kind": "several", "effects": ["viscous_friction:v", "delay:force"], "sentence": "Two."}
 TWO = {"verdict": BOTH, "ranking": [FIRST, LATE]}
-UNKNOWN = {"kind": "unknown", "effects": [], "limit": "model.one_trial"}
+UNKNOWN = {"kind": "unknown", "effects": [], "limit": "model.few"}
 UNKNOWABLE = {"verdict": UNKNOWN}
 LAGGING = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
 DELAYED = LAGGING | {"kind": "delay", "log": "delay_s = 0.05"}  # on top of 0.02 s in [log]

@@ -121,7 +121,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise unreadable(path, error) from None
     except (ValueError, KeyError, TypeError):
-        raise refused("file.not_own", path, kind="challenge") from None
+        raise unreadable(path, "format", kind="challenge") from None
 
 
 def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:

@@ -273,6 +273,7 @@ class DiscardJson(TypedDict):
     trials: list[str]
     unchanged: list[str]
     discarded: dict[str, str]
+    findings: list[Finding]
 
 
 class ExportJson(TypedDict):
@@ -283,6 +284,138 @@ class ExportJson(TypedDict):
     format: str
     search_ended: bool
     runner: NotRequired[str]
+    findings: list[Finding]
+
+
+class UndoneJson(TypedDict):
+    """`adopt --undo`."""
+
+    undone: list[str]
+    effects: list[dict[str, Any]]
+    params: By
+    findings: list[Finding]
+
+
+class SignalJson(TypedDict):
+    """A state or input that was sought in a log."""
+
+    name: str
+    path: str | None
+    sure: bool
+    reasons: list[str]
+    rivals: list[str]
+    scale: float
+
+
+class BegunJson(TypedDict):
+    """`init --from`."""
+
+    workspace: str
+    log: str
+    kind: str | None
+    why: str
+    dt: float
+    horizon: int
+    signals: list[SignalJson]
+    target: str
+    notes: list[str]
+    findings: list[Finding]
+
+
+class CreatedJson(TypedDict):
+    """`init --example`, `init --blank`."""
+
+    workspace: str
+    example: NotRequired[str]
+    model: NotRequired[str]
+    findings: list[Finding]
+
+
+class ExamplesJson(TypedDict):
+    """`init --list`."""
+
+    examples: dict[str, str]
+
+
+class TargetJson(TypedDict):
+    """`target`."""
+
+    target: str
+    horizon: int
+    columns: dict[str, list[float]]
+    free: list[str]
+    findings: list[Finding]
+
+
+class NextJson(TypedDict):
+    """`next`."""
+
+    trials: list[IngestedJson]
+    propose: ProposeJson | None
+    export: ExportJson | None
+    removed: list[str]
+    findings: list[Finding]
+
+
+class RecoverJson(TypedDict):
+    """`recover`."""
+
+    file: str
+    messages: dict[str, int]
+    lost_messages: dict[str, int]
+    losses: list[str]
+    findings: list[Finding]
+    unverified: int
+    duration_s: float
+    complete: bool
+    candidate: NotRequired[str | None]
+    steps: NotRequired[int]
+    planned_steps: NotRequired[int | None]
+    hole: NotRequired[bool]
+
+
+class EntryJson(TypedDict):
+    """The words of a code."""
+
+    weight: str
+    short: str
+    remedy: str
+    hides: list[str]
+
+
+class ExplainJson(TypedDict):
+    """`explain`."""
+
+    findings: dict[str, EntryJson]
+
+
+class ComparedJson(TypedDict):
+    """`diagnose --compare` of two models."""
+
+    models: list[str]
+    better: str | None
+    gain: Quantity
+    ahead_s: float
+    where: dict[str, dict[str, Any]]
+    numbers: dict[str, dict[str, Any]]
+    trials: list[str]
+    findings: list[Finding]
+
+
+class InstrumentsJson(TypedDict):
+    """`diagnose --instruments`."""
+
+    preflight: list[Fault]
+    unheld: list[str]
+
+
+class ActuatorJson(TypedDict):
+    """`export --library`."""
+
+    file: str
+    actuator: str
+    values: dict[str, dict[str, Any]]
+    findings: list[Finding]
 
 
 class TakenHomeJson(TypedDict):
@@ -315,6 +448,7 @@ class VerifyJson(TypedDict):
 
     checked: int
     damaged: list[LostJson]
+    findings: list[Finding]
 
 
 class RunJson(TypedDict):
@@ -322,21 +456,29 @@ class RunJson(TypedDict):
 
     trial_file: str
     candidate: str
+    findings: list[Finding]
 
 
 DOCUMENTS: dict[str, Any] = {
-    "adopt": AdoptJson,
-    "diagnose": Diagnosis,
+    "adopt": AdoptJson | UndoneJson,
+    "diagnose": Diagnosis | ComparedJson | InstrumentsJson,
     "discard": DiscardJson,
     "excite": ExciteJson,
-    "export": ExportJson | TakenHomeJson,
+    "explain": ExplainJson,
+    "export": ExportJson | TakenHomeJson | ActuatorJson,
     "fit": FitJson,
     "ingest": IngestJson,
+    "init": BegunJson | CreatedJson | ExamplesJson,
     "inspect": InspectJson,
+    "learn": StatusJson,
+    "next": NextJson,
     "propose": ProposeJson,
+    "recover": RecoverJson,
     "report": ReportJson,
+    "restore": DiscardJson,
     "run": RunJson,
     "status": StatusJson,
+    "target": TargetJson,
     "verify": VerifyJson,
 }
 _AS = {Finding: FindingJson, Quantity: QuantityJson}  # types that are written in another form

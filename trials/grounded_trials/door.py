@@ -19,15 +19,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, needs
 from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
-    from grounded.accounts.finding import Finding
+    from grounded.accounts.finding import Finding as Fault
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
+    from grounded.findings import Finding
     from grounded.frozen import Array
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
@@ -87,7 +89,7 @@ class Workspace(Folder):
                 holds a workspace.
         """
         if (example is None) == (log is None and model is None):
-            raise GroundedError("give either an example, or a log or model, to create a workspace")
+            raise refused("given.either", "example", "log or model", how="one")
         if log is None and model is not None:
             from grounded_trials.starting.blank import write_blank
 
@@ -122,7 +124,7 @@ class Workspace(Folder):
         candidate: str | None = None,
         *,
         anyway: bool = False,
-        warn: Callable[[str], None] | None = None,
+        warn: Callable[[Finding], None] | None = None,
     ) -> Ran:
         """Run a candidate on [system] and write a trial file, to be ingested.
 
@@ -132,7 +134,7 @@ class Workspace(Folder):
         Args:
             candidate: c0003, or `best`; None: the outstanding one.
             anyway: run it although it is void.
-            warn: called with each check that is overridden, before the robot moves.
+            warn: called with the finding of each check that is overridden, before the robot moves.
         """
         from grounded_trials.workspace.candidates.running import run_candidate
 
@@ -341,7 +343,7 @@ class Workspace(Folder):
 
         return compare_models(self.forget(), str(first), str(second), trials, progress)
 
-    def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+    def preflight(self, trials: Sequence[str] = ()) -> tuple[Fault, ...]:
         """Check the sensors of some or all trials for delays and scale errors, from their data."""
         from grounded_trials.workspace.diagnosing import instruments_in
 

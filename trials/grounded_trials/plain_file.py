@@ -31,16 +31,16 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
         OSError: as `open`.
     """
     if not follow and path.is_symlink():
-        raise refused("file.special", path, what="link")
+        raise unreadable(path, "link")
     descriptor = os.open(path, os.O_RDONLY | PLAIN | (0 if follow else NO_LINKS))
     try:
         mode = os.fstat(descriptor).st_mode
         if stat.S_ISDIR(mode):
             raise IsADirectoryError(21, "Is a directory", str(path))
         if not stat.S_ISREG(mode):
-            what = "a pipe" if stat.S_ISFIFO(mode) else "a device"
             what = "pipe" if stat.S_ISFIFO(mode) else "device"
-            raise refused("file.special", path, what=what)
+            what = "pipe" if stat.S_ISFIFO(mode) else "device"
+            raise unreadable(path, what)
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -61,7 +61,7 @@ def read_file(path: Path, limit: int, *, follow: bool = True) -> bytes:
     except OSError as error:
         raise unreadable(path, error) from None
     if len(data) > limit:
-        raise refused("file.large", path, limit=limit)
+        raise unreadable(path, f"> {limit} bytes")
     return data
 
 

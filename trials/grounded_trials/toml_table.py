@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from grounded.checks import near, refused
+from grounded.checks import near, unknown, wrong
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.plain_file import open_file
@@ -38,20 +38,21 @@ class Table:
 
         Args:
             key: of this table.
-            must: what its value must be: a word of the entry `file.value`.
+            must: what its value must be: a word of the entry `given.value`.
             value: what was found, None if the key is missing.
         """
         given = "" if value is None else str(value) if isinstance(value, float) else repr(value)
-        facts: dict[str, Any] = {"key": self._full(key), "must": must, "given": given}
-        return GroundedError(found("file.value", self.file.name, **facts))
+        return wrong(self._full(key), got=given, must=must, where=self.file.name)
 
     def _full(self, key: str) -> str:
         return f"[{self.where}] {key}" if self.where else key
 
     def unknown(self, key: str, valid: Iterable[str], value: str = "") -> GroundedError:
         """Return an error about a key, or the value of a key, that is none of the valid ones."""
-        facts = {"key": self._full(key), "value": value, **near(value or key, valid)}
-        return refused("file.key", self.file.name, **facts)
+        if value:
+            facts = near(value, valid)
+            return wrong(self._full(key), got=repr(value), where=self.file.name, **facts)
+        return unknown("key", self._full(key), valid, where=self.file.name)
 
     def expect(self, *names: str) -> None:
         """Raise an error for a key that is not among `names`; called before any key is taken."""
@@ -161,7 +162,7 @@ def read_toml(path: Path) -> Table:
         here = near[0] if near else ""
         raise GroundedError(found("file.no_workspace", str(path), near=here, then=then)) from None
     except NotADirectoryError:
-        raise GroundedError(found("file.no_folder", str(path.parent))) from None
+        raise GroundedError(found("file.no_workspace", str(path.parent))) from None
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(found("file.unreadable", str(path), why=str(error))) from None
     try:

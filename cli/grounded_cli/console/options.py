@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 import click
 
-from grounded.errors import GroundedError
+from grounded.findings import found
+from grounded.refusals import wrong
 from grounded_cli.console import completion as complete
 from grounded_cli.console.terminal import names_in
 
@@ -45,7 +46,7 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
         jobs = jobs or (idle() if by_itself and engine == "local" else 1)
         return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
 
-    default = "processors that are idle" if by_itself else "1"
+    default = "all idle" if by_itself else "1"
 
     for option in (
         click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
@@ -53,7 +54,7 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
             "--engine",
             type=click.Choice(["local", "dask"]),
             default="local",
-            help="Where: on this machine (default) or on a Dask cluster that sees this disk.",
+            help="Here (default), or a Dask cluster that sees this disk.",
         ),
         click.option(
             "--jobs",
@@ -66,9 +67,14 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
     return call
 
 
+def misuse(*options: str, how: str = "one") -> click.UsageError:
+    """Return the error of options that don't go together: "one" of them, "first", "both"."""
+    return click.UsageError(found("given.either", *options, how=how).sentence)
+
+
 def values_by_name(pairs: tuple[str, ...], option: str) -> dict[str, float]:
     """Return the values of an option such as --to x=1.0, by name."""
-    found = {}
+    values = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
@@ -76,9 +82,9 @@ def values_by_name(pairs: tuple[str, ...], option: str) -> dict[str, float]:
         except ValueError:
             end = math.nan
         if not math.isfinite(end):
-            raise click.UsageError(f"{option} {pair}: expected NAME=VALUE, such as x=1.0")
-        found[name.strip()] = end
-    return found
+            raise click.UsageError(str(wrong(option, got=pair, like="x=1.0")))
+        values[name.strip()] = end
+    return values
 
 
 def table_layout(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -117,7 +123,5 @@ def chosen_trials(function: F) -> F:
 def _trial_names(ctx: click.Context, option: click.Parameter, text: str | None) -> tuple[str, ...]:
     chosen = tuple(names_in(text))
     if text is not None and not chosen:
-        raise GroundedError(
-            "--trials names no trial: expected some, like t0001,t0002; omit it to use all"
-        )
+        raise wrong("--trials", got=text, like="t0001,t0002")
     return chosen

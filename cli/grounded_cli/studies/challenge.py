@@ -10,6 +10,7 @@ import click
 from grounded.challenge import make, simulator, summary
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
+from grounded.refusals import refused
 from grounded_cli.console.options import as_json, parallel
 from grounded_cli.console.terminal import bar, names_in, number, say, show, show_json, table
 from grounded_cli.console.workspace_option import typed
@@ -158,10 +159,7 @@ def _labels(folder: str, labels: str | None) -> Path:
     """
     usual = Path(f"{folder}-labels")
     if labels is None and Path(folder).is_dir() and not usual.is_dir():
-        raise GroundedError(
-            f"{usual} does not exist: the labels of {folder} are kept elsewhere; name the folder "
-            "that `make` wrote them to with --labels DIR"
-        )
+        raise refused("file.missing", usual, where="--labels")
     return Path(labels) if labels is not None else usual
 
 

@@ -10,7 +10,8 @@ import click
 
 from grounded.diagnosis.telling import sentence, told
 from grounded.engine import Engine, idle
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
+from grounded.refusals import refused
 from grounded.result import percent
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import (
@@ -51,7 +52,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     example(name)
     target = Path(folder or f"demo-{name}")
     if target.exists() and any(target.iterdir()):
-        raise GroundedError(f"{target} is not empty: name another folder with --dir, or remove it")
+        raise refused("file.exists", target)
     workspace = Workspace.create(target, example=name)
     located(str(target))  # for the commands in its texts
     say(f"workspace {target}: {name}, a crude model and a simulated real system\n")

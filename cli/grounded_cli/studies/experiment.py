@@ -10,7 +10,8 @@ import click
 
 from grounded.engine import Engine
 from grounded.experiments import car, flight, footnote9, nondeterminism, theorem1
-from grounded_cli.console.options import as_json, parallel
+from grounded.refusals import wrong
+from grounded_cli.console.options import as_json, misuse, parallel
 from grounded_cli.console.terminal import bar, show, show_json, table
 from grounded_trials.report.study_pictures import draw_study
 from grounded_trials.store.documents import StudyStore
@@ -74,12 +75,17 @@ def command(
         show(f"picture {png}")
 
 
+def _unlike(text: str) -> click.UsageError:
+    """Return the error of --seeds that select nothing that the study can run."""
+    return click.UsageError(str(wrong("--seeds", got=text, like="8 or 0-7")))
+
+
 def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
     """Translate --seeds into the arguments of a study."""
     if text is None:
         return {}
     if not kind:
-        raise click.UsageError(f"'{name}' is deterministic: it takes no --seeds")
+        raise misuse(name, "--seeds")
     try:
         if "-" in text:
             first, last = (int(part) for part in text.split("-"))
@@ -89,13 +95,13 @@ def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
         else:
             chosen = list(range(int(text)))
     except ValueError:
-        raise click.UsageError(f"--seeds must be like 8, 0-7 or 1,4,9, found '{text}'") from None
+        raise _unlike(text) from None
     if not chosen:
-        raise click.UsageError(f"--seeds {text} selects no seed")
+        raise _unlike(text)
     if kind == "seeds":
         return {"seeds": chosen}
     if chosen != list(range(chosen[0], chosen[-1] + 1)):
-        raise click.UsageError(f"--seeds of '{name}' must be a number or a range, like 8 or 0-7")
+        raise _unlike(text)
     if kind == "runs":
         return {"runs": len(chosen), "seed": chosen[0]}
     return {"count": len(chosen), "first_seed": chosen[0]}

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.checks import refused, wrong
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
 from grounded.compile.problem import Samples
 from grounded.compile.run.interpreted import Interpreted
@@ -93,11 +94,7 @@ class DifferencedSystem(Interpreted):
         if off.max(initial=0.0) > WRONG * np.abs(sides).max(initial=1e-9):
             _, i, j = np.unravel_index(int(np.argmax(off)), off.shape)
             by = (*self.signature.states, *self.signature.inputs)[j]
-            raise GroundedError(
-                f"{where(own)}: the derivative of '{self.states[i]}' by '{by}' differs from that "
-                f"of the step by {off.max():.3g}: jacobian and step don't belong together; leave "
-                "jacobian out to difference the step"
-            )
+            raise refused("model.differs", where(own), state=self.states[i], by=by, off=off.max())
 
     def slopes(self, at: Samples) -> tuple[Array, Array]:
         """See `Interpreted.slopes`; without smoothing, which changes nothing here."""
@@ -177,10 +174,8 @@ class DifferencedSystem(Interpreted):
         try:
             return np.array([call([*s], [*a]) for s, a in zip(x, u, strict=True)]).reshape(shape)
         except Exception as error:
-            raise GroundedError(
-                f"{where(own)}: jacobian must return f_x ({self.n}, {self.n}) and f_u "
-                f"({self.n}, {self.m}) for one sample: {error}"
-            ) from error
+            shapes = f"({self.n}, {self.n}), ({self.n}, {self.m})"
+            raise wrong(f"{where(own)}: jacobian", got=str(error), shape=shapes) from error
 
     def _differences(self, both: Array, p: Array, dt: float, low: Array, high: Array) -> Array:
         """(N, n + m) points -> (N, n, n + m) inside low and high, in one call of the step."""
@@ -251,7 +246,5 @@ class DifferencedSystem(Interpreted):
     def _failure(self, error: Exception) -> GroundedError:
         line = raised_at(error, self.signature.function)
         called = isinstance(error, TypeError) and "positional argument" in str(error)
-        return GroundedError(
-            f"{line}: the model raised {type(error).__name__}: {error}"
-            + "; it is called with states, inputs and parameters: (s, a, p)" * called
-        )
+        why = f"{type(error).__name__}: {error}"
+        return refused("model.fails", line, why=why, called=called)

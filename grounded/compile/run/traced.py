@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.checks import refused
 from grounded.compile.problem import STAGES, Integrator, Samples
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
-from grounded.errors import GroundedError
 from grounded.frozen import Array
 
 CHUNK = 1024  # samples at once
@@ -53,7 +53,7 @@ class TracedSystem(Interpreted):
                 return known
         found = trace(self.signature, np.asarray(p, float), dt)
         if isinstance(found, str):
-            raise GroundedError(f"{found}; with these parameters only; use np.where")
+            raise refused("model.untraced", why=found)
         self._variants.append(Variant(found, self.sizes))
         return self._variants[-1]
 
@@ -77,11 +77,8 @@ class TracedSystem(Interpreted):
         if differ.any():
             t, i = np.argwhere(differ)[0]
             ours, own = float(mine[t, i]), float(theirs[t, i])
-            raise GroundedError(
-                f"{self.source}: the traced model differs from the function: at sample {t}, state "
-                f"'{self.signature.states[i]}', the trace gives {ours!r} and the function {own!r}. "
-                "Does it use random numbers, keep a memory, or look at the type of its arguments?"
-            )
+            name = self.signature.states[i]
+            raise refused("model.differs", self.source, state=name, ours=ours, own=own)
 
     def jacobian(self, at: Samples, width: int) -> Array:
         """See `Interpreted.jacobian`; exact."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
 from grounded.diagnosis.hypotheses.orders import first
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
@@ -347,19 +348,12 @@ def undefined(predictor: Predictor) -> GroundedError:
         after = predictor.next(h, data.y[:-1])
     bad = np.argwhere(~np.isfinite(after).all(axis=-1) & (data.valid.T > 0))
     if not len(bad):
-        return GroundedError(
-            "the model's predictions of these trials diverge: fit its parameters, or check their "
-            "units",
-            then=NextCommand("fit"),
-        )
+        return refused("model.not_finite", data.model.name, then=NextCommand("fit"))
     t, b = bad[0]
     trial = data.ids[data.trial_of[b]] or f"number {data.trial_of[b] + 1}"
     values = ", ".join(
         f"{name} = {value:.4g}"
         for name, value in zip(data.model.state_names, data.y[t, b], strict=True)
     )
-    return GroundedError(
-        f"the model '{data.model.name}' is not finite at a measured state: trial {trial}, "
-        f"t = {data.time[t, b]:.3g} s, {values}; noise can carry a logged value outside the domain "
-        "of a square root or a logarithm: bound the argument in the model (np.maximum(x, 0))"
-    )
+    at = f"{data.time[t, b]:.3g} s"
+    return refused("model.not_finite", data.model.name, trial=trial, at=at, values=values)

@@ -66,10 +66,10 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     """
     told, no_cause, model = list[Finding](), False, data.model
     if data.count < 2 and len(data.valid) < PIECES:
-        told.append(found("model.one_trial", steps=PIECES * SHORTEST_PIECE))
+        told.append(found("model.few", needed=PIECES * SHORTEST_PIECE))
         no_cause = True
     if data.steps < FEW_STEPS:
-        told.append(found("model.few_steps", steps=data.steps, needed=FEW_STEPS))
+        told.append(found("model.few", steps=data.steps, needed=FEW_STEPS))
         no_cause = True
     still, unmoved = constant_inputs(data), still_states(data)
     if still or unmoved:
@@ -77,7 +77,7 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     no_cause |= len(still) == model.m and not released(data)
     if data.skipped:
         used = len(data.valid)
-        told.append(found("model.stretches", used=used, all=used + data.skipped))
+        told.append(found("model.share", used=used, total=used + data.skipped, stretches=True))
     names = model.state_names
     empty = [name for name, seen in zip(names, data.told, strict=True) if not seen]
     spared = {*left_out, *(names[i] for i, log in data.behind.items() if names[log] in left_out)}

@@ -32,18 +32,13 @@ ENTRIES: dict[str, Entry] = {
     ),
     "left": Entry(
         "note",
-        "unexplained: {state} is off by {error:size} {ahead:.3g} s ahead"
+        "unexplained: [[{state} is off by {error:size} {ahead:.3g} s ahead]]"
+        "[[the rate of {rate} lacks something small but lasting]][[, {size} rms]]"
         "[[ (noise: {bound:yes=at most ,no=}{noise:size})]][[, mostly where {place}]]"
         "[[, {part:%} of it in {trial} from {start:.3g} to {end:.3g} s]]"
         "[[; {others:more state} {others:is/are} off]]",
     ),
     "declared": Entry("note", "{effect}: as if {parameter} were {value}, not {was}"),
-    "lacks": Entry(
-        "note",
-        "small but lasting: the rate of {state} lacks something[[, {size} rms]]"
-        "[[, mostly where {place}]]"
-        "[[; {others:more state} {others:is/are} off]]",
-    ),
     "where": Entry(
         "note",
         "the gap is {share:%} in {state}[[ and {share2:%} in {state2}]]"
@@ -51,18 +46,20 @@ ENTRIES: dict[str, Entry] = {
     ),
     # what else is found
     "changed": Entry(
-        "warn", "{value} changed from {first} to {second} between the two groups of trials"
+        "warn",
+        "[[{value} changed from {first} to {second} between the two groups of trials]]"
+        "[[!value? nothing changed between the two groups beyond the noise]]",
     ),
-    "unchanged": Entry("note", "nothing changed between the two groups beyond the noise"),
     "tie": Entry(
         "warn",
         "these trials can't tell {effect} from {others}: each explains them",
         "[[own?adopting writes {effect}]]",
     ),
     "equivalent": Entry(
-        "note", "no log can tell {effect} from {others} in this model; plans are the same for all"
+        "note",
+        "[[nearly? hardly any]][[!nearly? no]] log can tell {effect} from {others} in this model; "
+        "plans are the same for all",
     ),
-    "alike": Entry("note", "{like} makes nearly the same log as {effect}"),
     "worse": Entry(
         "warn",
         "predictions of {state} get worse [[{ahead:.3g} s ahead]][[whole? over whole trials]]: "
@@ -98,13 +95,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "more": Entry(
         "note",
-        "{most:cause} {most:is/are} named, as many as were looked for, and more is left",
+        "[[{most:cause} {most:is/are} named, as many as were looked for, and more is left]]"
+        "[[interrupted? interrupted while it looked for one more effect]]",
         "[[deeper? allow more with --max-effects]][[!deeper? adopt these and diagnose again]]",
-    ),
-    "interrupted": Entry(
-        "warn",
-        "interrupted while it looked for one more effect",
-        "diagnose again to look further",
     ),
     "sign": Entry(
         "warn",
@@ -118,19 +111,17 @@ ENTRIES: dict[str, Entry] = {
         "corrected here, but not in the stored trials: {about}",
         "fix the program that writes the trials, and discard those that the search learned from",
     ),
-    "not_compared": Entry(
-        "note",
-        "{effect} is part of the model and was not compared again with {others}, from which the "
-        "trials could not tell it",
-    ),
     # the next step: one of them
     "next.record": Entry(
-        "note", "run another trial, or record a longer log, in which every input changes"
+        "note",
+        "[[diagnose all: {stored:stored trial} of this task can be diagnosed as well]]"
+        "[[!stored? run another trial, or record a longer log, in which every input changes]]",
     ),
-    "next.use": Entry(
-        "note", "diagnose all: {stored:stored trial} of this task can be diagnosed as well"
+    "next.none": Entry(
+        "note",
+        "no trial is needed[[adopted?: nothing more is found]][[ for the manoeuvre: the search has "
+        "ended, with {candidate}]]",
     ),
-    "next.none": Entry("note", "no trial is needed[[adopted?: nothing more is found]]"),
     "next.adopt": Entry(
         "note",
         "no trial is needed: {own:yes=fit the model's parameters,no=adopt the claimed effects}"
@@ -187,9 +178,6 @@ ENTRIES: dict[str, Entry] = {
         '[[term? or multiply each term of the rate of {state} by a Param(1.0, "1", 0.0, 2.0) and '
         "diagnose again: what comes far from 1 is why]]",
     ),
-    "next.ended": Entry(
-        "note", "no trial is needed for the manoeuvre: the search has ended, with {candidate}"
-    ),
     "next.undo": Entry(
         "warn",
         "the last {lost:candidate} planned with the adopted {about} lost",
@@ -205,11 +193,11 @@ ENTRIES: dict[str, Entry] = {
         "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
         "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
     ),
-    "probe_unsafe": Entry(
-        "note", "none of the probes that were tried stays inside [safety] and near the trials"
+    "no_probe": Entry(
+        "note",
+        "no probe[[ ({why})]][[{which:unsafe=: none that was tried stays inside [safety] and near "
+        "the trials,run=: it varies the best candidate and no run was complete}]]",
     ),
-    "probe_no_run": Entry("note", "no run was complete: a probe varies the best candidate"),
-    "probe_failed": Entry("warn", "no probe could be computed ({why})"),
     "next.no_probe": Entry(
         "note",
         "no run inside the limits would tell [[{effect} from {others}]][[{value} better]]",
@@ -220,11 +208,10 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "{better} predicts these trials better: errors of {worse} are {ratio:.3g} times as large",
     ),
-    "undecided": Entry("note", "these trials can't decide between {about}"),
-    "undecided_numbers": Entry(
+    "undecided": Entry(
         "note",
-        "these trials can't decide {about}",
-        "record runs in which {about:it/they} matter{about:s/}",
+        "these trials can't decide [[models? between ]]{about}",
+        "[[!models? record runs in which {about:it/they} matter{about:s/}]]",
     ),
     "rival_lost": Entry("refuse", "{about} can't follow these trials at all"),
 }

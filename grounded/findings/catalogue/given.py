@@ -14,6 +14,11 @@ ENTRIES: dict[str, Entry] = {
         "free=another name: grounded writes this one,outside=outside the folder of the cases,"
         "unique=one file: give more digits of its hash,finite=finite,positive=a positive number,"
         "whole=a whole number,numbers=an array of numbers,names=a list of names,above=above 0,"
+        "str=a text,float=a number,int=a whole number,list=a list in brackets,natural=0 or more,"
+        "nonzero=other than 0,pair=[low; high],time=a time of a log's clock,path=a message path,"
+        "crossing=a time or a path with one of above and below,one=either a file or a module,"
+        "alone=without a model,effects=tables with a name,deviations=standard deviations of "
+        "states,divisor=a whole part of the control step,actuator=a file of one actuator,"
         "weights=finite and not negative,place=one state along an axis, two in a plane "
         "(horizontal first) or three,bool=True or False,dict=a dict by name,ascending=in "
         "ascending order,name=a valid Python name,trial=the gr.Trial of the run,policy=read from "
@@ -34,13 +39,12 @@ ENTRIES: dict[str, Entry] = {
         "[[{of} has]][[!of? there is]] no {kind} '{about}'[[: did you mean '{near}'?]][[: there "
         "are {known}]]",
     ),
-    "twice": Entry("refuse", "the name '{name}' stands twice in {about}", "rename one"),
+    "twice": Entry("refuse", "'{name}' stands twice in {about}", "change one of them"),
     "either": Entry(
         "refuse",
         "{about}: expected {how:one=exactly one of them,both=both or none,first=the second only "
         "with the first}",
     ),
-    "order": Entry("refuse", "{about}: the lower bound {low} must be below the upper, {high}"),
     "fit": Entry(
         "refuse", "{about} has the {what} {theirs}, expected {own}[[ in this order{order:1=}]]"
     ),
@@ -58,8 +62,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "unweighed": Entry(
         "refuse",
-        "[reward] weighs {about}, but the target has no value for it at step {step}",
-        "add the column to the target (for a line: `--to {about}=0`; if only `terminal` weighs it,"
+        "[reward] weighs {about}, but the target has no value for it[[ at step {step}]]",
+        "add the column to the target ([[`{to}`]][[!to? for a line: `--to {about}=0`]]; if only "
+        "`terminal` weighs it,"
         " only the last value counts), or drop the weight",
     ),
     "no_input": Entry(

@@ -13,13 +13,14 @@ AGAIN = "[[; then discard {trials} and {source:log=ingest the log,trial=run it} 
 SCALE = "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]]"
 WRITES = "[[let the program write {writes}]]"
 # how a run went can't be judged by a wrong log
-RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.after*", "run.start")
+RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.safety", "run.start")
 
 ENTRIES: dict[str, Entry] = {
     # columns: the accounts
     "unit": Entry(
         "aside",
-        OF + "{about} {about:is/are} [[in {unit}, not {own}]][[{times:.4g} times too {size}]]"
+        OF + "{about} {about:is/are} [[in {unit}, not {own}]][[in degrees, but was unwrapped in "
+        "{folded}]][[{times:.4g} times too {size}]]"
         "[[ and of {negative}]][[: far beyond {beyond:.3g} in [safety] otherwise]]"
         + MOTION
         + RAN
@@ -27,12 +28,6 @@ ENTRIES: dict[str, Entry] = {
         + IN,
         SCALE + WRITES + "[[, and in [limits] {limits}]]" + AGAIN,
         hides=(*RUN, "log.limits", "log.stated"),
-    ),
-    "folded": Entry(
-        "aside",
-        OF + "{about} is in degrees, but was unwrapped in {own}" + IN,
-        SCALE + WRITES + AGAIN,
-        hides=RUN,
     ),
     "sign": Entry(
         "aside",
@@ -135,18 +130,14 @@ ENTRIES: dict[str, Entry] = {
         "the model that estimates {about} has {now}; for {trials} it had {before}",
         "to have all from one model, discard {trials} and ingest the logs again",
     ),
-    "reading": Entry("warn", "{about}"),
     "limits": Entry(
         "warn",
-        "{about} goes from {logged} in this log, beyond its [limits], {limits}",
-        "{how:percent=if it is in percent multiply its scale in [log] by 0.01,flip=its scale in "
+        "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]] in this "
+        "log",
+        "[[most? log the commands after clipping]][[{how:percent=if it is in percent multiply its "
+        "scale in [log] by 0.01,flip=its scale in "
         "[log] is negative: multiply these limits by -1 too,widen=no plan will use that: widen "
-        "them if the robot can take it}",
-    ),
-    "outside": Entry(
-        "warn",
-        "{about} in the log is up to {most} outside its [limits]",
-        "log the commands after clipping",
+        "them if the robot can take it}]]",
     ),
     # what a log lacks
     "gaps": Entry(
@@ -167,7 +158,6 @@ ENTRIES: dict[str, Entry] = {
         "no state changes in it: was the robot switched on, and are these its columns?",
         "`discard {trial}` sets it aside",
     ),
-    "unknown": Entry("refuse", "{about} {about:is/are} NaN from the start"),
     "late_states": Entry(
         "refuse",
         OF + "the run starts {late} before every state is known",
@@ -191,9 +181,6 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "its rows repeat the commands every {every:.3g} s: a delay is known to +- {half:.3g} s "
         "only",
-    ),
-    "earlier_rows": Entry(
-        "note", "the log begins {seconds:.3f} s before {ran} does: that part is left out"
     ),
     "start_doubt": Entry(
         "warn",
@@ -243,9 +230,11 @@ ENTRIES: dict[str, Entry] = {
     ),
     "earlier": Entry(
         "refuse",
-        "[[{log} ]]ran {ran}, which was made for an earlier task ({was}): its utility can't be "
-        "compared",
-        "ingest it with --data; or change the task back",
+        "[[{about} ]]ran {ran}, which [[was made for an earlier task ({was})]]"
+        "[[{what:unknown=this workspace never proposed,policy=is not the policy of this "
+        "workspace}]]"
+        ": its utility can't be compared",
+        "ingest it with --data for fit and diagnose[[was? ; or change the task back]]",
     ),
     "bare": Entry(
         "warn",
@@ -273,18 +262,13 @@ ENTRIES: dict[str, Entry] = {
         "no candidate is waiting for a trial; its commands are those of {ran}, the best: it counts "
         "as another run of it",
     ),
-    "copy": Entry("note", "its rows are those of {about}: the same recording, or a part of it"),
     "elsewhere": Entry(
         "note", "the {about} that it ran is from another workspace, or was made again since"
     ),
     "before": Entry(
         "note",
-        "it was stored before, as {about}, which is set aside: it is used as {ran} again",
-        "to change that, use --candidate ID",
-    ),
-    "not_used": Entry(
-        "note",
-        "it was stored before, as {about} ({ran}), which is set aside",
+        "it was stored before, as {about} ({ran}), which is set aside[[used? : it is used as that "
+        "again]]",
         "if it ran another candidate, name that with --candidate ID",
     ),
     "aside": Entry(
@@ -295,9 +279,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "repeats": Entry(
         "warn",
-        "it repeats {about} to the last bit: {copy:True=other trials of one candidate differ and "
+        "it repeats {about} to the last bit[[: {copy:True=other trials of one candidate differ and "
         "it is probably a copy,False=the system is treated as deterministic and no candidate is "
-        "run a second time from now on}",
+        "run a second time from now on}]]",
     ),
     "stored": Entry(
         "refuse",
@@ -306,17 +290,6 @@ ENTRIES: dict[str, Entry] = {
         "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted} all the "
         "same, discard {trial} and ingest it again]][[part? discard that and ingest this]]"
         "[[other? discard {trial} and ingest it again]]",
-    ),
-    "foreign_run": Entry(
-        "refuse",
-        "{about} ran {ran}, {what:unknown=which this workspace never proposed,policy=but not with "
-        "the policy of this workspace}",
-        "ingest it with --data for fit and diagnose",
-    ),
-    "stored_units": Entry(
-        "refuse",
-        "{about} has other units than the model: {units}",
-        "write its signals in the model's units, or ingest them as a CSV with a scale in [log]",
     ),
     "not_estimated": Entry(
         "refuse",

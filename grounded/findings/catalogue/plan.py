@@ -7,7 +7,6 @@ from grounded.findings.catalogue import Entry
 STOP = "be ready to stop the robot"
 
 ENTRIES: dict[str, Entry] = {
-    "unsafe": Entry("refuse", "{about} is not safe to run: {why}"),
     # there is no candidate
     "no_weight": Entry(
         "refuse",
@@ -16,18 +15,15 @@ ENTRIES: dict[str, Entry] = {
     ),
     "none": Entry(
         "refuse",
-        "there is no plan to run: {why}",
+        "there is no plan to run[[: {why}]][[: the {what} of {about} is not a finite number at t = "
+        "{at}]]",
         "correct the model there, or choose a start and a target at which it is valid",
     ),
-    "not_finite": Entry(
+    "outside": Entry(
         "refuse",
-        "the {what} of {candidate} is not a finite number at t = {at}: the model diverges there",
-        "check it with a shorter horizon",
-    ),
-    "outside_safety": Entry(
-        "refuse",
-        "{candidate} (alpha = {alpha:.6g}) is predicted to take {state} to {value} at t = {at}, "
-        "outside [safety] {state} = [{low}, {high}]",
+        "[[{candidate}]][[!candidate? it]][[ (alpha = {alpha:.6g})]] takes {state} to {value}[[ at "
+        "t = {at}]], outside "
+        "[{table}] {state} = [{low}, {high}]",
         "[[+- is the distance of trial {trial} from what it should repeat: if that run was "
         "disturbed, remove it with `discard {trial}`]]",
     ),
@@ -122,16 +118,11 @@ ENTRIES: dict[str, Entry] = {
     ),
     "small": Entry(
         "note",
-        "{candidate} promises {gain:.2g} over {best}, less than its trial can show: a gain below "
-        "{least:.2g} may be luck[[, from {few:repeat} only]][[. To show it takes {runs} runs of "
+        "{candidate} promises {gain:.2g} over {best}, less than its trial can show[[: about {log} "
+        "is expected of its log, with the noise that the prediction lacks]][[: a gain below "
+        "{least:.2g} may be luck]][[, from {few:repeat} only]][[. To show it takes {runs} runs of "
         "each of the two]]",
         "[[stop? if that is too many, stop with {best} (`export best`)]]",
-    ),
-    "less_in_log": Entry(
-        "note",
-        "in the model, which replays {best} with the noise in its log, {candidate} is {gain} "
-        "better; about {log} is expected of its log, with the noise that the prediction lacks: "
-        "only the run tells whether more than noise is gained",
     ),
     # the first plan of a task
     "no_motion": Entry(
@@ -161,17 +152,13 @@ ENTRIES: dict[str, Entry] = {
         "[reward] input_change of {about} was made for a different range from that in [limits]",
         "write input_change = {new} there, or draw the target again",
     ),
-    "at_limits": Entry(
-        "note",
-        "{about} {about:is/are} at a limit for {share:%} of the plan, and still {what} misses its "
-        "target by {off:size}: it asks for more than [limits] allow",
-        "draw a larger or slower target, or widen [limits] if the robot can take more",
-    ),
     "falls_short": Entry(
         "note",
-        "the plan ends with {what} {off:size} from the end of the target: either [reward] makes "
-        "getting closer too costly, or the model can't get there in time",
-        "weigh inputs and their changes less, draw a slower target, or check model.py",
+        "[[{about} {about:is/are} at a limit for {share:%} of the plan, and still ]]the plan "
+        "misses "
+        "its target: {what} is off by {off:size}[[!share?  at the end]]",
+        "draw a larger or slower target, weigh inputs and their changes less, check model.py, or "
+        "widen [limits] if the robot can take more",
     ),
     "rough": Entry(
         "note",
@@ -193,10 +180,6 @@ ENTRIES: dict[str, Entry] = {
         "draw a target whose run stays inside [safety] (`target`); widen [safety] only if the "
         "robot may go there",
     ),
-    "unused_rows": Entry(
-        "note",
-        "{file} has {rows} rows, but [task] horizon = {horizon} ends the plan after {end}",
-    ),
     "not_at_rest": Entry(
         "warn",
         "the plan assumes {held} before the start and after the end, under which {state} changes "
@@ -207,10 +190,9 @@ ENTRIES: dict[str, Entry] = {
     # it is not handed over, or not without a warning
     "refused": Entry(
         "refuse",
-        "{about} is not handed over: {why}",
-        "propose another, or use --anyway to hand it over regardless",
+        "{about} is [[!anyway? not ]]handed over[[anyway?  anyway]]: {why}",
+        "[[!anyway? propose another, or use --anyway to hand it over regardless]]",
     ),
-    "anyway": Entry("warn", "{about} is handed over anyway: {why}"),
     "unmapped": Entry(
         "refuse",
         "[log] maps no {about}, though {file} has {about:that as an input/those as inputs}: which "
@@ -225,34 +207,17 @@ ENTRIES: dict[str, Entry] = {
         "remove delay_s there again, so that plans allow for the delay that the robot's program "
         "sees, or undo the adoption with `adopt --undo`",
     ),
-    "rewritten": Entry(
-        "refuse",
-        "{file} is not the policy that was handed out[[, and that {ran} ran]]: it was rewritten, "
-        "or comes from another workspace[[ ({why})]]",
-        "delete the file and propose again",
-    ),
-    "other_robot": Entry(
-        "refuse", "{about} is for a robot with {has}, but this workspace's model has {model}"
-    ),
-    "other_dt": Entry("refuse", "it runs every {own}, but [task] dt is {now}"),
-    "other_unit": Entry("refuse", "it has {signal} in {unit}, but the model has it in {now}"),
-    "outside_limits": Entry(
-        "refuse", "it may send {input} = {value}, outside [limits] {input} = [{low}, {high}]"
-    ),
     "other_task": Entry(
-        "refuse", "it was made for another task ({what})[[never? , and was not run there]]"
-    ),
-    "of_other_task": Entry(
-        "note", "{candidate} was made for a different task from that in grounded.toml"
+        "refuse",
+        "{about} was made for another task[[ ({what})]][[never? , and was not run there]]",
     ),
     "outdated": Entry(
         "note", "the model was changed since {candidate} was made: its prediction is outdated"
     ),
-    "void": Entry("note", "{candidate} was not run and is void: {why}[[; run {instead} instead]]"),
-    "disowned": Entry(
+    "void": Entry(
         "note",
-        "{candidate} was not run and is void: {trials}, which it was made from, {trials:is/are} "
-        "{gone}",
+        "{candidate} was not run and is void[[: {why}]][[: {trials}, which it was made from, "
+        "{trials:is/are} {gone}]][[; run {instead} instead]]",
         "if the robot has run it meanwhile, ingest that log with --candidate {candidate}: it "
         "counts",
     ),
@@ -261,7 +226,6 @@ ENTRIES: dict[str, Entry] = {
         "{candidate} [[lost with {real:.4g}]][[!real? crashed]]; the best so far is {best}, "
         "{of:.4g}",
     ),
-    "run_aside": Entry("note", "{trial}, a run of {candidate}, is set aside[[: {why}]]"),
     # what the robot will do
     "near_safety": Entry(
         "note",
@@ -306,22 +270,11 @@ ENTRIES: dict[str, Entry] = {
         "to rest inside",
     ),
     # a drive that excites the model's parameters
-    "nothing_uncertain": Entry(
-        "refuse",
-        "no parameter of the model is uncertain, so there is nothing to excite",
-        "give a Param in {file} its bounds (low, high) or a std",
-    ),
-    "drive_unlimited": Entry(
-        "refuse",
-        "{about} {about:has/have} no [limits], so a drive has no size",
-        "enter them in grounded.toml",
-    ),
     "drive_unbounded": Entry(
         "refuse",
         "[safety] bounds no state, and no log shows where the robot may go",
         "enter where it may go, such as [safety] {state} = [-1.0, 1.0]",
     ),
-    "drive_length": Entry("refuse", "a drive takes 2 to {most} control steps of {dt}"),
     "no_drive": Entry(
         "refuse",
         "by the model, no drive stays inside [safety] from [task] start",

@@ -6,7 +6,7 @@ from grounded.findings.catalogue import Entry
 
 OF = "[[{log}: ]]"  # the file, where the log is refused
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
-OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.after*")
+OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.safety")
 SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
 
 ENTRIES: dict[str, Entry] = {
@@ -141,9 +141,11 @@ ENTRIES: dict[str, Entry] = {
     ),
     "failed": Entry(
         "warn",
-        "the run ended after {steps} of {horizon} steps: a failed candidate[[ ({silent} unknown "
+        "the run ended after {steps} of {horizon} steps[[large? , with values that are too "
+        "large]]: a failed candidate[[ ({silent} unknown "
         "after that)]][[, though {complete} ran to the end]]",
-        "`discard {trial}` if you stopped it for another reason, or if only the recording was cut",
+        "[[`discard {trial}` if you stopped it for another reason, or if only the recording was "
+        "cut]]",
     ),
     "fell": Entry(
         "warn",
@@ -182,13 +184,9 @@ ENTRIES: dict[str, Entry] = {
     # its end
     "safety": Entry(
         "warn",
-        "the run left [safety] {about} = {bound} at {at}: it came to {most}, where {predicted} was "
-        "predicted",
-    ),
-    "after_safety": Entry(
-        "warn",
-        "{after} after its end the robot left [safety] {about} = {bound}: it was {most}",
-        "stop it in time, or let the target end at rest inside",
+        "[[{after} after its end ]]the run left [safety] {about} = {bound}[[ at {at}]]: it came to "
+        "{most}[[, where {predicted} was predicted]]",
+        "[[after? stop it in time, or let the target end at rest inside]]",
     ),
     # the command of [system]
     "by_hand": Entry(
@@ -202,6 +200,21 @@ ENTRIES: dict[str, Entry] = {
         "[system] command {about}[[ ended with exit code {exit}]][[ can't be run: {why}]][[ wrote "
         "no trial to {missing}]]",
         "[[what it wrote is kept in {kept}]]",
+    ),
+    "workers": Entry(
+        "refuse",
+        "[[{lost} of {total:job} lost their worker ({why})]][[!lost? a worker has another version "
+        "of grounded]]",
+        "[[lost? run the study again with fewer --jobs: finished jobs are kept]][[!lost? install "
+        "one on every machine]]",
+    ),
+    "viewer": Entry(
+        "refuse",
+        "the viewer [[did not start, with exit code {exit}]][[missing? is not installed]][[screen? "
+        "has no screen here]]",
+        "[[missing? pip install '.[view]' in grounded's own folder, or ]]copy {about} to a "
+        "computer "
+        "with a screen and open it there with `rerun`",
     ),
     # its errors
     "off_target": Entry(

@@ -8,9 +8,11 @@ MODEL = "a diagnosis may show what the model lacks"
 
 ENTRIES: dict[str, Entry] = {
     # it goes on
-    "first": Entry("note", "the first candidate is the model's own policy"),
-    "gentler": Entry("note", "{crashed} crashed: the next first policy is gentler"),
-    "crashes": Entry("note", "{crashes} policies crashed in a row", MODEL),
+    "first": Entry(
+        "note",
+        "[[!crashed? the first candidate is the model's own policy]][[{crashed} crashed: the next "
+        "first policy is gentler]]",
+    ),
     "step": Entry(
         "note",
         "improve on {best} with {step}[[, since {crashed} crashed]][[; the last {lost} candidates "
@@ -30,12 +32,18 @@ ENTRIES: dict[str, Entry] = {
     "discard_first": Entry(
         "note", "discard {trial}, a run of {candidate}, or go on with it: `propose`"
     ),
+    "to_robot": Entry(
+        "note",
+        "[[ended? the search has ended with {about}]][[!ended? copy both files to the robot, run "
+        "{about} and record a log]]",
+    ),
     # it has ended with a result
     "no_step": Entry(
         "note",
         "no step improved on {best}[[ down to alpha = {alpha:.6g}]][[ in the last {last} "
         "candidates]][[ ({lost} lost)]][[; the next promises {gain}, with a likely error of "
-        "{error}]][[; the model promises less than {least:%} from smaller steps]]: {best} is the "
+        "{error}]][[; the model promises less than {least:%} from smaller steps]][[, from "
+        "{few:repeat} only]]: {best} is the "
         "result",
     ),
     "little": Entry(
@@ -43,17 +51,6 @@ ENTRIES: dict[str, Entry] = {
         "the last {last} candidates gained {gain:.3g} in total, less than [[{least:%} each "
         "([search] tolerance)]][[its standard error of {error:.2g}]][[, from {few:repeat} only]]: "
         "{best} is the result",
-    ),
-    "below_noise": Entry(
-        "note",
-        "{lost:step} from {best} did not improve, and the next promises [[{gain}, less than the "
-        "standard error of a trial's gain, {error:.2g}]][[, from {few:repeat} only]][[!gain? no "
-        "gain over its runs]]: {best} is the result",
-    ),
-    "nothing_promised": Entry(
-        "note",
-        "the model promises less than {least:%} more from any step ([search] tolerance): {best} is "
-        "the result",
     ),
     # it has ended without one
     "used_up": Entry(
@@ -73,16 +70,12 @@ ENTRIES: dict[str, Entry] = {
     ),
     "diverges": Entry(
         "note",
-        "the model grounded on {best} diverges for every step: it is too inaccurate there to "
-        "improve with",
-    ),
-    "every_step_loses": Entry(
-        "note",
-        "every step from {best} loses in the grounded model, by at least {least:.4g}: its "
-        "derivatives are wrong along this trial",
+        "the model grounded on {best} [[!least? diverges for every step]][[loses with every step, "
+        "by at least {least:.4g}]]: it is too inaccurate there to improve with",
     ),
     # what helps more than the next trial
     "lost_in_row": Entry("note", "{lost} steps in a row did not improve", MODEL),
+    "crashes": Entry("note", "{crashes} policies crashed in a row", MODEL),
     "far_off": Entry(
         "note",
         "{candidate} [[gave {real:.4g}]][[!real? failed]], but {promised:.4g} was predicted",
@@ -96,12 +89,12 @@ ENTRIES: dict[str, Entry] = {
     ),
     "diagnose": Entry("note", MODEL),
     "again": Entry("note", "run {best} again"),
-    "fit_first": Entry(
+    "adopt_first": Entry(
         "note",
-        "the diagnosis blames the model's parameters only, so fit them: a better model may gain "
-        "more",
+        "a better model may gain more: [[fit? fit its parameters, which alone the diagnosis "
+        "blames]]"
+        "[[!fit? adopt what this one lacks]]",
     ),
-    "adopt_first": Entry("note", "a better model may gain more: adopt what this one lacks"),
     # what status tells beside it
     "no_log": Entry(
         "note",
@@ -111,12 +104,8 @@ ENTRIES: dict[str, Entry] = {
     "uncounted": Entry(
         "note",
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
-        "candidates of another task, or probes",
-    ),
-    "namesake": Entry(
-        "note",
-        "{about} ran another policy that is also called {candidate}: only data, for fit and "
-        "diagnose",
+        "[[another policy that is also called {candidate}]][[!candidate? candidates of another "
+        "task, or probes]]",
     ),
     "left_out": Entry(
         "note",
@@ -158,16 +147,12 @@ ENTRIES: dict[str, Entry] = {
         "if that matters more, weigh it more in [reward] state, or stop here",
     ),
     # names
-    "aside": Entry("refuse", "{about} is set aside[[ ({why})]]"),
+    "aside": Entry("refuse", "{about}[[, a run of {candidate},]] is set aside[[ ({why})]]"),
     "unknown": Entry(
         "refuse",
-        "{about} is no {kind} of this workspace[[; did you mean '{meant}'?]][[; beside it: "
+        "{about} is no {kind} of this [[unusable? task, by its length, states, inputs or dt]]"
+        "[[!unusable? workspace]][[; did you mean '{meant}'?]][[; beside it: "
         "{beside}]][[; there are: {known}]]",
-    ),
-    "unusable": Entry(
-        "refuse",
-        "{about} can't be used: it is too short, or has other states, inputs or dt than this task",
-        "trials to use: {usable}",
     ),
     "no_trial": Entry(
         "refuse",
@@ -182,10 +167,6 @@ ENTRIES: dict[str, Entry] = {
     ),
     "no_best": Entry("refuse", "no run of this task is stored, so no candidate is the best"),
     "undiagnosed": Entry("refuse", "there is no diagnosis[[ of {about}]] yet", "diagnose first"),
-    "no_log_file": Entry(
-        "refuse",
-        "{about} is a trial or a candidate, expected the file of a log[[: its own is {path}]]",
-    ),
     # how sure a gain is
     "gain": Entry(
         "note",

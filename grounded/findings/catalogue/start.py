@@ -6,52 +6,67 @@ from grounded.findings.catalogue import Entry
 
 ENTRIES: dict[str, Entry] = {
     # why a number of the log is a state or input
-    "unit": Entry("note", "its unit is {unit}"),
-    "unit_other": Entry("note", "its unit is {unit} in the log, {model} in the model"),
-    "joint": Entry("note", "{about} names its joint '{joint}'"),
-    "joint_order": Entry(
+    "unit": Entry(
         "note",
-        "in order from the base, {index} of {about} is '{joint}'",
-        "check it by the joints of the controller",
+        "{about:its/their} unit is {unit}[[ in the log, {model} in the model]][[size? , by size]]",
     ),
-    "effort": Entry("note", "only it follows the measured effort of this joint"),
+    "joint": Entry(
+        "note",
+        "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base]]"
+        "[[effort? , whose measured effort it alone follows]]",
+        "[[index? check it by the joints of the controller]]",
+    ),
     "follows": Entry(
         "note",
-        "it follows the derivative of {of}{sign:1=,-1= with the OPPOSITE SIGN}, correlation "
-        "{correlation:.3f}",
+        "it [[no? does not follow]][[!no? follows]] the [[speed? speed]][[!speed? derivative]] of "
+        "{of}[[opposite?  with the OPPOSITE SIGN]][[, correlation {correlation:.3f}]]"
+        "[[, {slope:.3g} times as large]]",
     ),
-    "unfollowed": Entry(
-        "note", "it does not follow the derivative of {of}, correlation {correlation:.2f}"
-    ),
-    "times": Entry("note", "it is {slope:.3g} times the derivative of {of}"),
-    "in_degrees": Entry("note", "its size shows DEGREES"),
-    "same_unit": Entry("note", "{about} are taken to have one unit: they are of one size"),
     "exchanged": Entry(
         "note",
         "{about} look exchanged: the first follows the derivative of the second, correlation "
         "{correlation:.3f}, with the right sign and size",
         "if so, exchange these paths",
     ),
-    "speed": Entry(
-        "note",
-        "it follows the speed of {of}, correlation {correlation:.3f}, {slope:.3g} times as large",
-    ),
     "pose": Entry(
         "note",
         "measured independently of the wheels, from whose speed the pose of {about} is most "
         "likely integrated",
     ),
-    "still": Entry("note", "{about} never changes in this log"),
-    "alone": Entry(
+    "still": Entry(
         "note",
-        "no name matches; by {command:0=unit,1=being a command} only {numbers} fit{numbers:s/}",
+        "{about} never {about:changes/change} in this log",
+        "[[empty? there are no messages: record the commands]]",
     ),
-    "left": Entry("note", "no name matches; {numbers} {numbers:is/are} left, in the log's order"),
-    "steps": Entry("note", "with it the model's steps fit {share:%} better than the next best"),
-    "steps_tie": Entry("note", "the model's steps don't clearly favour one"),
-    "no_messages": Entry("note", "{about} {about:has/have} no messages", "record the commands"),
-    "given": Entry("note", "a guess: only its name is in the log"),
-    "asked": Entry("note", "as you specified"),
+    "left": Entry(
+        "note",
+        "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]][[!only? , in the "
+        "log's order]]",
+    ),
+    "steps": Entry(
+        "note",
+        "[[with it the model's steps fit {share:%} better than the next best]][[!share? the "
+        "model's steps don't clearly favour one]]",
+    ),
+    "given": Entry(
+        "note", "[[asked? as you specified]][[!asked? a guess: only its name is in the log]]"
+    ),
+    "unused": Entry(
+        "note", "{about} {about:is/are} not used of the log", "[log] can name {about:it/them}"
+    ),
+    "angles": Entry(
+        "note",
+        "{about} {about:is/are} {about:an angle/angles} by the model's equations",
+        "declare angles = {declared} in model.py, or a log that wraps at pi jumps by 6.28 rad",
+    ),
+    "interval": Entry(
+        "note",
+        "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[, its rows come "
+        "every "
+        "{rows:.3g} s]][[read as seconds, its rows are {apart:.3g} s apart]]",
+        "[[every? --dt sets another]][[apart? if the times are in ms or us, end that column's name "
+        "with _ms or _us and create the workspace again in another folder]]",
+    ),
     "encoder": Entry(
         "note", "of '{joint}', times the radius r", "enter yours here and in model.py"
     ),
@@ -69,8 +84,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "degrees": Entry(
         "note",
-        "{about} is in rad by the model, but goes from {low} to {high}",
-        "[[target? its course shows degrees: multiply it by {scale:.8g}]][[!target? if in degrees,"
+        "{about} is in rad by the model[[, but goes from {low} to {high}]][[: {turns:.2g} turns]]",
+        "[[if you meant degrees, use `--to {about}={to}`]][[target? its course shows degrees: "
+        "multiply it by {scale:.8g}]][[!target? if in degrees,"
         " set scale = {scale:.8g} in [log], of its rate too; [limits] are in rad]]",
     ),
     "no_start": Entry(
@@ -79,7 +95,6 @@ ENTRIES: dict[str, Entry] = {
         "still=nothing changes in it}[[ ({names})]]",
         "give a log in which the robot moves, with its states and commands as numbers",
     ),
-    "damaged": Entry("refuse", "{why}"),
     # the drawing of a target
     "no_position": Entry(
         "refuse",

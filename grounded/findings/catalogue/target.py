@@ -5,22 +5,6 @@ from __future__ import annotations
 from grounded.findings.catalogue import Entry
 
 ENTRIES: dict[str, Entry] = {
-    "seconds": Entry(
-        "refuse",
-        "a {about} lasts as long as its speeds take it; --seconds is for a step, a swing-up or a "
-        "line --to STATE=VALUE",
-        "set how fast it is driven with --speed and --accel",
-    ),
-    "weighed": Entry(
-        "warn",
-        "[reward] weighs {about}, without a column in the target: `propose` refuses that",
-        "[[draw it again with `{to}`, or ]]remove the weight in grounded.toml",
-    ),
-    "degrees": Entry(
-        "warn",
-        "{about} = {value:g} rad is {turns:.2g} turns",
-        "if you meant degrees, use `--to {about}={rad:.4g}`",
-    ),
     "beyond": Entry("warn", "{about} goes to {goes}, beyond its bound in [safety], {bound:g}"),
     "readings": Entry(
         "note",
@@ -43,7 +27,6 @@ ENTRIES: dict[str, Entry] = {
         "nothing asks for rest at the end",
         "for {about} there, by weights in [reward] terminal, draw it again with `--rest` as well",
     ),
-    "complete": Entry("note", "--rest has nothing to add: every state has a column already"),
     "kept": Entry(
         "note",
         "[reward] state is kept, since it was chosen: {weights}",

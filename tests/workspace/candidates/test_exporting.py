@@ -179,4 +179,4 @@ def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tm
     plain_name = grounded("-C", w.folder, "export", "c0001", "-o", tmp_path / "plain")
     assert plain_name.code == 0 and json.loads((tmp_path / "plain").read_text())["dt"] == 0.05
     folder = grounded("-C", w.folder, "export", "c0001", "-o", ".")
-    assert folder.code == 1 and "is a folder" in folder.err
+    assert folder.code == 1 and "folder" in folder.err

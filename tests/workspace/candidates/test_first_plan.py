@@ -149,7 +149,7 @@ def test_a_target_that_turns_tighter_than_the_model_can_is_told(tmp_path, size, 
     limits = "steer = [-0.36, 0.36]\nspeed = [0, 3]"
     w = blank(tmp_path / "w", STEERED, dt=0.05, limits=limits)
     drawn(w, "figure-8", "--size", size, "--speed", "1.5")
-    assert bool(told(w, "plan.at_limits")) == tight
+    assert bool(told(w, "plan.falls_short")) == tight
 
 
 @pytest.fixture

@@ -11,12 +11,13 @@ class Bad(Exception):
     """A part of a file can't be read.
 
     Args:
-        code: its entry in the catalogue, without the area `file`.
+        code: its entry in the catalogue; that of the area `file` without it.
+        *about: what it is about.
         **facts: of the finding.
     """
 
-    def __init__(self, code: str, **facts: Any) -> None:
-        self.finding = found(f"file.{code}", **facts)
+    def __init__(self, code: str, *about: str, **facts: Any) -> None:
+        self.finding = found(code if "." in code else f"file.{code}", *about, **facts)
         super().__init__(self.finding.sentence)
 
 

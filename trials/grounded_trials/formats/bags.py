@@ -73,7 +73,7 @@ def sqlite_records(path: Path) -> Iterator[Record]:
 def _tables(bag: Any, path: Path) -> Iterator[Record]:
     tables = {name for (name,) in bag.execute("SELECT name FROM sqlite_master WHERE type='table'")}
     if not {"topics", "messages"} <= tables:
-        raise GroundedError(found("file.no_bag", str(path)))
+        raise GroundedError(found("file.no_log", str(path), head="SQLite"))
     yield Header("ros2", "rosbag2 sqlite3")
     known = _definitions(bag) if "message_definitions" in tables else {}
     topics = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
@@ -101,7 +101,7 @@ def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]
     query = "SELECT topic_id, timestamp, data FROM messages"
     for topic, stamp, data in bag.execute(query):
         if topic not in channels:
-            raise GroundedError(found("file.no_channel", str(path), channel=topic))
+            raise GroundedError(found("file.damaged", str(path), where=f"channel {topic}"))
         yield channels[topic], stamp, data
 
 

@@ -113,7 +113,7 @@ class _CdrNode(Node):
     def _check(self, stop: Ints) -> None:
         over = (stop > self.end) | (self.pos < self.base)
         if over.any():
-            raise BadMessage(self.rows[over][0], "message_ends", inside=str(self.type))
+            raise BadMessage(self.rows[over][0], "decode", what="message", at=str(self.type))
 
     def _counts(self) -> tuple[Ints, _CdrNode]:
         """Return the item counts of lists or texts, and the cursors at the first items."""
@@ -138,7 +138,7 @@ class _CdrNode(Node):
         counts, body = node._counts()
         if isinstance(part, Text):
             if part.unit == 0:
-                raise BadPath("after_wstring")
+                raise BadPath("decode", what="wstring")
             return body.pos + counts
         sizes = _sizes(part.item, self.coding)
         if sizes is not None:
@@ -179,7 +179,7 @@ class _Table:
 
     def __init__(self, once: tuple[int, ...]) -> None:
         if max(once) > SIZE_LIMIT:
-            raise BadPath("type_large", limit=SIZE_LIMIT)
+            raise BadPath("decode", what="type", why=f"> {SIZE_LIMIT} bytes")
         self.once = np.array(once, dtype=np.int64)
         self.powers = [self.once]
 
@@ -251,17 +251,17 @@ def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
     """
     short = end - start < 4
     if short.any():
-        raise BadMessage(int(np.argmax(short)), "message_ends", inside="header")
+        raise BadMessage(int(np.argmax(short)), "decode", what="message", at="header")
     octets = np.frombuffer(buffer, dtype=np.uint8)
     kinds = octets[start + 1]
     if len(kinds):
         other = kinds != kinds[0]
         if other.any():
-            raise BadMessage(int(np.argmax(other)), "message_variant")
+            raise BadMessage(int(np.argmax(other)), "decode", what="CDR")
         if buffer[start[0] : start[0] + 4] == ZSTD:
-            raise BadMessage(0, "message_variant")
+            raise BadMessage(0, "decode", what="CDR")
         if int(kinds[0]) not in _KINDS or octets[start].any():
-            raise BadMessage(0, "message_variant", variant=int(kinds[0]))
+            raise BadMessage(0, "decode", what="CDR", at=str(int(kinds[0])))
     coding = _KINDS[int(kinds[0])] if len(kinds) else _KINDS[1]
     base = start + 4
     return _CdrNode(type, np.arange(len(start)), base, base, end, buffer, coding)

@@ -30,8 +30,7 @@ def columns_by_name(columns: Iterable[tuple[str, str, C]], path: Path) -> dict[s
     written: dict[str, str] = {}
     for name, cell, column in columns:
         if name in by_name:
-            both = tuple(dict.fromkeys((written[name], cell)))
-            raise GroundedError(found("file.column_twice", str(path), name=name, both=both))
+            raise GroundedError(found("given.twice", str(path), name=name))
         if name:
             by_name[name], written[name] = column, cell
     return by_name

@@ -62,7 +62,7 @@ def parse_idl(text: str, name: str) -> Struct:
     try:
         return _Parser(tokens).read(name.replace("/", "::"))
     except (IndexError, ValueError, RecursionError) as error:
-        raise BadSchema("schema", what="damaged", at=str(error)[:80]) from None
+        raise BadSchema("decode", what="definition", why="damaged", at=str(error)[:80]) from None
 
 
 @dataclass
@@ -88,7 +88,7 @@ class _Parser:
         while self.pos < len(self.tokens):
             self.definition(())
         if name not in self.defined or self.defined[name].kind != "struct":
-            raise BadSchema("schema", what="lacks", at=name[:80])
+            raise BadSchema("decode", what="definition", why="lacks", at=name[:80])
         return self.struct(name, 0)
 
     def take(self) -> str:
@@ -99,7 +99,7 @@ class _Parser:
     def expect(self, wanted: str) -> None:
         token = self.take()
         if token != wanted:
-            raise BadSchema("schema", what="unexpected", at=token[:40])
+            raise BadSchema("decode", what="definition", why="unexpected", at=token[:40])
 
     def until(self, end: str) -> list[str]:
         """Return the tokens up to `end`, without annotations."""
@@ -113,7 +113,7 @@ class _Parser:
 
     def annotation(self, token: str) -> None:
         if token in ("@optional", "@mutable"):
-            raise BadSchema("schema", what="refused", at=token)
+            raise BadSchema("decode", what="definition", why="refused", at=token)
         if self.pos < len(self.tokens) and self.tokens[self.pos] == "(":
             depth = 0
             while True:
@@ -128,7 +128,7 @@ class _Parser:
         elif token == "module":
             inner = (*scope, self.take())
             if len(inner) > MODULE_LIMIT or len(inner[-1]) > NAME_LIMIT:
-                raise BadSchema("schema", what="nested", at=inner[-1][:40])
+                raise BadSchema("decode", what="definition", why="nested", at=inner[-1][:40])
             self.expect("{")
             while self.tokens[self.pos] != "}":
                 self.definition(inner)
@@ -148,9 +148,9 @@ class _Parser:
             at = written.index("=")
             self.define(written[at - 1], _Definition(token, scope, [written[at + 1 :]]))
         elif token in _REFUSED:
-            raise BadSchema("schema", what="refused", at=token)
+            raise BadSchema("decode", what="definition", why="refused", at=token)
         elif token != ";":
-            raise BadSchema("schema", what="unexpected", at=token[:40])
+            raise BadSchema("decode", what="definition", why="unexpected", at=token[:40])
 
     def define(self, name: str, definition: _Definition) -> None:
         self.defined["::".join((*definition.scope, name))] = definition
@@ -190,7 +190,7 @@ class _Parser:
 
     def check_depth(self, name: str, depth: int) -> None:
         if depth > DEPTH_LIMIT:
-            raise BadSchema("schema", what="nested", at=name[:80])
+            raise BadSchema("decode", what="definition", why="nested", at=name[:80])
 
     def member(self, written: list[str], scope: tuple[str, ...], depth: int) -> list[Field]:
         kind, rest = self.type(written, scope, depth)
@@ -211,7 +211,7 @@ class _Parser:
         for text in reversed(counts):
             count = self.count(text, scope, 0)
             if not 0 <= count <= COUNT_LIMIT:
-                raise BadSchema("schema", what="long", at=str(count)[:20])
+                raise BadSchema("decode", what="definition", why="long", at=str(count)[:20])
             kind = Array(kind, count)
         return kind
 
@@ -224,7 +224,7 @@ class _Parser:
         if name not in self.counts:
             constant = self.defined[name]
             if constant.kind != "const":
-                raise BadSchema("schema", what="unexpected", at=name[:80])
+                raise BadSchema("decode", what="definition", why="unexpected", at=name[:80])
             self.counts[name] = self.count("".join(constant.parts[0]), constant.scope, depth + 1)
         return self.counts[name]
 
@@ -245,7 +245,7 @@ class _Parser:
             if number and written[words : words + 1] != ["double"]:
                 return number, written[words:]
         if first in _REFUSED or first in ("long", "wchar"):
-            raise BadSchema("schema", what="refused", at=first)
+            raise BadSchema("decode", what="definition", why="refused", at=first)
         name = self.find(first, scope)
         definition = self.defined[name]
         if definition.kind == "enum":
@@ -266,5 +266,5 @@ class _Parser:
                     self.found[name, scope] = full
                     break
             else:
-                raise BadSchema("schema", what="lacks", at=name[:80])
+                raise BadSchema("decode", what="definition", why="lacks", at=name[:80])
         return self.found[name, scope]

@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
@@ -31,6 +29,7 @@ from grounded_trials.formats.tables import (
     is_time,
     table_records,
 )
+from grounded_trials.plain_file import unreadable
 
 DATA = ("Data", "data", "values", "Values")  # the numbers of one signal beside its times
 CALLED = ("Name", "name", "label", "blockName")  # what names it
@@ -87,7 +86,8 @@ def _records(content: Mapping[str, Any], path: Path, rate: float) -> Iterator[Re
     objects = {name: one.kind for name, one in content.items() if isinstance(one, _Object)}
     if not tables and objects:
         kinds = tuple(dict.fromkeys(objects.values()))
-        raise GroundedError(found("file.objects", *objects, file=str(path), kinds=kinds))
+        why = f"{', '.join(objects)}: {', '.join(kinds)}"
+        raise unreadable(path, why, kind="MATLAB class")
     yield from table_records(tables, "mat", path)
 
 

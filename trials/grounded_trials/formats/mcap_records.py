@@ -145,7 +145,7 @@ class Fields:
         """Return the next `count` bytes."""
         end = self.pos + count
         if end > len(self.content):
-            raise BadRecord("record", what="short")
+            raise BadRecord("decode", what="content")
         piece = bytes(self.content[self.pos : end])
         self.pos = end
         return piece
@@ -159,7 +159,7 @@ class Fields:
         try:
             return self.skip(self.uint(32)).decode("utf-8")
         except UnicodeDecodeError:
-            raise BadRecord("record", what="text") from None
+            raise BadRecord("decode", what="text") from None
 
     def blob(self) -> bytes:
         """Return the next bytes, which follow their length."""
@@ -186,7 +186,7 @@ def _attachment(f: Fields) -> Attachment:
     end = f.pos
     stated = f.uint(32)
     if stated and zlib.crc32(f.content[:end]) != stated:
-        raise BadRecord("record", what="checksum")
+        raise BadRecord("decode", what="checksum")
     return attachment
 
 
@@ -214,19 +214,19 @@ def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[
         name, start = bytes(content[32 : 32 + length]), 40 + length
         stored = _U64.unpack_from(content, 32 + length)[0]
     except struct.error:
-        raise BadRecord("record", what="short") from None
+        raise BadRecord("decode", what="content") from None
     if start + stored > len(content):
-        raise BadRecord("record", what="short")
+        raise BadRecord("decode", what="content")
     if name and not packed:
-        raise BadRecord("record", what="packed")
+        raise BadRecord("decode", what="content", why="compressed")
     inside = bytes(content[start : start + stored])
     data, wrong = decompress(name.decode("utf-8", "replace"), inside, size)
     if wrong:
-        raise BadRecord("record", what="compression", why=wrong)
+        raise BadRecord("decode", what="compression", why=wrong)
     if len(data) != size:
-        raise BadRecord("record", what="size")
+        raise BadRecord("decode", what="size")
     if crc and zlib.crc32(data) != crc:
-        raise BadRecord("record", what="checksum")
+        raise BadRecord("decode", what="checksum")
     return data, bool(crc)
 
 

@@ -64,7 +64,7 @@ class DamagedFile(GroundedError):
     Args:
         name: of the file.
         offset: where that was noticed [bytes].
-        what: what is wrong there: `file.mcap` says it in words.
+        what: what is wrong there: `file.damaged` says it in words.
         where: the part of the file.
         why: the cause, if known.
         lost: whether nothing can be saved.
@@ -76,7 +76,8 @@ class DamagedFile(GroundedError):
         self.offset, self.what = offset, what
         facts: dict[str, Any] = {"what": what, "where": where, "why": why}
         then = None if lost else NextCommand("recover", (name,))
-        code = "file.mcap_lost" if lost else "file.mcap"
+        code = "file.no_message" if lost else "file.damaged"
+        code = "file.no_log" if what == "other" else code
         super().__init__(found(code, name, then=then, byte=offset, **facts))
 
 
@@ -194,7 +195,7 @@ class _Walk:
         try:
             positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
         except BadRecord as error:
-            raise self.damaged("record", "a message", str(error)) from None
+            raise self.damaged("record", "message", error.finding.what) from None
         return self._in_calendar(batch(self.buffer, positions))
 
     def _in_calendar(self, messages: Messages) -> Messages:
@@ -242,7 +243,7 @@ class _Walk:
                 yield self._defined(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
-            raise self.damaged("record", what, str(error), at) from None
+            raise self.damaged("record", what, error.finding.what, at) from None
 
     def _data_end(self, content: memoryview) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
@@ -275,7 +276,7 @@ def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:
     """Return the error for a second definition with the id of a first one."""
     names = [r.topic if isinstance(r, Channel) else r.name for r in (known, other)]
     what, (one, two) = f"{type(known).__name__.lower()} {known.id}", (n[:80] for n in names)
-    return BadRecord("defined_again", what=what, first=one, second=two)
+    return BadRecord("decode", what=what, at=one, why=two)
 
 
 def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
@@ -311,7 +312,7 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
         if length > end - pos - 9:
             if cut:
                 break
-            raise BadRecord("record", what="short")
+            raise BadRecord("decode", what="content")
         if opcode == MESSAGE:
             positions, pos = message_positions(data, pos, end)
             yield positions
@@ -336,7 +337,7 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         if opcode != MESSAGE or length > end - pos - 9:
             break
         if length < MESSAGE_HEADER:
-            raise BadRecord("message_ends", inside=f"header of {length} bytes")
+            raise BadRecord("decode", what="header", at=f"{length} bytes")
         append(pos)
         pos += 9 + length
         if len(positions) == look:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NoReturn
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, alike
 from grounded.findings import found
 
 _TRIGONOMETRY = ("sin", "cos", "tan", "asin", "acos", "atan")
@@ -228,8 +228,8 @@ class _Parser:
             return Function(name, self.argument(name))
         if name != "norm" and name not in UNARY:
             self.pos = at
-            known = nearest(name, ["norm", *_PARTS, *UNARY, *BINARY])
-            self.fail(f"a function, not '@{name}': {known}")
+            close = alike(name, ["norm", *_PARTS, *UNARY, *BINARY]) or "norm"
+            self.fail(f"@{close}, not '@{name}'")
         return Function(name)
 
     def argument(self, name: str) -> float:
@@ -284,4 +284,4 @@ class _Parser:
     def fail(self, expected: str) -> NoReturn:
         at = self.pos + 1 if self.pos < len(self.text) else 0
         shown = str(self.text)[: LENGTH_LIMIT // 10]
-        raise GroundedError(found("file.path", path=shown, at=at, expected=expected))
+        raise GroundedError(found("file.path", path=shown, at=str(at), expected=expected))

@@ -201,7 +201,7 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
         try:
             objects.append(json.loads(buffer[a:b]))
         except (ValueError, RecursionError) as error:
-            raise BadMessage(i, "json", why=str(error)) from None
+            raise BadMessage(i, "decode", what="JSON", why=str(error)) from None
     return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
 
 
@@ -240,8 +240,8 @@ class _JsonNode(Node):
             elif isinstance(o, int | float):
                 values[i] = _as_float(o)
             else:
-                what = {"dict": "an object", "list": "a list"}.get(type(o).__name__, "a text")
-                raise BadPath("path_ends", type=f"{what} in message {self.rows[i]}")
+                at = f"message {self.rows[i]}"
+                raise BadPath("path", expected="number", found=type(o).__name__, at=at)
         return values
 
     def equals(self, text: str) -> Bools:

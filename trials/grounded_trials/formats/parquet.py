@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.columns import columns_by_name
@@ -108,7 +109,8 @@ def episode_records(path: Path) -> Iterator[Record]:
     }
     file, rows = _rows_of(folder, info, number, [*features, "frame_index", "timestamp"])
     if not len(rows.get("frame_index", ())):
-        raise GroundedError(found("file.no_episode", str(path), count=info["total_episodes"]))
+        high = info["total_episodes"] - 1
+        raise wrong("episode", got=path.name, must="whole", low=0, high=high)
     times = rows["frame_index"][:, 0] / float(info["fps"])
     tables: dict[str, Columns] = {}
     for key in sorted(features, key=lambda key: (key not in FIRST, key in LAST)):

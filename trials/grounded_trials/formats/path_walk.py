@@ -96,7 +96,7 @@ def _into(type: Type, step: Step) -> Type:
         return type
     if isinstance(step, Slice):
         if not isinstance(type, Array):
-            raise BadPath("path_step", step="[...]", needs="a list", type=str(type))
+            raise BadPath("path", at="[...]", expected="list", found=str(type))
         return type.item
     names = (step.name,) if isinstance(step, Field) else step.path
     inner: Type = type
@@ -106,15 +106,15 @@ def _into(type: Type, step: Step) -> Type:
         return inner
     wanted = Text if isinstance(step.value, str) else Number
     if not isinstance(inner, wanted):
-        raise BadPath("path_step", step=".".join(names), needs=type_of(step.value), type=str(inner))
+        raise BadPath("path", at=".".join(names), expected=type_of(step.value), found=str(inner))
     return type
 
 
 def _field(type: Type, name: str) -> Type:
     if isinstance(type, Array):
-        raise BadPath("path_list", name=name)
+        raise BadPath("path", at=name, expected="[0] or [:]", found=str(type))
     if not isinstance(type, Struct):
-        raise BadPath("path_step", step=name, needs="a message", type=str(type))
+        raise BadPath("path", at=name, expected="message", found=str(type))
     if name not in type.by_name:
         raise NoField(type, name)
     return type.by_name[name].type
@@ -134,8 +134,7 @@ class NoField(BadPath):
         left = [one for one in type.by_name if one not in taken and one != "header"]
         alike = in_another_unit(name, left)
         others = {"near": alike[0]} if alike else near(name, left)
-        read = tuple(one for one in type.by_name if one in taken)
-        super().__init__("path_field", type=str(type), name=name, read=read, **others)
+        super().__init__("given.name", name, kind="field", of=str(type), **others)
 
     def beside(self, taken: Collection[str]) -> NoField:
         """Return it without a suggestion of fields that other signals are read from."""
@@ -149,21 +148,21 @@ def _check_end(type: Type, path: MessagePath) -> None:
     if name in ANGLES:
         fits = isinstance(type, Struct) and all(_is_number(type, part) for part in QUATERNION)
         if not fits and not _is_turn(type):
-            raise BadPath("path_step", step="@rpy", needs="x, y, z and w", type=str(type))
+            raise BadPath("path", at="@rpy", expected="x, y, z, w", found=str(type))
     elif name in AXES:
         if not _is_odometry(type):
             both = f"{'.'.join(TURNED)} and {'.'.join(MOVING)}"
-            raise BadPath("path_step", step=f"@{WORLD}", needs=both, type=str(type))
+            raise BadPath("path", at=f"@{WORLD}", expected=both, found=str(type))
     elif name == "norm":
         fits = isinstance(type, Array) and isinstance(type.item, Number)
         if not fits and not (isinstance(type, Struct) and _numbers_of(type)):
-            raise BadPath("path_step", step="@norm", needs="numbers", type=str(type))
+            raise BadPath("path", at="@norm", expected="numbers", found=str(type))
     elif isinstance(type, Struct):
-        raise BadPath("path_ends", type=str(type), fields=tuple(type.by_name))
+        raise BadPath("path", expected="number", found=str(type), known=tuple(type.by_name))
     elif isinstance(type, Array):
-        raise BadPath("path_ends", type=str(type), fields=("[0]", "[:]"))
+        raise BadPath("path", expected="number", found=str(type), known=("[0]", "[:]"))
     elif not isinstance(type, Number):
-        raise BadPath("path_ends", type=str(type))
+        raise BadPath("path", expected="number", found=str(type))
 
 
 def _is_odometry(type: Type) -> bool:
@@ -284,7 +283,9 @@ def read_stamp(node: Node) -> tuple[Ints, Ints]:
     outside = ~((np.abs(whole) <= CALENDAR_S) & (np.abs(part) < 2**32))
     if outside.any():
         k = int(np.argmax(outside))
-        raise BadMessage(seconds.rows[k], "stamp", stamp=f"{whole[k]:g} s {part[k]:g} ns")
+        raise BadMessage(
+            seconds.rows[k], "decode", what="stamp", at=f"{whole[k]:g} s {part[k]:g} ns"
+        )
     return seconds.rows, whole.astype(np.int64) * 10**9 + part.astype(np.int64)
 
 

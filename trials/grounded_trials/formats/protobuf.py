@@ -79,7 +79,7 @@ class _ProtobufNode(Node):
             return _integers(kind, raw)
         size = {FIXED64: 8, FIXED32: 4}.get(wire)
         if size != kind.size or not _is_fixed(kind):
-            raise BadMessage(self.rows[at[0]], "message_number")
+            raise BadMessage(self.rows[at[0]], "decode", what="number")
         return np.asarray(windows(self.buffer, f"<{kind.kind}")[start], dtype=np.float64)
 
     def equals(self, text: str) -> Bools:
@@ -190,13 +190,15 @@ def _content(buffer: bytes, wire: Ints, pos: Ints, limit: Ints, message: Ints) -
                 start[at] = after
                 room = (limit[at] - after).astype(np.uint64)
                 if (value > room).any():
-                    raise BadMessage(message[at][value > room][0], "message_ends", inside="field")
+                    raise BadMessage(
+                        message[at][value > room][0], "decode", what="message", at="field"
+                    )
                 after = after + value.astype(np.int64)
             end[at] = after
         else:
-            raise BadMessage(message[at][0], "message_number")
+            raise BadMessage(message[at][0], "decode", what="number")
     if (end > limit).any():
-        raise BadMessage(message[end > limit][0], "message_ends", inside="field")
+        raise BadMessage(message[end > limit][0], "decode", what="message", at="field")
     return start, end
 
 
@@ -219,14 +221,14 @@ def _varints(buffer: bytes, pos: Ints, limit: Ints, message: Ints) -> tuple[Word
         at = end[active]
         over = at >= limit[active]
         if over.any():
-            raise BadMessage(message[active[over]][0], "message_ends", inside="field")
+            raise BadMessage(message[active[over]][0], "decode", what="message", at="field")
         octet = octets[at]
         value[active] |= (octet & np.uint8(0x7F)).astype(np.uint64) << np.uint64(shift)
         end[active] += 1
         active = active[octet > 0x7F]
         if not len(active):
             return value, end
-    raise BadMessage(message[active][0], "message_number")
+    raise BadMessage(message[active][0], "decode", what="number")
 
 
 def _is_fixed(kind: Number) -> bool:
@@ -254,7 +256,7 @@ def _unpack(
         counts = np.where(packed, (end - start) // size, 1)
         ragged = packed & ((end - start) % size != 0)
         if ragged.any():
-            raise BadMessage(node.rows[owner[ragged][0]], "message_ends", inside="list")
+            raise BadMessage(node.rows[owner[ragged][0]], "decode", what="message", at="list")
     else:
         low, high = int(start[packed].min()), int(end[packed].max())
         stops = np.flatnonzero(np.frombuffer(node.buffer[low:high], np.uint8) < 0x80) + 1 + low

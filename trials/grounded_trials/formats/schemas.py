@@ -50,7 +50,7 @@ def struct_of(schema: Schema) -> Struct:
         return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
     if schema.encoding in ("ros2idl", "omgidl"):
         return parse_idl(text, schema.name)
-    raise BadSchema("schema_language", language=schema.encoding)
+    raise BadSchema("decode", what="schema language", at=schema.encoding)
 
 
 _OWN_FIELD = re.compile(rb"\n[\x01-\x7f]([!-~]+)\x18.{1,2} ([\x01\x03])\(\x01", re.DOTALL)
@@ -105,7 +105,7 @@ def parse_protobuf(data: bytes, name: str) -> Struct:
             types.collect(file.message_type, file.package)
         return types.struct(name)
     except (DecodeError, TypeError, ValueError, RecursionError) as error:
-        raise BadSchema("schema", what="damaged", at=str(error)[:80]) from None
+        raise BadSchema("decode", what="definition", why="damaged", at=str(error)[:80]) from None
 
 
 class _ProtobufTypes:
@@ -125,7 +125,7 @@ class _ProtobufTypes:
         if name in self.built:
             return self.built[name]
         if name not in self.messages:
-            raise BadSchema("schema", what="lacks", at=name)
+            raise BadSchema("decode", what="definition", why="lacks", at=name)
         self.built[name] = built = Struct(name, ())
         fields = tuple(self.field(field) for field in self.messages[name].field)
         object.__setattr__(built, "fields", fields)
@@ -136,9 +136,9 @@ class _ProtobufTypes:
             raise ValueError("name")
         code = field.type if field.HasField("type") else 0
         if code != MESSAGE and code not in _PROTOBUF:
-            raise BadSchema("schema", what="refused", at=field.name)
+            raise BadSchema("decode", what="definition", why="refused", at=field.name)
         if not 0 < field.number < NUMBER_LIMIT:
-            raise BadSchema("schema", what="unexpected", at=field.name)
+            raise BadSchema("decode", what="definition", why="unexpected", at=field.name)
         kind: Type = _PROTOBUF.get(code) or self.struct(field.type_name.lstrip("."))
         if field.label == REPEATED:
             return Field(field.name, Array(kind), field.number)
@@ -182,7 +182,7 @@ def parse_ros(text: str, name: str, *, ros1: bool) -> Struct:
         head, _, body = part.lstrip("\n").partition("\n")
         kind, _, full = head.partition(":")
         if kind.strip() != "MSG":
-            raise BadSchema("schema", what="unexpected", at=head[:40])
+            raise BadSchema("decode", what="definition", why="unexpected", at=head[:40])
         texts[_short(full.strip())] = body
     root = _short(name)
     texts[root] = first
@@ -222,7 +222,7 @@ class _RosTypes:
         if name in self.built:
             return self.built[name]
         if depth > DEPTH_LIMIT:
-            raise BadSchema("schema", what="nested", at=name)
+            raise BadSchema("decode", what="definition", why="nested", at=name)
         package = name.split("/")[0] if "/" in name else ""
         fields = []
         for line in self.texts[name].split("\n"):
@@ -231,7 +231,7 @@ class _RosTypes:
                 continue
             match = _FIELD.match(stripped)
             if not match:
-                raise BadSchema("schema", what="unexpected", at=stripped[:60])
+                raise BadSchema("decode", what="definition", why="unexpected", at=stripped[:60])
             if match["constant"]:
                 continue
             fields.append(Field(match["name"], self.type(match, package, depth)))
@@ -247,7 +247,7 @@ class _RosTypes:
         if not count or count.startswith("<="):
             return Array(kind)
         if len(count) > 9 or int(count) > COUNT_LIMIT:
-            raise BadSchema("schema", what="long", at=count[:20])
+            raise BadSchema("decode", what="definition", why="long", at=count[:20])
         return Array(kind, int(count))
 
     def named(self, name: str, package: str, depth: int) -> Type:
@@ -264,4 +264,4 @@ class _RosTypes:
         for full in names if "/" not in name else names[:1]:
             if full in self.texts:
                 return self.struct(full, depth + 1)
-        raise BadSchema("schema", what="lacks", at=name)
+        raise BadSchema("decode", what="definition", why="lacks", at=name)

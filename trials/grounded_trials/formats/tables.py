@@ -69,7 +69,8 @@ def npz_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     if arrays.keys() >= CANDIDATE:
-        raise GroundedError(found("file.exported", str(path), candidate=str(arrays["candidate"])))
+        head = f"candidate {arrays['candidate']}"
+        raise GroundedError(found("file.no_log", str(path), head=head))
     yield from table_records(_npz_tables(arrays, path, layout.rate), "npz", path, layout.rate)
 
 
@@ -224,7 +225,7 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     if lost := len(values) - len(finite):
         raise GroundedError(found("file.times", str(path), name=name, lost=lost))
     if top * UNITS[unit] > LATEST:
-        raise GroundedError(found("file.times", str(path), name=name, top=top, unit=unit))
+        raise GroundedError(found("file.times", str(path), name=name, text=f"{top:g} {unit}"))
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
 
 

@@ -24,7 +24,7 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import Finding, Weight, found
 from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
@@ -82,7 +82,7 @@ def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
         except ValueError:
             values, stamps = _with_texts(_rows(stream, head, cut), head, times, path)
     if not values.size:
-        raise GroundedError(found("file.no_rows", str(path), line=head.line))
+        raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
     named = zip(head.names, head.cells, values.T, strict=True)
     columns: dict[str, Any] = columns_by_name(named, path)
     if stamps is not None:
@@ -145,9 +145,17 @@ def _table_remarks(path: Path) -> list[Finding]:
         cut, empty = _cut_in(stream, head), _empty_last(stream, head)
     odd, name = [], str(path)
     if empty:
-        odd.append(found("file.last_column", name, name=head.cells[-1], line=head.line))
+        odd.append(
+            found(
+                "file.empty_column",
+                name,
+                name=head.cells[-1],
+                line=head.line,
+                weight=Weight.WARN,
+            )
+        )
     if cut is not None:
-        odd.append(found("file.cut", name, line=cut.line, text=cut.text[:80]))
+        odd.append(found("file.cut", name, line=str(cut.line), text=cut.text[:80]))
     return odd
 
 
@@ -170,7 +178,7 @@ def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
             "name": head.cells[-1],
             "column": head.names.index("") + 1,
         }
-        raise GroundedError(found("file.names_moved", str(path), **facts))
+        raise GroundedError(found("file.empty_column", str(path), **facts))
 
 
 def _empty_last(stream: TextIO, head: _Head) -> bool:
@@ -188,7 +196,6 @@ def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> Grounde
     facts: dict[str, Any] = {
         "line": line,
         "has": has,
-        "head": head.line,
         "names": names,
         "comma": int(comma),
     }
@@ -318,13 +325,10 @@ def _head_by(columns: Sequence[str], lines: Sequence[str], path: Path) -> _Head:
     rows = [_filled(_cells(line, mark)) for line, mark in zip(lines, marks, strict=True)]
     i = next((i for i, cells in enumerate(rows) if cells and _share(cells) == 1), None)
     if i is None:
-        raise GroundedError(found("file.no_rows", str(path), line=1))
-    cells, mark, line = rows[i], marks[i], lines[i]
+        raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
+    cells, mark = rows[i], marks[i]
     if len(cells) != len(columns):
-        row = line.strip()[:40]
-        raise GroundedError(
-            found("file.columns", str(path), has=len(cells), names=tuple(columns), row=row)
-        )
+        raise GroundedError(found("file.row", str(path), has=len(cells), names=len(columns)))
     return _Head(tuple(map(column_name, columns)), tuple(columns), mark, i, i)
 
 
@@ -413,7 +417,7 @@ def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any
         moment = _moment(f"{date.strip()} {text.strip()}".strip()) or _moment(text)
         if moment is None:
             raise GroundedError(
-                found("file.no_time", str(path), line=line, name=name, text=text.strip())
+                found("file.times", str(path), line=line, name=name, text=text.strip())
             )
         if moments and moment + days < moments[-1] - timedelta(hours=12) and moment.year == 1970:
             days += timedelta(days=1)  # past midnight, without a date

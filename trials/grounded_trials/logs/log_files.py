@@ -102,7 +102,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
         if not path.exists() and not parquet.is_episode(path):
             raise _missing(path)
     if not files:
-        raise GroundedError(found("file.missing", "a log"))
+        raise GroundedError(found("file.missing", "log"))
     return tuple(files)
 
 
@@ -117,7 +117,7 @@ def _bag(folder: Path) -> list[Path]:
     if names:  # names only: a listing can't lead out of its folder
         missing = [name for name in names if not (folder / name).exists()]
         if missing:
-            raise GroundedError(found("file.listed", str(listing), name=missing[0]))
+            raise GroundedError(found("file.missing", missing[0], where=str(listing)))
         return [folder / name for name in names]
     inside = next((paths for paths in bags if paths), [])
     if not inside:
@@ -176,7 +176,7 @@ def _no_log_in(folder: Path) -> GroundedError:
     several = tuple(tables[:NEWEST]) if len(tables) > 1 else ()
     workspace = int((folder / "grounded.toml").is_file())
     return GroundedError(
-        found("file.no_log_inside", str(folder), tables=several * (not workspace), own=workspace)
+        found("file.no_log", str(folder), tables=several * (not workspace), own=workspace)
     )
 
 
@@ -196,14 +196,14 @@ def open_log(path: Path) -> BinaryIO:
     except FileNotFoundError:
         raise _missing(path) from None
     except IsADirectoryError:
-        raise GroundedError(found("file.folder", str(path))) from None
+        raise _unreadable(path, "folder") from None
     except OSError as error:
         raise _unreadable(path, str(error.strerror)) from None
 
 
 def empty(path: Path) -> GroundedError:
     """Return the error for a log without a single byte."""
-    return GroundedError(found("file.empty", str(path)))
+    return GroundedError(found("file.no_message", str(path), byte=0))
 
 
 def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
@@ -239,7 +239,7 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO, layout: Layout) -> Ite
     elif (format := _format_of(path, head)) is not None:
         yield from _read_as(format, path, layout)
     else:
-        raise GroundedError(found("file.no_log", str(path), head=repr(head[:8])))
+        raise GroundedError(found("file.no_log", str(path), begins=repr(head[:8])))
 
 
 def _format_of(path: Path, head: bytes) -> Format | None:

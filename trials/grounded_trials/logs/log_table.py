@@ -12,7 +12,8 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.checks import unknown
+from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
@@ -153,8 +154,7 @@ class LogMapping:
         """
         for name in before:
             if name not in self.inputs:
-                hint = nearest(name, self.inputs)
-                raise GroundedError(found("file.no_input", name, hint=hint))
+                raise unknown("input", name, self.inputs, of="[log]")
         new = {name: replace(self.inputs[name], before=value) for name, value in before.items()}
         return replace(self, inputs={**self.inputs, **new})
 
@@ -213,14 +213,13 @@ def mapped_signals(
         GroundedError: see `signals.read_signals`.
     """
     if missing := ["state"] * (not states) + ["input"] * (not inputs):
-        raise GroundedError(found("file.unmapped", kinds=tuple(missing)))
+        raise GroundedError(found("log.no_signal", *missing, what="any"))
     paths_of = {mapping.states[name].path: name for name in states}
     same = [name for name in inputs if mapping.inputs[name].path in paths_of]
     if same:
         path = mapping.inputs[same[0]].path
-        raise GroundedError(
-            found("file.mapped_twice", same[0], input=same[0], state=paths_of[path], path=path)
-        )
+        places = f"[log.state.{paths_of[path]}]", f"[log.input.{same[0]}]"
+        raise GroundedError(found("given.twice", *places, name=path))
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
     series = read_signals(paths, {**specs, **mapping.span.signals()}, mapping.layout)

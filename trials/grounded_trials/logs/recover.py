@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
+from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found
 from grounded_trials.formats.mcap_records import (
@@ -77,7 +78,7 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     if target.exists():
         raise GroundedError(found("file.exists", str(target)))
     if target.suffix.lower() != ".mcap":
-        raise GroundedError(found("file.unwritable", str(target), why="it needs the ending .mcap"))
+        raise wrong("name of the copy", str(target), like="copy.mcap")
     if not target.parent.is_dir():
         raise GroundedError(found("file.unwritable", str(target), folder=str(target.parent)))
     with open_log(source) as stream:
@@ -108,8 +109,7 @@ def _recover(source: Path, target: Path) -> Recovery:
                 found("file.unwritable", str(target), why=str(error.strerror))
             ) from error
     if not copy.anything:
-        why = salvage.losses[0].sentence if salvage.losses else ""
-        raise GroundedError(found("file.nothing_saved", str(source), why=why))
+        raise GroundedError(found("file.no_message", str(source)))
     losses = salvage.losses[:MOST_LOSSES]
     if more := len(salvage.losses) - len(losses):
         losses.append(found("file.lost", more=more))

@@ -110,11 +110,6 @@ class Gridded:
         """What is odd about the samples."""
         return self._told[1]
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The findings as sentences."""
-        return tuple(one.sentence for one in self.findings)
-
     @cached_property
     def interpolated_s(self) -> float:
         """By how much a response may begin early between two samples [s], see `begins_early`."""

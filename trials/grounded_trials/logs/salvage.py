@@ -116,7 +116,7 @@ class Salvage:
         self.losses.append(self._ends_early())
 
     def _ends_early(self) -> Finding:
-        return found("file.cut_at", byte=self.size, index=int(self._ended))
+        return found("file.cut", byte=self.size, index=int(self._ended))
 
     def _first(self) -> int | None:
         if read_at(self.stream, 0, 8) == MAGIC:
@@ -142,7 +142,7 @@ class Salvage:
                 yield from self._sound(record)
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
-            self.losses.append(found("file.lost", part=what, byte=pos, why=str(error)))
+            self.losses.append(found("file.lost", part=what, byte=pos, why=error.finding.what))
             if opcode == CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
@@ -189,7 +189,7 @@ class Salvage:
         stated = int.from_bytes(record[9:13], "little")
         wrong = bool(stated) and stated != self._crc
         if wrong and not self.losses and (self._outside or self._tables):
-            self.losses.append(found("file.unverified", messages=self._outside))
+            self.losses.append(found("file.lost", wrong=True, messages=self._outside))
         if self.losses or not stated:
             self.unverified += self._outside
         self._outside, self._ended = 0, True

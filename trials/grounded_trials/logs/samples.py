@@ -90,7 +90,7 @@ class Samples:
             raise _unusable(self.name, self.spec, "one")
         if self.interval > SPARSE * dt and self.spec.max_age_s is None:
             facts: dict[str, Any] = {"path": self.spec.path, "every": self.interval, "dt": dt}
-            raise GroundedError(found("file.sparse", self.name, **facts))
+            raise GroundedError(found("file.gap", self.name, **facts))
 
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
         """Interpolate values at times [ns]; up to half an interval beyond the ends is allowed.
@@ -208,7 +208,7 @@ class Samples:
         ends = {k: (self.t[i] - origin) * 1e-9 for k, i in (("first", 0), ("last", -1))}
         when = float(ends["first"]) if at is None else (at - origin) * 1e-9
         path = self.spec.path
-        return GroundedError(found("file.outside", self.name, path=path, at=when, **ends))
+        return GroundedError(found("file.gap", self.name, path=path, at=when, **ends))
 
     def _refuse(self, t0: int, t1: int, limit: float, origin: int) -> None:
         facts: dict[str, Any] = {
@@ -216,8 +216,7 @@ class Samples:
             "end": (t1 - origin) * 1e-9,
             "limit": limit,
         }
-        gap, path = (t1 - t0) * 1e-9, self.spec.path
-        raise GroundedError(found("file.gap", self.name, path=path, gap=gap, **facts))
+        raise GroundedError(found("file.gap", self.name, path=self.spec.path, **facts))
 
 
 def _by_chance(count: int) -> float:
@@ -268,9 +267,8 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     back = np.diff(t)
     if len(back) and back.min() < -JUMP_S * 1e9:
         k = int(np.argmin(back))
-        facts: dict[str, Any] = {"clock": spec.clock, "by": float(-back[k]) * 1e-9, "sample": k}
-        other = int(spec.clock != "log")
-        raise GroundedError(found("file.clock_jumps", name, path=spec.path, other=other, **facts))
+        by = float(-back[k]) * 1e-9
+        raise GroundedError(found("file.clocks", name, by=by, sample=str(k)))
     order = np.argsort(t, kind="stable")
     t, y = t[order], y[order]
     last_of_stamp = np.append(np.diff(t) != 0, True)
@@ -291,7 +289,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
 
 
 def _unusable(name: str, spec: SignalSpec, what: str, values: int = 0) -> GroundedError:
-    return GroundedError(found("file.unusable", name, path=spec.path, what=what, values=values))
+    return GroundedError(found("file.signal", name, path=spec.path, what=what, values=values))
 
 
 def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
@@ -320,8 +318,5 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
         f"{s.spec.delay_s + by * 1e-9:.3f}"
         for s in moved
     )
-    names: dict[str, Any] = {
-        "early": tuple(s.name for s in early),
-        "late": tuple(s.name for s in late),
-    }
-    raise GroundedError(found("file.clocks", apart=abs(by) * 1e-9, lines=lines, **names))
+    names = [s.name for s in (*early, *late)]
+    raise GroundedError(found("file.clocks", *names, apart=abs(by) * 1e-9, lines=lines))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import MIXED_S, Samples
 from grounded_trials.logs.signals import Series
@@ -101,8 +101,7 @@ def check_clocks(series: Mapping[str, Series]) -> None:
     """
     first, last, apart = _furthest({name: s.skew_s for name, s in series.items()})
     if apart > MIXED_S:
-        facts: dict[str, Any] = {"early": (first,), "late": (last,), "apart": apart, "lines": ""}
-        raise GroundedError(found("file.clocks", **facts))
+        raise GroundedError(found("file.clocks", first, last, apart=apart))
 
 
 def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
@@ -192,7 +191,7 @@ def vanished(series: Sequence[Samples], last: int) -> list[Finding]:
 
 def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]:
     """Return what is odd in the signals of a trial; what several share is told once."""
-    odd = [found("file.late_start", late=late)] if late > 0 else []
+    odd = [found("file.vanished", late=late)] if late > 0 else []
     alike: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for r in reports:
         disordered = r.out_of_order if r.out_of_order >= DISORDERED * r.samples else 0
@@ -203,11 +202,11 @@ def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]
         }
         facts |= {"stamps": disordered + r.repeated + r.unstamped}
         if any(facts.values()):
-            gap = f"{r.largest_gap_s:.3f} s at {r.largest_gap_at_s:.3f} s"
+            gap = Quantity(r.largest_gap_s, "s")
             facts |= {"gap": gap, "samples": r.samples}
             alike.setdefault(tuple(facts.items()), []).append(r.name)
     odd += [found("file.odd_values", *names, **dict(facts)) for facts, names in alike.items()]
     low, high, apart = _furthest({r.name: r.skew_s for r in reports})
     if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
-        odd.append(found("file.clocks_apart", low, high, apart=apart))
+        odd.append(found("file.clocks", low, high, apart=apart, weight=Weight.WARN))
     return odd

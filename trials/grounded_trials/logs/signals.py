@@ -132,7 +132,8 @@ def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
     few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
     others = {"known": tuple(known)} if few else near(topic, known)
     then = NextCommand("inspect", (file,))
-    raise refused("file.no_topic", *names, topic=topic, then=then, **others)
+    facts: dict[str, Any] = {"kind": "topic", "of": Path(file).name, "where": ", ".join(names)}
+    raise refused("given.name", topic, **facts, then=then, **others)
 
 
 class _Log:
@@ -168,7 +169,7 @@ class _Log:
         if unknown:
             then = NextCommand("recover", (self.name,))
             raise GroundedError(
-                found("file.no_channel", self.name, channel=int(unknown[0]), then=then)
+                found("file.damaged", self.name, where=f"channel {unknown[0]}", then=then)
             )
         for identity, (decoder, wanting) in self.wanted.items():
             if identity not in present:
@@ -185,17 +186,14 @@ class _Log:
             for collector in wanting:
                 collector.collect(root, decoder, own)
         except BadMessage as error:
-            facts: dict[str, Any] = {
-                "topic": decoder.topic,
-                "type": decoder.name,
-                "why": str(error),
-            }
             at = float(own.log_times[error.message]) * 1e-9
-            raise GroundedError(found("file.message", self.name, at=at, **facts)) from None
+            raise self._misfit(channel, collector, error, at) from None
         except BadPath as error:
             raise self._misfit(channel, collector, error) from None
 
-    def _misfit(self, channel: Channel, collector: _Collector, error: Bad) -> GroundedError:
+    def _misfit(
+        self, channel: Channel, collector: _Collector, error: Bad, at: float | None = None
+    ) -> GroundedError:
         if isinstance(error, NoField):
             mapped = (c.path for c in self.collectors if c is not collector)
             same = [path for path in mapped if path.topic == channel.topic]
@@ -203,10 +201,11 @@ class _Log:
         facts: dict[str, Any] = {
             "topic": channel.topic,
             "type": self.topics[channel.topic],
-            "why": str(error),
+            "why": error.finding.what,
+            "at": at,
         }
         facts |= {"file": self.name, "path": collector.path.text}
-        return GroundedError(found("file.misfit", collector.name, **facts))
+        return GroundedError(found("file.signal", collector.name, **facts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,9 +244,9 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
     if encoding == "json":
         return Decoder(channel.topic, name or "json", Dynamic(), json_messages)
     if encoding not in _READERS:
-        raise BadSchema("encoding", encoding=encoding)
+        raise BadSchema("decode", what="encoding", at=encoding)
     if schema is None:
-        raise BadSchema("encoding", encoding=encoding, bare=1)
+        raise BadSchema("decode", what="schema", at=encoding)
     type, read = struct_of(schema), _READERS[encoding]
     return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
 
@@ -270,14 +269,14 @@ class _Collector:
         self.type, self.stamped = decoder.name, bound.stamp is not None
         dynamic = isinstance(decoder.type, Dynamic)
         if self.spec.clock == "header" and not self.stamped and not dynamic:
-            raise BadPath("no_stamp")
+            raise BadPath("decode", what="header stamp")
 
     def collect(self, root: Node, decoder: Decoder, batch: Messages) -> None:
         self.messages += len(batch)
         values = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
         if len(values.rows) > 1 and (np.diff(values.rows) == 0).any():
             at = int(values.rows[np.argmax(np.diff(values.rows) == 0)])
-            raise BadPath("several_values", at=float(batch.log_times[at]) * 1e-9)
+            raise BadPath("path", expected="one value", at=f"{batch.log_times[at] * 1e-9:.3f} s")
         self.parts.append((self._times(batch, values), values.values, batch.log_times[values.rows]))
 
     def _times(self, batch: Messages, values: Values) -> Ints:
@@ -286,10 +285,12 @@ class _Collector:
         if self.spec.clock == "publish":
             times = batch.publish_times[values.rows]
             if (times < 0).any():
-                raise BadMessage(values.rows[np.argmax(times < 0)], "stamp", stamp="after 2262")
+                raise BadMessage(
+                    values.rows[np.argmax(times < 0)], "decode", what="stamp", at="2262"
+                )
             return times
         if values.stamps is None:
-            raise BadPath("no_stamp")
+            raise BadPath("decode", what="header stamp")
         return values.stamps
 
     def series(self) -> Series:
@@ -300,6 +301,6 @@ class _Collector:
                 "topic": self.path.topic,
                 "messages": self.messages,
             }
-            raise GroundedError(found("file.no_samples", self.name, **facts))
+            raise GroundedError(found("file.signal", self.name, **facts))
         t, values, log_times = columns
         return Series(self.spec, t, values, log_times, self.messages, self.type, self.stamped)

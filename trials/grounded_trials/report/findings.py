@@ -48,16 +48,14 @@ if TYPE_CHECKING:
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
-FAR = "distance from the desired position"
-AT_END = "at the end: "  # label of errors of the last state
+FAR = "distance from target"
 ESTIMATED = "not measured: an estimate"  # note at a panel
 MOVED = 0.02  # share of the change in cost below which a row is left out
-WORSE = 1.05  # ratio to the first trial's error above which a row is reported as worse
 TERMS = {  # tables of [reward]
-    "state": "states, along the way",
-    "terminal": "states, at the end",
+    "state": "states",
+    "terminal": "end",
     "input": "inputs",
-    "input_change": "changes of inputs",
+    "input_change": "input changes",
 }
 
 
@@ -160,9 +158,9 @@ class Findings:
     def plain(self) -> str:
         """The name of the task's model, which contains no adopted effects."""
         changed = any(self.values[name] != value for name, value in self.nominal.items())
-        without = "without adopted effects"
+        without = "without effects"
         if changed:  # the diagnosis's "calibrated" is another: the best one without effects
-            return "model with its present parameters" + f", {without}" * bool(self.effects)
+            return "present model" + f", {without}" * bool(self.effects)
         return f"model {without}" if self.effects else "crude model"
 
     @property
@@ -242,6 +240,8 @@ class Improved:
     unit: str
     before: float
     after: float
+    distance: bool = False  # of several states
+    at_end: bool = False
 
     @property
     def text(self) -> str:
@@ -273,43 +273,52 @@ def improvements_in(findings: Findings) -> list[Improved]:
     short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
     arrives = reaches(task)
-    worse = "; here the best trial is worse than the first, but better in other terms of the reward"
     groups, role = weighed_groups(task), task.model.roles.get("position", ())
     place = {role} if isinstance(role, str) else {*role}
     for (names, what), rate in zip(groups, rates_among(task, groups), strict=True):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
         unit = shown(task.model.states[names[0]])
-        far = FAR if len(names) > 1 else f"{what}, off its target"
+        far = FAR if len(names) > 1 else what
         running, terminal = task.reward.state[states], task.reward.terminal[states]
-        views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
+        views = [(errors, running, False)] * bool(running.any() or not terminal.any())
         if (terminal.any() or arrives) and not short:
             last = [[e[[task.horizon]] for e in own] for own in errors]
-            views.append((last, terminal + arrives * running, f"{AT_END}{far}"))
-        for parts, weights, words in views:
+            views.append((last, terminal + arrives * running, True))
+        for parts, weights, at_end in views:
             missed = [float(np.linalg.norm(rms(part))) for part in parts]
             costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
             before = missed[0] if len(missed) > 1 else float("nan")
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
-            paid = worse * (missed[-1] > WORSE * missed[0])
+            paid = ""
             noise = float(np.linalg.norm(reading_noise([run.trial for run in each], states)))
-            lost = words.startswith(AT_END) and missed[-1] < noise
+            lost = at_end and missed[-1] < noise
             if lost:  # a single sample can't show a smaller error
                 before, missed[-1] = max(before, noise), noise
-                paid = f"; the best is within its noise of {measured_alike([noise], unit)[0]}"
-            elif words.startswith(AT_END):
-                paid = _at_end_told(findings, parts, missed, states, unit) + paid
-            one = Improved(words + note + paid, unit, before, missed[-1])
+                paid = f", noise {measured_alike([noise], unit)[0]}"
+            elif at_end:
+                paid = _at_end_told(findings, parts, missed, states, unit)
+            words = f"{far}, {'end' if at_end else 'rms'}{paid}{note}"
+            several = len(names) > 1
+            one = Improved(words, unit, before, missed[-1], several, at_end)
             found.append((rate, one.is_same, names[0] not in place, -moved, one))
     found.sort(key=lambda each: each[:4])
     least = MOVED * sum(abs(moved) for *_, moved, _ in found)
     large = [one for rate, *_, moved, one in found if not rate or -moved >= least]
     firsts = (
-        next((one for *_, one in found if one.what.startswith(words)), None)
-        for words in (FAR, *(AT_END,) * arrives)
+        next((one for *_, one in found if test(one)), None)
+        for test in (_of_position, *(_of_end,) * arrives)
     )
     asked = [one for one in firsts if one is not None and one not in large[:SHOWN]]
     return [*large[: SHOWN - len(asked)], *asked]  # what was asked for, if it changed or not
+
+
+def _of_position(one: Improved) -> bool:
+    return one.distance and not one.at_end
+
+
+def _of_end(one: Improved) -> bool:
+    return one.at_end
 
 
 def _at_end_told(
@@ -341,7 +350,7 @@ def _at_end_told(
     else:
         told = [f"{error} {by_runs(count)}" for error, count in zip(told, counts, strict=True)]
     same = len(std) > 1 and abs(missed[0] - missed[-1]) < LUCK * math.hypot(std[0], std[-1])
-    return f"; +- {' and '.join(told)}{', which may explain the change' * same}"
+    return f"; +- {' and '.join(told)}{', luck' * same}"
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:

@@ -52,7 +52,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     if findings.logs:
         parts.append(_logs(findings, table))
     if findings.lost:
-        lines = ["left out of this report"]
+        lines = ["left out"]
         for one in findings.lost:
             lines += _wrapped(f"{one.file}: {one.reason}")
         parts.append("\n".join(lines))
@@ -80,7 +80,7 @@ def _head(findings: Findings) -> str:
 def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
     history = findings.history
     if not history:
-        return "utility\n  no candidate was proposed yet"
+        return "utility\n  -"
     shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
     rows = [(*row[:3], *row[4:]) for row in map(findings.standing.row, shown)]  # without damping
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
@@ -91,9 +91,9 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     ]
     if left:
         status = rendered(NextCommand("status"), findings.folder)
-        lines += _wrapped(f"({left} more between them: {status} shows all)")
+        lines += _wrapped(f"({left} more: {status})")
     if spark := bars([t.utility for t in history if t.utilities]):
-        lines += ["", *_wrapped(f"{spark}; by candidate, higher is better")]
+        lines += ["", *_wrapped(spark)]
     first, best = findings.first, findings.best
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
@@ -120,26 +120,22 @@ def _trajectories(findings: Findings, table: Table) -> str:
     rows = by_state(task.model, columns)
     ids = [run.candidate.id for run in runs]
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
-    note = "off: from the desired path; gap: from what the model predicted for that run"
-    title = "trajectories, rms over the run"
-    return "\n".join([title, table(rows, header), *_wrapped(note)])
+    return "\n".join(["trajectories, rms", table(rows, header)])
 
 
 def _biases(findings: Findings, table: Table) -> str:
     task = findings.task
     runs = selection(findings.improvements, ITERATIONS)
     if not runs:
-        return "bias\n  no whole trial yet"
+        return "bias\n  -"
     rows = by_state(task.model, [rms(run.residual) / task.dt for run in runs], per_second)
     header = ("state", "unit", *(run.candidate.id for run in runs))
-    return f"bias: what the {findings.plain} lacks, rms over the run\n" + table(rows, header)
+    return "bias, rms\n" + table(rows, header)
 
 
 def _diagnosis(findings: Findings, table: Table) -> str:
     if findings.diagnosis is None:
-        told = f"not diagnosed yet: {rendered(DIAGNOSE, findings.folder)}"
-        if not (findings.runs or findings.logs):
-            told = "nothing to diagnose yet: no trial and no log of data is stored"
+        told = rendered(DIAGNOSE, findings.folder)
         return "\n".join(["gap to the model", *_wrapped(told)])
     lines = ["gap to the model", *(part for line in findings.lines for part in _wrapped(line))]
     if (said := findings.told) is not None and said.rows:
@@ -153,10 +149,7 @@ def _logs(findings: Findings, table: Table) -> str:
     ahead = findings.ahead_s
     columns = [forecast_error(findings.crude, log.trial, ahead) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = (
-        f"data: rms error of the {findings.plain} {ahead:.3g} s after each restart from the "
-        "measured state, by log, not held out"
-    )
+    title = f"data: rms error {ahead:.3g} s ahead"
     return "\n".join([*wrapped(title, "", "  "), ""]) + table(
         rows, ("state", "unit", *(log.trial.id for log in logs))
     )

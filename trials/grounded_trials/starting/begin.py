@@ -16,11 +16,11 @@ import numpy as np
 
 from grounded.checks import known, refused
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import found
+from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import undeclared_angles
-from grounded.result import Result, listed
+from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import states_time_unit
 from grounded_trials.logs.inspection.assignment import assigned
@@ -33,6 +33,7 @@ from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.logs.log_files import column_units, kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
+from grounded_trials.plain_file import unreadable
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of, too_coarse
@@ -45,7 +46,6 @@ from grounded_trials.starting.kinds import (
 )
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.starting.pushed import with_gain
-from grounded_trials.starting.shapes import has_plane
 from grounded_trials.starting.skeletons import Skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
@@ -55,7 +55,6 @@ from grounded_trials.workspace.user_files.model_file import load_module, model_i
 NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
 NAMED = 5  # most columns named in an error
-TO_COMPLETE = "no input changes a state yet: write your robot's equations into model.py"
 HORIZON = 200  # largest number of steps of a target taken from a recorded run
 Ask = Callable[[Guess], str]
 
@@ -74,7 +73,7 @@ class Begun(Result):
     inputs: tuple[Guess, ...]
     target: str  # description of target.csv
     start: str = ""  # description of [task] start
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     again: tuple[str, ...] = ()  # arguments of `init` once the log's time column is renamed
 
     @property
@@ -125,7 +124,8 @@ class Begun(Result):
             "horizon": self.horizon,
             "signals": signals,
             "target": self.target,
-            "notes": list(self.notes),
+            "notes": [one.sentence for one in self.findings],
+            "findings": [one.to_json() for one in self.findings],
         }
 
 
@@ -186,21 +186,21 @@ def _begin(
     # What the log has, and the model: the user's, or a skeleton of the kind of robot.
     files, report, notes = _usable(log, layout)
     joints, stated = joint_names(report), column_units(files[0])
-    chosen, why = (kind, "as you specified") if kind else kind_in(report, joints)
+    chosen, why = (kind, "--kind") if kind else kind_in(report, joints)
     plain = None if own else skeleton(chosen, report, joints, named, stated)
     if own:
         why = "your model"
     built = own.bring(folder) if own else _model_in(folder, plain)
     matched = assigned(report, built.states, built.inputs, built, joints)
     if plain and not (kind or any(g.path for g in matched[0])):
-        why = f"no number in the log matches a state of kind {chosen}; names are the log's"
+        why = f"none of {chosen}"
         chosen, plain = "generic", skeleton("generic", report, joints, named, stated)
         built = _model_in(folder, plain)
     if chosen == "generic" and not own:
         given = {name: one.path for name, one in moving(report).items()}
         matched = assigned(report, built.states, built.inputs, built, joints, given)
         driven = any(one.value for name, one in built.params.items() if name.startswith("gain_"))
-        notes = (*notes, *_left_out(report, built), *[TO_COMPLETE] * (not driven))
+        notes = (*notes, *_left_out(report, built), *_undriven(built) * (not driven))
 
     # Which number is which signal.
     states, inputs = map(list, matched)
@@ -217,10 +217,8 @@ def _begin(
     odd = perhaps_degrees((*states, *inputs), built, joints)
     inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
     slow = () if layout.rate or states_time_unit(files[0]) else _in_seconds(report)
-    notes = (*notes, *slow, *(odd[g.name].sentence for g in states if g.name in odd))
-    step, whose, note = (
-        (dt, "", too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
-    )
+    notes = (*notes, *slow, *(odd[g.name] for g in states if g.name in odd))
+    step, note = (dt, too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
     built = own.in_step(folder, built, step) if own else built
     if chosen != "drone":  # zero is sent after a run, so the limits must include it
         ranges |= {
@@ -239,7 +237,7 @@ def _begin(
         nonlocal stood
         name, stood = Path(log).name, held_first(built, columns, sent, step, ranges)
         held = stood or {}
-        write_first(folder, built, (step, whose), columns, rows, ranges, table, why, name, held)
+        write_first(folder, built, step, columns, rows, ranges, table, why, name, held)
 
     write({built.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, built, states, step, write)
@@ -253,20 +251,22 @@ def _begin(
         states=tuple(states),
         inputs=tuple(inputs),
         target=target,
-        start=_start(built, stood, states),
-        notes=(*notes, *[note] * bool(note), *more),
+        start=_start(stood),
+        findings=(*notes, *[one for one in (note,) if one], *more),
         again=again if slow else (),
     )
 
 
-def _usable(log: str | Path, layout: Layout) -> tuple[tuple[Path, ...], LogReport, tuple[str, ...]]:
+def _usable(
+    log: str | Path, layout: Layout
+) -> tuple[tuple[Path, ...], LogReport, tuple[Finding, ...]]:
     """Return the files of a log, what is in it, and notes; refuse one that tells no motion."""
     files = log_files(log)
     if kind_of(files[0]):
         raise refused("start.no_start", log, why="own")
     report = inspect_log(log, layout)
     if report.damage:
-        raise refused("start.damaged", why=report.damage, then=NextCommand("recover", (str(log),)))
+        raise unreadable(log, report.damage, then=NextCommand("recover", (str(log),)))
     numbers = [field for field in report.numbers if field.low is not None]
     if not numbers:
         there = [field.path for field in report.numbers]
@@ -276,14 +276,14 @@ def _usable(log: str | Path, layout: Layout) -> tuple[tuple[Path, ...], LogRepor
     return files, *_one_run(report)
 
 
-def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
+def _one_run(report: LogReport) -> tuple[LogReport, tuple[Finding, ...]]:
     """Reduce a file of runs with the same columns to its first run, with a note."""
     runs = [t for t in report.topics if t.type.startswith(("npz", "mat"))]
     columns = {tuple(f.path.removeprefix(t.topic) for f in t.fields) for t in runs}
     same = [t for t in runs if len(t.fields) == max(len(c) for c in columns)] if columns else []
     if len(same) < 2:
         return report, ()
-    note = f"{same[0].topic} of {len(same)} runs is used; [log] may name another"
+    note = found("start.unused", *(t.topic for t in same[1:]))
     return replace(report, topics=(same[0],)), (note,)
 
 
@@ -294,72 +294,50 @@ def _model_in(folder: Path, plain: Skeleton | None) -> Model:
     return model_in(load_module(folder, "model.py"))
 
 
-def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
+def _left_out(report: LogReport, model: Model) -> tuple[Finding, ...]:
     """Return notes on the numbers that a generic skeleton leaves out, and on missing inputs."""
     left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
-    found = [f"left out of model.py: {', '.join(reversed(left))}"] * bool(left)
+    odd = [found("start.unused", *reversed(left))] * bool(left)
     if not set(model.inputs) & set(moving(report)):
-        last = next(iter(moving(report)), "A")
-        found.append(
-            "no number looks like a command: create the workspace again in another folder and name "
-            f"the inputs, such as --inputs {last}"
-        )
-    return tuple(found)
+        odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
+    return tuple(odd)
+
+
+def _undriven(model: Model) -> tuple[Finding, ...]:
+    """Return that no input changes a state of a skeleton yet."""
+    return (found("plan.without_effect", *model.input_names, file="model.py"),)
 
 
 def _on_own(
     report: LogReport, states: Sequence[Guess], inputs: Sequence[Guess], model: Model
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """Return notes on what the user's own model and the log lack of each other."""
     without = getattr(model.step, "without", ())
-    unmoved = [found("start.unmoved", *without).sentence] * bool(without)
+    unmoved = [found("start.unmoved", *without)] * bool(without)
     unused = _unused(report, (*states, *inputs))
-    return (*unused, *_unmeasured(states, model), *_turning(model), *unmoved)
+    return (*unused, *_turning(model), *unmoved)
 
 
-def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[str, ...]:
+def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[Finding, ...]:
     """Return a note that names the changing numbers of which the model uses none."""
     used = {guess.path for guess in guesses}
     left = [f.path for f in reversed(moving(report).values()) if f.path not in used]
     left = [path for path in left if not PARTS.search(path)]
-    more = f" and {len(left) - NAMED} more" * (len(left) > NAMED)
-    named = f"{', '.join(left[:NAMED])}{more}" if more else listed(left)
-    return (f"not used of the log: {named}",) * bool(left)
+    more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
+    return (found("start.unused", *left[:NAMED], *more),) * bool(left)
 
 
-def _unmeasured(states: Sequence[Guess], model: Model) -> tuple[str, ...]:
-    """Return a note on what estimates the rates of a log in which no state was found."""
-    pairs = {q: w for q, w in velocities(model).items() if q not in velocities(model).values()}
-    if not pairs or any(guess.path for guess in states):
-        return ()
-    return (
-        f"the log need not hold {listed(pairs.values())}: once {listed(pairs)} "
-        f"{'have paths' if len(pairs) > 1 else 'has a path'} in [log], use [estimate] in "
-        "grounded.toml, and the smoother finds the rest",
-    )
-
-
-def _turning(model: Model) -> tuple[str, ...]:
+def _turning(model: Model) -> tuple[Finding, ...]:
     """Return a note on states that are angles by the model's equations, but not declared so."""
     if not (names := undeclared_angles(model)):
         return ()
-    declared = ", ".join(f'"{name}"' for name in (*model.angles, *names))
-    are = "is an angle" if len(names) == 1 else "are angles"
-    return (
-        f"{listed(names)} {are} by the model's equations: declare angles=({declared},) in "
-        "model.py, or a log that wraps at pi shows a jump of 6.28 rad",
-    )
+    return (found("start.angles", *names, declared=(*model.angles, *names)),)
 
 
-def _in_seconds(report: LogReport) -> tuple[str, ...]:
+def _in_seconds(report: LogReport) -> tuple[Finding, ...]:
     """Return a note for each table whose times seem to be in another unit than seconds."""
     slow = [t for t in report.topics if t.topic == "/csv" and 0 < t.rate_hz < SLOWEST]
-    return tuple(
-        f"read as seconds, the rows are {1 / t.rate_hz:.3g} s apart: are the times in ms or us? "
-        "If so, end that column's name with _ms or _us, and create the workspace again in another "
-        "folder; if they are in seconds, `ingest` the log"
-        for t in slow
-    )
+    return tuple(found("start.interval", t.topic, apart=1 / t.rate_hz) for t in slow)
 
 
 def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str, str]) -> Guess:
@@ -371,25 +349,14 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
         return replace(guess, sure=bool(path))
     field = next((one for one in report.numbers if one.path == path), None)
     scale = Stated.by(report.files).factor(path, units[guess.name]) if path else 1.0
-    why = (found("start.asked", guess.name),)
+    why = (found("start.given", guess.name, asked=True),)
     clock = next((report.clock(t) for t in report.topics if field in t.fields), "log")
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)
 
 
-def _start(model: Model, stood: Mapping[str, float] | None, states: Sequence[Guess]) -> str:
-    """Say what [task] start holds, or why it is empty and what to enter."""
-    if stood:
-        told = ", ".join(f"{name} = {value:.4g}" for name, value in stood.items())
-        return f"{told}, where it stood in the log's first rows"
-    if has_plane(model):
-        return "empty: a run begins where the target does"
-    if stood is not None:
-        return "empty, that is 0, where it stood in the log's first rows"
-    lost = [guess.name for guess in states if not guess.path]
-    why = f"no rest is seen without {listed(lost)} in the log" if lost else "the log shows no rest"
-    if not lost and not any(unit.endswith("/s") for unit in model.states.values()):
-        why = "whether it rested in the log is not known while no state is a speed by its unit"
-    return f"empty, {why}: enter where a run begins in [task] start"
+def _start(stood: Mapping[str, float] | None) -> str:
+    """Say what [task] start holds."""
+    return ", ".join(f"{name} = {value:.4g}" for name, value in (stood or {}).items()) or "empty"
 
 
 def _recorded(
@@ -399,7 +366,7 @@ def _recorded(
     states: Sequence[Guess],
     dt: float,
     write: Callable[..., None],
-) -> tuple[str, int, tuple[str, ...]]:
+) -> tuple[str, int, tuple[Finding, ...]]:
     """Write target.csv from the run in the log, or a placeholder if that can't be sampled.
 
     The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again.
@@ -412,7 +379,7 @@ def _recorded(
     try:
         if mapping is None or not measured:
             raise refused("given.no_input", "the log", what="state")
-        found = read_log(
+        grid = read_log(
             files,
             mapping,
             dt,
@@ -424,8 +391,8 @@ def _recorded(
         )
     except GroundedError as error:
         write({model.state_names[0]: np.zeros(HORIZON + 1)}, HORIZON)
-        return "zeros, to be replaced", HORIZON, (f"the run can't be sampled yet: {error}",)
-    columns = dict(zip(measured, found.states.T, strict=True))
-    horizon = len(found.states) - 1
-    write(columns, horizon, dict(zip(mapping.inputs, found.inputs.T, strict=True)))
-    return f"the run in the log, its first {horizon * dt:.3g} s", horizon, found.warnings
+        return "zeros", HORIZON, (error.finding.weighing(Weight.NOTE),)
+    columns = dict(zip(measured, grid.states.T, strict=True))
+    horizon = len(grid.states) - 1
+    write(columns, horizon, dict(zip(mapping.inputs, grid.inputs.T, strict=True)))
+    return f"{horizon * dt:.3g} s of the log", horizon, grid.findings

@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.checks import refused, unknown
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found, settle
+from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import velocities
@@ -271,7 +271,7 @@ def _columns(workspace: Folder, asked: Manoeuvre, start: Mapping[str, float]) ->
     if shape == "swing-up":
         return swing_up(model, dt, long, asked.to, start)
     if asked.seconds is not None:
-        raise GroundedError(found("target.seconds", shape))
+        raise GroundedError(found("given.either", "--seconds", shape, how="one"))
     if asked.is_path:
         return path_target(shape, asked.drive, model, dt, asked.to, start)
     return recorded_run(workspace, shape, SHAPES)
@@ -298,7 +298,7 @@ def _in_degrees(case: _Case) -> Iterator[Finding]:
     for name, value in case.asked.to.items():
         if case.units.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
             turns = abs(value) / (2 * math.pi)
-            yield found("target.degrees", name, value=value, turns=turns, rad=math.radians(value))
+            yield found("start.degrees", name, turns=turns, to=f"{math.radians(value):.4g}")
 
 
 def _weighed_without_column(case: _Case) -> Iterator[Finding]:
@@ -308,15 +308,13 @@ def _weighed_without_column(case: _Case) -> Iterator[Finding]:
         rates = velocities(case.workspace.base_model) if case.line else ()
         to = " ".join(f"--to {name}={'0' if name in rates else 'VALUE'}" for name in about)
         path = case.asked.is_path and not case.asked.to
-        yield found("target.weighed", *about, to=None if path else to)
+        yield found("given.unweighed", *about, to=None if path else to, weight=Weight.WARN)
 
 
 def _rest(case: _Case) -> Iterator[Finding]:
     if case.line is not None and case.rests is None:
         ends = {name: column[-1] + 0.0 for name, column in case.line.columns.items()}
         yield found("target.may_rest", *(f"{name} = {end:.3g}" for name, end in ends.items()))
-    elif case.asked.rest and case.rests is None:
-        yield found("target.complete")
 
 
 def _replaced(case: _Case) -> Iterator[Finding]:

@@ -198,6 +198,38 @@ def _source(module: ModuleType) -> str:
 SIMULATED = 'model = "real.py"             # robot: command = "python drive.py {candidate} {trial}"'
 
 
+TASK = """# {name}
+
+[model]
+file = "model.py"             # the crude model
+smoothing = {smoothing}              # width over which planning smooths np.where, abs ...
+
+[task]
+dt = {dt}                     # [s] control interval
+horizon = {horizon}                 # steps
+target = "target.csv"         # states without a column are free
+start = {start}
+feedback = {feedback}               # false: open loop
+latency = {latency}
+
+[reward]                      # quadratic weights; utility = -sum
+{weights}
+
+[limits]                      # hard limits of the real inputs
+{limits}
+
+[search]
+method = "ddp"                # or "policy-gradient"
+step = "damped"               # as in the paper: "full", and match_inputs = false
+repeats = 1                   # trials per candidate, averaged
+rerun_incumbent = true        # repeat the best candidate after a loss within the noise
+max_trials = 40
+
+[system]                      # how `grounded run` reaches the real system
+{system}
+"""
+
+
 def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = False) -> str:
     """Return the grounded.toml of a task, with comments.
 
@@ -226,42 +258,20 @@ def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = 
         for i, low, high in zip(inputs, task.low, task.high, strict=True)
         if np.isfinite(low) and np.isfinite(high)
     ]
-    lines = [
-        f"# {name}: {EXAMPLES[name].text}" if name in EXAMPLES else f"# {name}",
-        "",
-        "[model]",
-        'file = "model.py"             # the crude model'
-        + ", plain NumPy" * (task.model.step is None),
-        f"smoothing = {_number(task.smoothing)}              # width over which planning smooths "
-        "np.where, abs ...",
-        "",
-        "[task]",
-        f"dt = {_number(task.dt)}                     # [s] control interval",
-        f"horizon = {task.horizon}                 # steps",
-        'target = "target.csv"         # states without a column are free',
-        f"start = {_table(start)}",
-        f"feedback = {'true' if task.feedback else 'false'}               # false: open loop",
-        f"latency = {_table(latency)}",
-        "",
-        "[reward]                      # quadratic weights; utility = -sum",
-        *(f"{k} = {_table({n: w for n, w in v.items() if w})}" for k, v in weights.items()),
-        "",
-        "[limits]                      # hard limits of the real inputs",
-        *limits,
-        "",
-        "[search]",
-        'method = "ddp"                # or "policy-gradient"',
-        'step = "damped"               # as in the paper: "full", and match_inputs = false',
-        "repeats = 1                   # trials per candidate, averaged",
-        "rerun_incumbent = true        # repeat the best candidate after a loss within the noise",
-        "max_trials = 40",
-        "",
-        "[system]                      # how `grounded run` reaches the real system",
-        system,
-        *["seed = 0"] * (system == SIMULATED),
-        "",
-    ]
-    return "\n".join(lines)
+    return TASK.format(
+        name=f"{name}: {EXAMPLES[name].text}" if name in EXAMPLES else name,
+        smoothing=_number(task.smoothing),
+        dt=_number(task.dt),
+        horizon=task.horizon,
+        start=_table(start),
+        feedback="true" if task.feedback else "false",
+        latency=_table(latency),
+        weights="\n".join(
+            f"{k} = {_table({n: w for n, w in v.items() if w})}" for k, v in weights.items()
+        ),
+        limits="\n".join(limits),
+        system=system + "\nseed = 0" * (system == SIMULATED),
+    )
 
 
 def _number(value: float) -> str:

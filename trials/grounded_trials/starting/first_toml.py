@@ -22,10 +22,51 @@ from grounded_trials.workspace.user_files.task_file import change_weight, write_
 BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
 
 
+FIRST = """# made from a log by `grounded init --from` ({why})
+
+[model]
+file = "model.py"             # the crude model
+
+[task]
+dt = {dt}                     # [s] control interval
+horizon = {horizon}                 # steps
+target = "target.csv"         # `grounded target` draws another; no column: free
+start = {start}
+feedback = true               # false: open loop
+latency = {{ }}                 # [s] transport delay of inputs, unless `diagnose` finds it
+
+[reward]                      # quadratic weights: 1 / (range in the target, at least
+                              # 0.1)^2, for coordinates of a position the smaller range
+                              # (at least a fifth of the larger), a tenth of it for a
+                              # velocity beside its position; a constant column uses the
+                              # largest range of its unit, else 1. `target` updates them
+                              # until you change one
+state = {state}
+# terminal: weights of the last step only. If the run must END at rest on its target
+# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds
+# terminal = {terminal}
+# input_change: weights of (a_t - a_{{t-1}})^2; larger ones make inputs smoother. Until
+# you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether
+# you did, it compares them with the next line: leave that one as it is
+# input_change = {changes}
+input_change = {changes}
+
+[limits]
+{limits}
+
+[search]
+max_trials = 40
+
+{table}
+"""
+SEEN = """# SEEN in the log, 0 included: enter those of your robot, then delete these two lines
+seen_in = {log}"""
+
+
 def write_first(
     folder: Path,
     model: Model,
-    grid: tuple[float, str],
+    dt: float,
     columns: Mapping[str, Array],
     horizon: int,
     ranges: Mapping[str, tuple[float, float] | None],
@@ -39,7 +80,7 @@ def write_first(
     Args:
         folder: the workspace.
         model: its crude model.
-        grid: control interval [s], and the end of its comment.
+        dt: control interval [s].
         columns: columns of the target, by state.
         horizon: number of steps.
         ranges: lowest and highest value of each signal in the log, in the model's unit.
@@ -49,7 +90,6 @@ def write_first(
         held: states in which the robot stood at the start of the log, and the inputs that held it
             there; may be {}.
     """
-    dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = usual_weights(model, columns)
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
@@ -60,53 +100,19 @@ def write_first(
         for name in model.input_names
         if (found := ranges[name]) is not None and found[0] < found[1]
     ]
-    lines = [
-        f"# made from a log by `grounded init --from` ({why})",
-        "",
-        "[model]",
-        'file = "model.py"             # the crude model' + ", plain NumPy" * (model.step is None),
-        "",
-        "[task]",
-        f"dt = {dt:g}                     # [s] control interval{whose}",
-        f"horizon = {horizon}                 # steps",
-        'target = "target.csv"         # `grounded target` draws another; no column: free',
-        f"start = {_inline(held) if held else '{ }'}"
-        + "  # where it stood in the log's first rows" * bool(held)
-        + ", and the inputs that held it" * bool({*held} & {*model.inputs}),
-        "feedback = true               # false: open loop",
-        "latency = { }                 # [s] transport delay of inputs, unless `diagnose` finds it",
-        "",
-        "[reward]                      # quadratic weights: 1 / (range in the target, at least",
-        "                              # 0.1)^2, for coordinates of a position the smaller range",
-        "                              # (at least a fifth of the larger), a tenth of it for a",
-        "                              # velocity beside its position; a constant column uses the",
-        "                              # largest range of its unit, else 1. `target` updates them",
-        "                              # until you change one",
-        f"state = {_inline(weights)}",
-        "# terminal: weights of the last step only. If the run must END at rest on its target",
-        "# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds",
-        f"# terminal = {_inline({name: OFFERED * weight for name, weight in weights.items()})}",
-        "# input_change: weights of (a_t - a_{t-1})^2; larger ones make inputs smoother. Until",
-        "# you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether",
-        "# you did, it compares them with the next line: leave that one as it is",
-        f"# input_change = {_inline(changes)}",
-        f"input_change = {_inline(changes)}",
-        "",
-        "[limits]" + "                      # enter the limits of your robot" * (not limits),
-        *limits,
-        *[
-            "# SEEN in the log, 0 included: enter those of your robot, then delete these two lines",
-            f"seen_in = {json.dumps(log, ensure_ascii=False)}",
-        ]
-        * bool(limits),
-        "",
-        "[search]",
-        "max_trials = 40",
-        "",
-        table.rstrip(),
-        "",
-    ]
-    write_atomically(folder / FILE, "\n".join(lines).encode())
+    seen = SEEN.format(log=json.dumps(log, ensure_ascii=False)) if limits else ""
+    text = FIRST.format(
+        why=why,
+        dt=f"{dt:g}",
+        horizon=horizon,
+        start=_inline(held) if held else "{ }",
+        state=_inline(weights),
+        terminal=_inline({name: OFFERED * weight for name, weight in weights.items()}),
+        changes=_inline(changes),
+        limits="\n".join((*limits, seen)) if limits else "# those of your robot",
+        table=table.rstrip(),
+    )
+    write_atomically(folder / FILE, text.encode())
 
 
 def held_first(

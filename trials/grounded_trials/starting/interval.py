@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
@@ -38,7 +39,7 @@ EXACT, LOOSE = 0.1, 0.25  # tolerance of a multiple, as a fraction of the interv
 
 def interval_of(
     report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
-) -> tuple[float, str, str]:
+) -> tuple[float, Finding | None]:
     """Estimate the control interval of a log.
 
     Args:
@@ -47,11 +48,10 @@ def interval_of(
         states: the paths of its states.
 
     Returns:
-        The interval [s], its origin as the end of a comment, and a note if it differs from the
-        interval of the rows.
+        The interval [s], and a note if it differs from that of the rows.
     """
     inputs = _commanded(inputs)
-    for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
+    for guesses in (inputs, states):
         rates = [
             t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
         ]
@@ -60,13 +60,9 @@ def interval_of(
         rows = 1 / min(rates)
         held = _held(report, inputs, rows) if guesses is inputs else None
         if held is not None:
-            note = (
-                f"the log has a command every {rows:.3g} s, but commands change every {held:g} s: "
-                "dt is set to that; --dt overrides it"
-            )
-            return held, ": that in which the log's commands change", note
-        return round_interval(rows), f": that of the {whose}", ""
-    return GUESSED, ": a guess, no input or state was found", ""
+            return held, found("start.interval", every=held, dt=held, rows=rows)
+        return round_interval(rows), None
+    return GUESSED, None
 
 
 def round_interval(rows: float) -> float:
@@ -84,8 +80,8 @@ def round_interval(rows: float) -> float:
     return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
 
 
-def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> str:
-    """Return a note if the commands of a log change more than once in a given interval; or "".
+def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> Finding | None:
+    """Return a note if the commands of a log change more than once in a given interval.
 
     Args:
         report: the log.
@@ -94,13 +90,8 @@ def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> str:
     """
     gaps = _gaps(report, _commanded(inputs))
     if len(gaps) < ENOUGH or dt < APART * (apart := float(np.median(gaps))):
-        return ""
-    usual = round_interval(apart)
-    return (
-        f"the log's commands change every {1e3 * usual:.3g} ms: with dt = {1e3 * dt:.3g} ms each "
-        f"step keeps one in {dt / usual:.2g} of them, the one at its middle. --dt {usual:g} keeps "
-        "them all"
-    )
+        return None
+    return found("start.interval", every=round_interval(apart), dt=dt)
 
 
 def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:

@@ -217,50 +217,44 @@ KINDS = (
 
 
 def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
-    """Return the kind of robot that a log was probably recorded on, and the reason."""
+    """Return the kind of robot that a log was probably recorded on, and the names that show it."""
     steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
     if steered is not None:
-        return "car", f"{steered} holds Ackermann commands"
+        return "car", steered
     if hung := _hung(log, joints):
         return "crane", hung
     if joints := _turning(of_arms(at_joints(joints))):
         where, names = next(iter(joints.items()))
         kind = "arm" if len(names) > 1 else "pendulum"
-        return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
+        return kind, f"{where}: {', '.join(names[:6])}"
     flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
     if flying is not None:
-        return "drone", f"{flying} is named like a drone"
+        return "drone", flying
     both = _both_sides(log)
     afloat = [t for t in log.topics if AFLOAT.search(t.topic.lower())]
     pairs = both or next(filter(None, map(_two_unnamed, afloat)), ())
     if afloat and pairs and (both or _headed(log)):
-        named = f"{afloat[0].topic} is named like a boat's"
-        return "boat", f"{named}, and there are the commands {' and '.join(pairs)}, and a heading"
-    for wanted, kind, what in (
-        (("steer",), "car", "has a steering signal"),
-        (
-            ("thrust(?!er)", "attitude_setpoint", "actuator_outputs"),
-            "drone",
-            "has a drone's commands",
-        ),
-        (("cmd_vel",), "rover", "holds velocity commands"),
+        return "boat", ", ".join((afloat[0].topic, *pairs))
+    for wanted, kind in (
+        (("steer",), "car"),
+        (("thrust(?!er)", "attitude_setpoint", "actuator_outputs"), "drone"),
+        (("cmd_vel",), "rover"),
     ):
         for topic in log.topics:
             if _says(topic, wanted):
-                return kind, f"{topic.topic} {what}"
+                return kind, topic.topic
     words = {_word(one.path).lower() for one in log.numbers}
     if both:
-        return "differential", f"it has the commands {' and '.join(both)}, and a heading"
+        return "differential", ", ".join(both)
     if sent := _speed_and_turn(log):
-        return "rover", f"it has the commands {' and '.join(sent)}, and a heading"
+        return "rover", ", ".join(sent)
     if command := _balancing(log):
-        return "balance", f"it has a pitch, a position or speed, and one command, {command}"
+        return "balance", command
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
-        return "pendulum", "the log has an angle and a torque"
+        return "pendulum", ", ".join(sorted(words))
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
-        return "rover", f"{flat} moves in a plane, and there is no steering signal"
-    known = ", ".join(KINDS[:-1])
-    return "generic", f"the kind of robot is unknown, --kind sets it ({known}); names are the log's"
+        return "rover", flat
+    return "generic", "--kind names another"
 
 
 def of_arms(joints: Joints) -> Joints:
@@ -286,11 +280,11 @@ def _hung(log: LogReport, joints: Joints) -> str:
     (topic, names), found = own[0], moving(log)
     slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
     if len(others) == 1:
-        return f"{topic} has the sliding joint '{slide}', and '{others[0]}'"
+        return f"{topic}: {slide}, {others[0]}"
     angles = [n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path)]
     if others or not angles:
         return ""
-    return f"{topic} has the sliding joint '{slide}', and {found[angles[0]].path} is an angle"
+    return f"{topic}: {slide}, {found[angles[0]].path}"
 
 
 def _crane(log: LogReport, units: Units) -> Skeleton:

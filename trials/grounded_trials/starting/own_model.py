@@ -15,9 +15,10 @@ from pathlib import Path
 
 from grounded.adapters import mujoco
 from grounded.adapters.beside import beside, recorded
+from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.model import Model
-from grounded.result import listed
+from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
@@ -64,12 +65,7 @@ class OwnModel:
         try:
             return model_in(load_module(folder, FILE))
         except GroundedError as error:
-            far = f" ({listed(map(str, self.outside))})" if self.outside else ""
-            raise GroundedError(
-                f"{self.file} loads from its own folder, but its copy in {folder} does not: "
-                f"{error}. Create {folder} yourself, copy {self.file.name} there as {FILE}, and "
-                f"the files that it reads{far} too, then give --model {folder / FILE}"
-            ) from None
+            raise unreadable(folder / FILE, error, outside=tuple(map(str, self.outside))) from None
 
     def in_step(self, folder: Path, model: Model, dt: float) -> Model:
         """Return a simulated model whose timestep divides dt, which model.py then states."""
@@ -91,10 +87,7 @@ def own_model(file: str | Path) -> OwnModel:
     """
     file = Path(file)
     if not file.is_file():
-        raise GroundedError(
-            f"{file} does not exist: --model names a Python file with `model`, or an MJCF or URDF "
-            "file"
-        )
+        raise refused("file.missing", file, where="--model")
     folder = file.resolve().parent
     with recorded() as read, beside(folder):
         if simulated := file.suffix.lower() in SIMULATED:
@@ -109,7 +102,7 @@ def own_model(file: str | Path) -> OwnModel:
     try:
         return OwnModel(file, model, file.read_bytes(), others, outside)
     except OSError as error:
-        raise GroundedError(f"{file} can't be read: {error.strerror}") from None
+        raise unreadable(file, error) from None
 
 
 def _loads(model: Model, file: Path, name: str) -> str:

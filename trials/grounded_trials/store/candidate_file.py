@@ -194,4 +194,4 @@ def _policy_table(policy: Policy) -> dict[str, Any]:
 
 def _refuse_faulty(policy: Policy, name: str = "candidate") -> None:
     if wrong := fault(policy):
-        raise refused("plan.unsafe", name, why=wrong)
+        raise refused("plan.refused", name, why=wrong)

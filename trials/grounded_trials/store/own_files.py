@@ -254,7 +254,8 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "record", "its end", "no checksum")
     if meta is None or meta.get("format") != kind:
-        raise refused("file.not_own", name, kind=kind, has=meta and meta.get("format"))
+        has = str(meta and meta.get("format"))
+        raise unreadable(name, f"format {has}", kind=f"{kind} file")
     types = {c.topic: _type(c, schemas, name) for c in channels.values()}
     return OwnFile(name, source, meta, attachments, types, messages)
 

@@ -285,7 +285,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         GroundedError: if it can't be written.
     """
     if path.is_dir():
-        raise refused("file.folder", path)
+        raise unwritable(path, "folder")
     # not named by process id: processes in two containers may have the same id
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:

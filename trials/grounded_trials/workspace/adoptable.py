@@ -52,7 +52,8 @@ def check_adoptable(
             raise unknown("effect", name, family[:1] or known, "the last diagnosis")
         if name in in_log:
             _, _, state = name.partition(":")
-            raise refused("model.delayed_twice", name, state=state, delay=f"{in_log[name]:g}")
+            keys = (f"[log.state.{state}] delay_s = {in_log[name]:g}",)
+            raise refused("plan.delay_twice", keys=keys, effects=(name,))
         if name in adopted:
             raise refused("model.not_adoptable", name, why="adopted")
 

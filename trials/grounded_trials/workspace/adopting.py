@@ -111,7 +111,8 @@ class Undone(Result):
     def to_json(self) -> dict[str, Any]:
         """Return the document of `adopt --undo --json`."""
         effects = [dict(effect) for effect in self.effects]
-        return {"undone": list(self.undone), "effects": effects, "params": dict(self.params)}
+        params = dict(self.params)
+        return {"undone": [*self.undone], "effects": effects, "params": params, "findings": []}
 
 
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
@@ -212,23 +213,23 @@ def _told(
         if family == "sensor_bias":
             b = effect["b"]
             bias, way = Quantity(abs(b), units[state]), "low" if b < 0 else "high"
-            yield found_("model.biased", state, state=state, bias=bias, way=way, offset=-b)
+            yield found_("model.readings", state, bias=bias, way=way, offset=-b)
         elif family == "sensor_scale":
             k = effect["k"]
             way = "low" if k < 0 else "high"
-            yield found_("model.scaled", state, state=state, by=abs(k), way=way)
+            yield found_("model.readings", state, by=abs(k), way=way)
         else:
-            yield found_("model.late", *state.split("+"), age=effect["d"])
+            yield found_("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
     if done.along:
         yield found_("model.along", *done.along)
     if not done.claimed:
-        yield found_("model.unclaimed", effect=asked[0])
+        yield found_("model.beside", asked[0])
     if done.beside:
         yield found_("model.beside", *done.beside)
     for one in done.left.values():
         ends = (Quantity(value, one.unit) for value in (one.kept, one.value))
         kept, value = ends
-        yield found_("model.kept", one.called, name=one.called, kept=kept, value=value)
+        yield found_("model.not_told", one.called, kept=kept, value=value)
     if stopped := [name for name, e in known.items() if e.stopped]:
         yield found_("model.at_bound", *stopped)
     if done.logged:
@@ -387,7 +388,7 @@ def undo_adoption(workspace: Folder) -> Undone:
     file, model = workspace.config.file, workspace.config.model
     if not kept:
         has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
-        raise refused("model.no_adoption", file, effects=has)
+        raise refused("model.edited", file, effects=has)
     *earlier, last = kept
     names, before = [str(name) for name in last["names"]], last["before"]
     if _written(model) != last["after"]:

@@ -14,7 +14,7 @@ from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import NEXT, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity
+from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
 from grounded.share import Share
 from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
@@ -109,7 +109,7 @@ def diagnose_in(
         if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
         why = str(error) or type(error).__name__
-        identity, step = "", finding("gap.probe_failed", why=why)
+        identity, step = "", finding("gap.no_probe", why=why)
     if step is not None and step.code.startswith(NEXT):
         found = found.asking(step, identity)
     elif step is not None:  # why there is no probe
@@ -146,13 +146,13 @@ def _with_next(
         found = found.asking(finding("gap.next.fix", *wrong), identity)
     left = len(diagnosable(workspace)) - len(made_from(found).trials)
     if unasked := found.no_cause and left > 0 and whole:
-        found = found.asking(finding("gap.next.use", stored=left))
+        found = found.asking(finding("gap.next.record", stored=left))
     write_diagnosis(workspace.reports, found)  # again, now with the next step
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and left_open(found):
         best = candidate_named(workspace, "best")
-        found = found.asking(finding("gap.next.ended", candidate=best), identity)
+        found = found.asking(finding("gap.next.none", candidate=best), identity)
     return replace(found, then=then)
 
 
@@ -160,8 +160,8 @@ def _not_compared(workspace: Folder) -> Iterator[Finding]:
     """Yield a finding for each adopted effect that tied with others when it was adopted."""
     same = equivalent_when_adopted(workspace)
     for name, others in tied_when_adopted(workspace).items():
-        code = "gap.equivalent" if name in same else "gap.not_compared"
-        yield finding(code, name, effect=name, others=others)
+        code = "gap.equivalent" if name in same else "gap.tie"
+        yield finding(code, name, effect=name, others=others, weight=Weight.NOTE)
 
 
 def _declared(task: Task, found: Diagnosis) -> Iterator[Finding]:
@@ -239,7 +239,7 @@ def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     return unheld(workspace.planner.task.model, chosen(workspace, trials).trials)
 
 
-def unwritten_in(workspace: Folder) -> list[str]:
+def unwritten_in(workspace: Folder) -> list[Finding]:
     """Return a note if model.py still has what `init` wrote for a robot of unknown kind."""
     file = workspace.config.model.file
     gains = [p.value for name, p in workspace.base_model.params.items() if name.startswith("gain_")]
@@ -247,11 +247,7 @@ def unwritten_in(workspace: Folder) -> list[str]:
         return []
     if PLACEHOLDER not in (workspace.folder / file).read_text(encoding="utf-8"):
         return []
-    return [
-        f"{file} has what `init` wrote for a robot of unknown kind, where no input changes a "
-        "state: what is found stands in for your robot's equations. Write these first, and "
-        "diagnose again"
-    ]
+    return [finding("plan.without_effect", *workspace.base_model.input_names, file=file)]
 
 
 def _probe(
@@ -274,7 +270,7 @@ def _probe(
     best = now.incumbent
     ties = {*found.indistinguishable} - {*found.equivalent}
     if best is None:
-        return "", finding("gap.probe_no_run") if write else None
+        return "", finding("gap.no_probe", which="run") if write else None
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
@@ -297,7 +293,7 @@ def _probe(
             saved = workspace.save_probe(candidate)
             facts = {**made.step.facts, "candidate": saved.id}
             return saved.id, replace(made.step, facts=facts)
-    return "", finding("gap.probe_unsafe") if offer else None
+    return "", finding("gap.no_probe", which="unsafe") if offer else None
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:

@@ -41,7 +41,7 @@ class SetAside(Result):
     def to_json(self) -> dict[str, Any]:
         """Return the document of `discard --json` and `restore --json`."""
         named = {"trials": list(self.trials), "unchanged": list(self.unchanged)}
-        return named | {"discarded": self.discarded}
+        return named | {"discarded": self.discarded, "findings": []}
 
 
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:

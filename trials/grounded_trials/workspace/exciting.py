@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.checks import wrong
 from grounded.diagnosis.design import Drive, design, uncertain
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.search.scatter import sensor_noise
@@ -93,9 +94,7 @@ def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
     for length in lengths:
         steps = round(length / task.dt)
         if not 2 <= steps <= MAX_HORIZON:
-            raise GroundedError(
-                found("plan.drive_length", most=MAX_HORIZON, dt=Quantity(task.dt, "s"))
-            )
+            raise wrong("--seconds", length, low=2 * task.dt, high=MAX_HORIZON * task.dt)
         made = design(task, steps, noise, hidden)
         if made is None or (drive is not None and len(made.weak) == len(drive.weak)):
             break  # what stays in [safety] for 5 s may not for 10 s, and some only act together
@@ -122,10 +121,10 @@ def _bounded(workspace: Folder) -> Task:
     """Return the task at rest, its states bounded by [safety] or by where logs have been."""
     planner, task = workspace.planner, workspace.planner.plan
     if not uncertain(task):
-        raise GroundedError(found("plan.nothing_uncertain", file=workspace.config.model.file))
+        raise GroundedError(found("given.constant", str(workspace.config.model.file)))
     ends = zip(task.model.input_names, task.low, task.high, strict=True)
     if free := [name for name, *both in ends if not np.isfinite(both).all()]:
-        raise GroundedError(found("plan.drive_unlimited", *free))
+        raise GroundedError(found("plan.no_limits", *free, weight=Weight.REFUSE))
     trials = [one for one in workspace.task_trials() if one.steps > 1]
     if trials:
         task = near(planner, trials)

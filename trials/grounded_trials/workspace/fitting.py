@@ -49,11 +49,9 @@ class Fitted(Result):
         """What to know of the fit, the heaviest first."""
         told = list(self.fit.findings)
         if self.not_fitted:
-            told.append(finding("model.delay_kept", *self.not_fitted))
+            told.append(finding("model.times", *self.not_fitted))
         if self.rows_s or self.interpolated_s:
             told.append(finding("model.times", rows=self.rows_s, early=self.interpolated_s))
-        if self.fit.helps and not self.applied:
-            told.append(finding("model.stands_in"))
         return settle(told)
 
     def summary(self) -> str:

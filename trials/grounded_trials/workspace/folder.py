@@ -101,7 +101,7 @@ class Folder:
         for name in ("trials", "candidates", "runs", "reports"):
             place = self.folder / name
             if place.is_symlink() and not place.resolve().is_relative_to(self.folder.resolve()):
-                raise refused("file.special", place, what="link", to=str(place.resolve()))
+                raise unreadable(place, f"link to {place.resolve()}")
         return read_config(self.folder)
 
     @cached_property

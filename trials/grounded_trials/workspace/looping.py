@@ -46,6 +46,7 @@ class NextRun(Result):
             "propose": None if self.proposed is None else self.proposed.to_json(),
             "export": None if self.exported is None else self.exported.to_json(),
             "removed": [str(path) for path in self.removed],
+            "findings": [one.to_json() for one in self.taken.findings],
         }
 
 

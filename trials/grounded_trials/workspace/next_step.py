@@ -200,7 +200,7 @@ def outlook(now: Standing, then: NextCommand) -> Standing:
     """Return the standing; of a search that has ended, also that the model may change."""
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT)
     if then.verb == "fit" or (then.verb == "adopt" and not goes_on):
-        return now.with_finding(found(f"search.{then.verb}_first", then=then))
+        return now.with_finding(found("search.adopt_first", then=then, fit=then.verb == "fit"))
     return now
 
 

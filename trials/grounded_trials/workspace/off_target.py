@@ -86,10 +86,6 @@ class OffTarget(Document):
             told |= {"also": int("rms" in told)}
         return found("run.off_target", self.what, **told)
 
-    def summary(self) -> str:
-        """Return the errors in words."""
-        return self.finding.what
-
 
 def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     """Return how far the runs of one candidate are off the target, the position first.

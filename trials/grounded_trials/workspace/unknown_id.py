@@ -80,7 +80,9 @@ def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str])
     stored = {one.id for one in workspace.store.list()} - {*workspace.discarded()}
     for name in given:
         if name.lower() in stored.difference(usable):
-            raise refused("search.unusable", name.lower(), usable=ranges(usable))
+            raise refused(
+                "search.unknown", name.lower(), kind="trial", unusable=True, known=ranges(usable)
+            )
         if name.lower() not in usable:
             raise unknown_trial(workspace, name)
     return tuple(name.lower() for name in given)
@@ -100,4 +102,4 @@ def refuse_ids(workspace: Folder, log: str | Path, verb: str) -> None:
     paths = {one.id: str(one.path) for one in workspace.store.list()}
     if given in paths or given in workspace.candidate_ids():
         path = None if verb == "ingest" else paths.get(given)
-        raise refused("search.no_log_file", str(log), path=path)
+        raise refused("file.no_log", str(log), path=path)

@@ -33,7 +33,8 @@ class Verified(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `verify --json`."""
-        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
+        damaged = [vars(one) for one in self.damaged]
+        return {"checked": self.checked, "damaged": damaged, "findings": []}
 
 
 def verify_in(workspace: Folder) -> Verified:

@@ -77,7 +77,7 @@ def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
 def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, limit, said):
     config = CONFIG.replace("force = [-5.0, 5.0]", f"force = [-5.0, {limit}]")
     findings = Workspace(make(tmp_path / "w", config=config).folder).propose().findings
-    told = [one for one in findings if one.code == "plan.at_limits"]
+    told = [one for one in findings if one.code == "plan.falls_short"]
     assert len(told) == said
     assert all(one.about == ("force",) for one in told)
 
@@ -117,5 +117,5 @@ def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
     np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
     config = w.folder / "grounded.toml"
     config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
-    told = of_code(Workspace(w.folder).ingest(file), "run.after_safety")
+    told = of_code(Workspace(w.folder).ingest(file), "run.safety")
     assert [one.about for one in told] == [("x",)] * (rolls > 0)

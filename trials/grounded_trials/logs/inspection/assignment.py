@@ -213,8 +213,7 @@ class _Table:
             return points + STATED * bool(number.said and role.unit) * fits
         if not unit:
             return points
-        code = "start.unit" if fits else "start.unit_other"
-        why = found(code, role.name, unit=unit, model=role.unit)
+        why = found("start.unit", role.name, unit=unit, model=None if fits else role.unit)
         self.add(role.name, number.path, 0.0, why)
         if not fits and not number.said:
             self.doubted.add((role.name, number.path))
@@ -305,7 +304,7 @@ class _Table:
         first = self.taken()
         for role in (one for one in self.roles if one.sent):
             if path := by_efforts(role.name, self.joints, signals, self.log):
-                self.add(role.name, path, CAP, found("start.effort", path))
+                self.add(role.name, path, CAP, found("start.joint", path, effort=True))
                 self.doubted.discard((role.name, path))
             angle = first.get(without_role(role.name), "")
             path = first.get(role.name, "")
@@ -412,9 +411,10 @@ class _Table:
                 like = follows(way, speed * self.stated.factor(path, self.units[name]), step)
                 if like.correlation > FOLLOWS:
                     why = found(
-                        "start.speed",
+                        "start.follows",
                         name,
                         of=tuple(position),
+                        speed=True,
                         correlation=like.correlation,
                         slope=like.slope,
                     )
@@ -456,7 +456,7 @@ class _Table:
                 number = self.numbers[self.at[path]]
                 clear = number.command and self.points[self.row[name], self.at[path]] >= SURE
                 sure = clear or len(lost) == len(left) == 1
-                why = found("start.alone", name, numbers=tuple(top), command=int(number.command))
+                why = found("start.left", name, numbers=tuple(top), only=True)
                 rest = tuple(p for p in top if p != path)
                 known = tuple(self.why.get((name, path), ()))
                 made[name] = Guess(name, path, "", not rest and sure, rest, None, (*known, why))
@@ -476,7 +476,7 @@ class _Table:
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
         empty = [t.topic for t in self.log.topics if not t.messages]
         empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
-        why = (found("start.no_messages", *empty),) if empty and role.sent else ()
+        why = (found("start.still", *empty, empty=True),) if empty and role.sent else ()
         return Guess(role.name, "", "", False, tuple(n.path for n in some)[:MOST], None, why)
 
     def finished(self, guess: Guess) -> Guess:
@@ -493,7 +493,7 @@ class _Table:
             guess = replace(guess, others=guess.others[:3])
         factor = self.factor(guess.name, path)
         if number.said and guess.scale == 1 and factor_between(f"{number.said}/s", wanted):
-            why = found("start.unit_other", guess.name, unit=number.said, model=wanted)
+            why = found("start.unit", guess.name, unit=number.said, model=wanted)
             return guess.because(why, sure=False)  # deg, of a rate
         return replace(guess, scale=guess.scale * factor) if abs(factor - 1) > 1e-9 else guess
 
@@ -538,12 +538,12 @@ class _Reading:
     q: float = 1.0  # factor of the position
     w: float = 1.0  # factor of its rate, positive
     about: int | None = None  # the signal whose unit is not the expected one: 0 or 1
-    why: str = ""
+    unit: str = ""  # by their sizes
 
     @property
     def both(self) -> bool:
         """Whether it says something of the two together."""
-        return self.why == "start.same_unit"
+        return self.unit == "the same"
 
 
 def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Iterator[_Reading]:
@@ -556,12 +556,12 @@ def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Itera
     """
     tried = [
         _Reading(),
-        _Reading(q=1 / DEGREES, about=0, why="start.in_degrees"),
-        _Reading(w=1 / DEGREES, about=1, why="start.in_degrees"),
+        _Reading(q=1 / DEGREES, about=0, unit="deg"),
+        _Reading(w=1 / DEGREES, about=1, unit="deg"),
     ]
     if bool(stated[0]) != bool(stated[1]):  # the one unit is that of both
         other = {"w": by[0], "about": 1} if stated[0] else {"q": by[1], "about": 0}
-        tried.append(_Reading(**other, why="start.same_unit"))  # type: ignore[arg-type]
+        tried.append(_Reading(**other, unit="the same"))  # type: ignore[arg-type]
     return (one for one in tried if abs(abs(slope) * one.w / one.q - 1) < SAME)
 
 
@@ -587,11 +587,11 @@ def _followed(
     if crossed and not (size < -SURELY and abs(slope + 1) < SAME):
         return {q.name: replace(q, sure=False), w.name: w.because(exchanged, sure=False)}
     if abs(size) < FOLLOWS:
-        why = found("start.unfollowed", w.name, of=q.path, correlation=size)
+        why = found("start.follows", w.name, of=q.path, correlation=size, no=True)
         return {w.name: w.because(why, sure=False)} if size else {}
 
     q, w = _in_units(q, w, like, by, table)
-    why = found("start.follows", w.name, of=q.path, correlation=size, sign=int(np.sign(slope)))
+    why = found("start.follows", w.name, of=q.path, correlation=size, opposite=slope < 0)
     w = w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)
     return {q.name: q, w.name: w}
 
@@ -604,11 +604,12 @@ def _in_units(
     slope = like.slope * by[1] / by[0]
     reading = next(_readings(slope, stated, by), None)
     if reading is None:
-        why = found("start.times", w.name, of=q.path, slope=slope)
+        why = found("start.follows", w.name, of=q.path, slope=slope)
         return q, w.because(why, sure=False)
     if reading.about is not None:
         names = (q.name, w.name)
-        odd = found(reading.why, *(names if reading.both else names[reading.about :][:1]))
+        about = names if reading.both else names[reading.about :][:1]
+        odd = found("start.unit", *about, unit=reading.unit, size=True)
         q, w = (g.because(odd) if i == reading.about else g for i, g in enumerate((q, w)))
     q = replace(q, scale=reading.q, sure=q.sure and reading.q == 1)
     w = replace(w, scale=reading.w * float(np.sign(slope)))

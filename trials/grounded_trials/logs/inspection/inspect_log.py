@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.bad import Bad, BadPath
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile
@@ -135,17 +135,21 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
     for topic in log.topics:
         name, bad = topic.topic, [f.path for f in topic.fields if f.not_finite]
         if topic.problem:
-            odd.append(found("file.topic", name, type=topic.type, why=topic.problem))
+            odd.append(found("file.unreadable", name, why=topic.problem, weight=Weight.WARN))
         gap = topic.largest_gap_s if topic.messages > 1 and topic.rate_hz else 0.0
         gap *= gap > GAP / max(topic.rate_hz, 1e-9)
         if topic.messages < 2 or gap:
-            odd.append(found("file.gaps", name, messages=topic.messages, gap=gap))
+            odd.append(
+                found("file.odd_values", name, messages=topic.messages, gap=Quantity(gap, "s"))
+            )
         if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
-            odd.append(found("file.clocks_apart", name, "the log", apart=topic.skew_s))
+            odd.append(
+                found("file.clocks", name, "log", apart=abs(topic.skew_s), weight=Weight.WARN)
+            )
         if len(topic.fields) >= FIELD_LIMIT:
-            odd.append(found("file.first_numbers", name, numbers=FIELD_LIMIT))
+            odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
         if bad:
-            odd.append(found("file.not_finite", bad[0]))
+            odd.append(found("file.odd_values", bad[0], lost="some"))
     odd += [
         found("file.opposite", twins.first, twins.second, correlation=twins.correlation)
         for twins in log.twins

@@ -265,7 +265,7 @@ def in_order(
             if commanded:
                 given[name] = _commanded(commanded, own, at, joint, names)
             elif own:
-                why = found("start.joint_order", topic, joint=joint, index=at)
+                why = found("start.joint", topic, joint=joint, index=str(at))
                 known = slide or bool(_words(joint) & TURNS)
                 points = ORDERED if known else UNKNOWN
                 given[name] = {path: Joint(points, why, doubted=len(some) > 1)}
@@ -276,7 +276,7 @@ def _commanded(
     arrays: Sequence[str], own: Sequence[str], at: int, joint: str, names: Sequence[str]
 ) -> dict[str, Joint]:
     """Return the commands for a joint: by its place in arrays, its effort, the rest of them."""
-    why = found("start.joint_order", arrays[0], joint=joint, index=at)
+    why = found("start.joint", arrays[0], joint=joint, index=str(at))
     paths = [*(f"{array}[{at}]" for array in arrays), *own]
     paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
     return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}

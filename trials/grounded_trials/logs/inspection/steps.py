@@ -82,7 +82,7 @@ def by_groups(
     )
     if not clear or best not in fits:
         rivals = [way for way in fits or ways if way != first]
-        return _given(guesses, pairs, first, rivals, *[found("start.steps_tie")] * bool(left))
+        return _given(guesses, pairs, first, rivals, *[found("start.steps")] * bool(left))
     second = min((way for way in ways if way != best), key=lambda way: float(left[way].sum()))
     gain = float((left[second] - left[best]).sum()) / len(model.states)
     return _given(guesses, pairs, best, (), _better(gain))
@@ -278,7 +278,7 @@ def _open(
         others = tuple(dict.fromkeys(one[k] for one in rivals if one[k] != said[k]))
         open_[name] = moved_to(guesses[name], said[k])
         if others:
-            doubted = open_[name].because(found("start.steps_tie"), sure=False)
+            doubted = open_[name].because(found("start.steps"), sure=False)
             open_[name] = replace(doubted, others=others)
     return open_
 

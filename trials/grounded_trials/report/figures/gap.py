@@ -14,8 +14,7 @@ import numpy as np
 from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import SHORT, probe, samples, true_values
-from grounded.result import listed
+from grounded.places import SHORT, probe, samples
 from grounded.trial import Trial
 from grounded_trials.report.findings import ESTIMATED, Findings, Run
 from grounded_trials.report.forecast import forecast
@@ -29,6 +28,7 @@ POINTS = 1500  # points of a residual
 BINS = 24
 LEAST = 3  # points of a bin; one with fewer, or half as many as usual, is merged with the next
 NEARLY = 0.05  # of a residual's variance: what another variable may explain more, by chance
+RESTARTED = "Predictions restarted every"
 LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
 LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
@@ -38,36 +38,14 @@ def forecast_figures(findings: Findings) -> list[Figure]:
     found, ahead = [], f"{findings.ahead_s:.3g} s"
     run = forecast_run(findings)
     if run is not None:
-        title = f"Predictions restarted every {ahead}, {run.label}"
+        title = f"{RESTARTED} {ahead}, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
     longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
     for log in longest:
-        title = f"Predictions restarted every {ahead}, data {log.trial.id}"
+        title = f"{RESTARTED} {ahead}, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
     some = [figure for figure in found if figure is not None]
-    return [replace(one, caption=_caption(findings, k, one.caption)) for k, one in enumerate(some)]
-
-
-def _caption(findings: Findings, place: int, own: str) -> str:
-    """Return the caption of a figure of forecasts: the first one says what is drawn."""
-    better = findings.better
-    if place:
-        return own
-    start = "the measured state"
-    if findings.estimated:
-        start = f"the measured state, with {listed(findings.estimated)} as estimated from it,"
-    caption = (
-        f"Every {findings.ahead_s:.3g} s the model starts from {start} and gets the inputs that "
-        "were sent: where the lines differ by more than noise in the start makes of it, the model "
-        "is wrong."
-    )
-    names = better.planner.plan.model.state_names if better is not None else ()
-    if true_values(names, names[findings.task.model.n :]):
-        caption += (
-            " A sensor that the model knows to be late shows where the robot was: then it starts "
-            "from where it is, as far as the samples until then tell."
-        )
-    return f"{caption} {own}".rstrip()
+    return some
 
 
 def forecast_run(findings: Findings) -> Run | None:
@@ -111,12 +89,11 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         )
     said, diagnosis = [], findings.diagnosis
     if diagnosis is not None and diagnosis.made is not None and better is not None:
-        saw = "used" if trial.id in diagnosis.made.trials else "did not use"
-        said.append(f"The last diagnosis {saw} this trial.")
+        said.append("held out" * (trial.id not in diagnosis.made.trials))
     if trial.steps < steps:
         end = begin + trial.steps * trial.dt
-        said.append(f"Only its worst part, from {begin:.4g} to {end:.4g} s, is drawn.")
-    return Figure(name, title, " ".join(said), tuple(panels), legend(panels))
+        said.append(f"{begin:.4g} to {end:.4g} s")
+    return Figure(name, title, ", ".join(filter(None, said)), tuple(panels), legend(panels))
 
 
 def _worst_part(findings: Findings, trial: Trial) -> tuple[Trial, float]:
@@ -159,24 +136,11 @@ def residual_figures(findings: Findings) -> list[Figure]:
     channels = _channels(findings, trial.states[:whole], residual[:whole])
     over = [_over(findings, trial, i, residual[:whole], explained) for i in channels]
     rest = [_autocorrelation(findings, trial, i, residual[:whole], explained) for i in channels]
-    name, better = trial.id or "the best trial", findings.better
-    caption = f"Each dot is a step of {name}: what must be added to the {findings.plain}."
-    if explained is not None and better is not None:
-        caption += f" The line is what the model {better.name} adds."
-    same = (
-        f"Residuals of {name} from one measured state to the next. A sensor's noise enters two "
-        "consecutive residuals with opposite signs: if they are noise only, the first lag is -0.5. "
-        "At higher lags, white noise stays within the band."
-    )
-    if findings.diagnosis is not None and findings.diagnosis.where.whiteness:
-        same += (
-            ' The test in "Is there a pattern in the rest?" uses other residuals: those of the '
-            "filter that accounts for sensor noise, over all trials of the diagnosis."
-        )
+    name = trial.id or "best"
     return [
-        Figure("residual", "What the model lacks", caption, tuple(over), legend(over)),
+        Figure("residual", "What the model lacks", name, tuple(over), legend(over)),
         Figure(
-            "autocorrelation", "What is left from step to step", same, tuple(rest),
+            "autocorrelation", "Autocorrelation of the residual", name, tuple(rest),
             (*legend(rest), Key("other", "white noise, 95 %", "band")),
         ),
     ]  # fmt: skip
@@ -205,14 +169,12 @@ def _over(
     k = _telling(model, state, values, rate)
     x = values[:, k]
     some = np.linspace(0, steps - 1, min(steps, POINTS)).astype(int)
-    curves = [
-        Curve(x[some], rate[some], "model", f"missing in the {findings.plain}", style="points")
-    ]
+    curves = [Curve(x[some], rate[some], "model", findings.plain, style="points")]
     better = findings.better
     if explained is not None and better is not None:
         added = rate - explained[:, state] / trial.dt
         at, mean = _binned(x, added)
-        curves.append(Curve(at, mean, "best", f"added by the model {better.name}", 2.5))
+        curves.append(Curve(at, mean, "best", f"model {better.name}", 2.5))
     name, unit = list(model.states.items())[state]
     title = f"{name}: what the model lacks, over {units[k][0]}"
     bounds = fitted([np.quantile(rate, [0.002, 0.998])], 0.15)
@@ -290,21 +252,17 @@ def _autocorrelation(
     curves, note = [], ""
     if explained is not None:
         left = float(np.std(explained[:, state]) / (np.std(residual[:, state]) or 1.0))
-        note = f"{percent(left)} of the residual is left"
-        if left > 1:
-            note = f"the residual grows by {percent(left - 1)}"
+        note = f"{percent(left)} left"
     note += "; " * bool(note) + "sensor noise alone: −0.5 at the first lag"
     for values, role, name in shown_:
         y = values[:, state] - values[:, state].mean()
         power = float(y @ y) or 1.0
         found = np.array([float(y[lag:] @ y[:-lag]) / power for lag in lags])
-        curves.append(
-            Curve(np.array(lags) * float(trial.dt), found, role, f"residual of the {name}", 2.0)
-        )
+        curves.append(Curve(np.array(lags) * float(trial.dt), found, role, name, 2.0))
     bound = 1.96 / np.sqrt(len(residual))
-    band = Band(-bound, bound, "other", "white noise stays inside, 95 %")
+    band = Band(-bound, bound, "other", "white noise, 95 %")
     name = findings.task.model.state_names[state]
     return Panel(
-        f"{name}: autocorrelation of the residual", "lag [s]", "correlation", tuple(curves),
+        name, "lag [s]", "correlation", tuple(curves),
         bands=(band,), y_range=(-1.05, 1.05), note=note,
     )  # fmt: skip

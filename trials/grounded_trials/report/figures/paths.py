@@ -75,25 +75,14 @@ def path_figure(findings: Findings) -> Figure | None:
     body, caption = views[0].body, []
     if logs:
         panels = [_of_logs(findings, view) for view in views]
-        caption.append("Data of logs that ran no candidate.")
     else:
         panels = [_seen_in(findings, view) for view in views]
         if views[0].equal and findings.runs:
             panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
-        if body is not None:
-            caption.append(
-                "Moving parts: real in black or white, predicted for the same trial in pink, "
-                f"desired dashed. The curves are paths of {body.watched}."
-            )
     if body is None and not scene.spatial:
-        position = findings.task.model.roles.get("position")
-        why = "No role gives a position" if position is None else "The position has one axis"
-        caption.append(f"{why}: phase plane of {listed(scene.names)}.")
+        caption.append(f"Phase plane of {listed(scene.names)}.")
     if body is not None and not body.unit:
-        caption.append(
-            "The lengths of its links are unknown (name parameters l, or l1, l2 ... in m): they "
-            "are drawn with equal length."
-        )
+        caption.append("Name lengths of links l, or l1, l2 ... [m].")
     if any(crash(run) for run in findings.runs):
         caption.append("A cross marks where a run ended early.")
     return Figure("paths", "Paths", " ".join(caption), tuple(panels), legend(panels[:1]))
@@ -208,14 +197,13 @@ def _enlarged(findings: Findings, view: View) -> list[Panel]:
         path = near + factor * (view.place(states) - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
         if off.mean() > MOSTLY:
-            note = f"{name.partition(',')[0]} is outside"
+            note = f"{role} outside"
             continue
         path[off] = np.nan
         cut |= bool(off.any())
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
     title = f"Deviations {factor:g} times enlarged"
-    title += ", where they fit" * cut
     return [Panel(title, *view.names, tuple(curves), equal=True, note=note, kind="path")]
 
 
@@ -228,7 +216,7 @@ def _shaded(findings: Findings, view: View) -> list[Panel]:
         return []
     far = np.linalg.norm(body.path(states) - desired[: len(states)], axis=1)
     times: Array = np.arange(len(states), dtype=np.float64) * findings.task.dt
-    name = labelled("distance from desired", body.unit)
+    name = labelled("off", body.unit)
     (x, y), (a, b) = view.place(states).T, view.place(target).T
     path = Curve(x, y, "other", "", 1.0, times, far, name)
     wanted = Curve(a, b, "desired", "desired", 1.0)

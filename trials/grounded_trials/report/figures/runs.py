@@ -116,8 +116,7 @@ def error_figure(findings: Findings) -> Figure | None:
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
         marks = _crashes(findings, off)
         panels.append(_timed(f"{name} − target", unit, curves, spare=50.0, marks=marks))
-    caption = "Error of each run from its target, and from the model's prediction for that run."
-    return Figure("error", "Tracking error", caption, tuple(panels), legend(panels))
+    return Figure("error", "Tracking error", "", tuple(panels), legend(panels))
 
 
 def input_figure(findings: Findings) -> Figure | None:
@@ -156,7 +155,7 @@ def bias_figure(findings: Findings) -> Figure | None:
             drawn.append((run.residual[:, i], role, words, 1.0))
         best = findings.best
         if best is not None and best.explained is not None and findings.better is not None:
-            words = f"last iteration, model {findings.better.name}"
+            words = f"model {findings.better.name}"
             drawn.append((best.explained[:, i], "predicted", words, 1.5))
         window = window_of([values for values, *_ in drawn])
         curves = [
@@ -165,15 +164,10 @@ def bias_figure(findings: Findings) -> Figure | None:
         ]
         panel = _timed(name, per_second(unit), curves)
         if window > 1:
-            note = f"means over {window * task.dt:.2g} s: single steps are mostly noise"
+            note = f"means: {window * task.dt:.2g} s"
             panel = replace(panel, note="; ".join(filter(None, (panel.note, note))))
         panels.append(panel)
-    caption = (
-        f"The rate of change that the {findings.plain} lacks, step by step, to replay the "
-        "trial. A curve with the same shape in all iterations is a property of the system, not of "
-        "a run."
-    )
-    return Figure("bias", "Bias of the model", caption, tuple(panels), legend(panels))
+    return Figure("bias", "Bias", "", tuple(panels), legend(panels))
 
 
 def _means(values: Array, window: int, dt: float, role: str, name: str, width: float) -> Curve:
@@ -245,4 +239,4 @@ def _cut_off(values: list[Array], low: float, high: float) -> str:
     ends = [float(e) for v in finite if len(v) for e in (v.min(), v.max())]
     out = sorted({e for e in ends if not low <= e <= high})
     reached = " and ".join(figure(e, 2) for e in out).replace("-", "−")
-    return f"model’s policy is cut off: it reaches {reached}" if out else ""
+    return f"up to {reached}" if out else ""

@@ -20,8 +20,6 @@ from grounded_trials.wording import percent, rendered
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import DIAGNOSE
 
-NO_TRIAL = "Nothing to diagnose yet: no trial and no log of data is stored."
-
 
 def gap_section(findings: Findings) -> list[Block]:
     """What was diagnosed, and forecasts of the crude model beside the better one."""
@@ -29,11 +27,8 @@ def gap_section(findings: Findings) -> list[Block]:
     ahead = [b for each in forecast_figures(findings) for b in drawn(each, title=True)]
     lacking = [b for each in residual_figures(findings) for b in drawn(each, title=True)]
     if diagnosis is None:
-        if not (findings.runs or findings.logs):
-            return [Block("text", NO_TRIAL)]
-        words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
-        return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
+        return [command, *ahead, *forecast_table(findings), *lacking]
     verdict = Block("verdict", lines=findings.lines)
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
@@ -53,7 +48,7 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
         found += [Block("heading", "Effects that were compared"), effect_table(diagnosis, since)]
     if diagnosis.lookalikes:
         alike = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
-        found.append(Block("heading", "Look-alikes, with the share of the signal they reproduce"))
+        found.append(Block("heading", "Look-alikes"))
         found.append(table("lookalikes", ("claimed effect", "look-alike ", "share"), alike))
     return found + _by_trial(diagnosis) + leftover_table(diagnosis)
 
@@ -69,7 +64,7 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
         unit = own.unit if own else units.get((p.effect, p.quantity), "")
         value = Estimate(p.value, p.std, unit=unit).text
         rows.append((p.effect, p.quantity, p.trial, value, "yes" if p.agrees else "no"))
-    header = ("effect", "quantity ", "trial ", "value", "agrees with the others")
+    header = ("effect", "quantity ", "trial ", "value", "agrees")
     strong = [i for i, p in enumerate(found) if not p.agrees]
     each = table("per-trial", header, rows, strong)
     return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))] * bool(found)

@@ -35,8 +35,8 @@ from grounded_trials.report.figures.runs import (
     input_figure,
     state_figure,
 )
-from grounded_trials.report.findings import Findings, compared, improvements_in, utility_terms
-from grounded_trials.report.page.diagnosed import NO_TRIAL, gap_section
+from grounded_trials.report.findings import Findings, improvements_in, utility_terms
+from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -87,10 +87,8 @@ def page(findings: Findings, watched: int = 0) -> str:
         findings=findings,
         about=_about(findings),
         tiles=_tiles(findings),
-        changed=_heading(findings),
         improved=_improved(findings),
         diagnose=rendered(DIAGNOSE, findings.folder),
-        no_trial=NO_TRIAL,
         why=_why(findings),
         sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
         style=_own("page.css") + _roles(),
@@ -207,31 +205,6 @@ def _about(findings: Findings) -> str:
     )
 
 
-def _heading(findings: Findings) -> str:
-    """Return the heading above `_improved`; "What improved" only if no row got worse.
-
-    If the scatter of repeats may explain the gain, it says so.
-    """
-    runs, tried = compared(findings), [one for one in findings.history if one.trials]
-    if len(runs) < 2:
-        alone = len(tried) < 2 or findings.first is None
-        return "Results" if alone else "The first run is still the best"
-    rows = improvements_in(findings)
-    worse = any(one.after > one.before and not one.is_same for one in rows)
-    if worse:
-        return "What the runs changed"
-    two = _first_and_best(findings)
-    between = None if two is None else Difference(*two, findings.history)
-    if between is None or not between.doubt:
-        return "What improved"
-    sure = between.probability
-    first, best = between.before.candidate.id, between.after.candidate.id
-    better = f"{best} is better than {first} with probability {sure:.2f}"
-    if sure < 0.5:
-        return f"What the runs changed ({better})"
-    return f"What perhaps improved ({'not repeated' if math.isnan(sure) else better})"
-
-
 def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:
     """Return the first and the best candidate with their runs; None if they are the same."""
     first, best = findings.first, findings.best
@@ -252,7 +225,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
         if rated and (two := _first_and_best(findings)):
             gain = f": {Difference(*two, findings.history).lead.sentence}"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
-        rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
+        rows.append((moved, f"utility, {first.candidate.id} to {best.candidate.id}{gain}"))
     elif best is not None:
         rows.append((figure(best.utility), f"utility, {best.candidate.id}"))
     return rows
@@ -267,13 +240,13 @@ def _tiles(findings: Findings) -> list[str]:
         found.append(f"{count(logs, 'log')} of data")
     found += [one.sentence for one in not_counted(findings.uncounted)]
     if findings.optimum is not None:
-        found.append(f"optimum of the real system {figure(findings.optimum)}")
+        found.append(f"optimum {figure(findings.optimum)}")
     for left, shown, kind in (
         (findings.left_runs, len(findings.runs), "trials"),
         (findings.left_logs, len(findings.logs), "logs"),
     ):
         if left:
-            found.append(f"{left} of {left + shown} {kind} are not drawn (too many)")
+            found.append(f"{shown} of {left + shown} {kind} drawn")
     early = [run.trial.id for run in findings.runs if crash(run) is not None]
     return [*found, f"ended early: {', '.join(early)}"] if early else found
 
@@ -298,8 +271,7 @@ def _why(findings: Findings) -> dict[str, Any]:
 
 def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
-        logs = count(len(findings.logs) + findings.left_logs, "log")
-        return [Block("text", f"No candidate has been proposed yet; {logs} of data.")]
+        return []
     gain = last_gain(findings.history)
     sure = gain.to_finding().sentence if gain else ""
     few = len(findings.history) <= OPEN
@@ -313,7 +285,6 @@ def _utility(findings: Findings) -> list[Block]:
 
 
 def _task(findings: Findings) -> list[Block]:
-    adopted = ", ".join(findings.effects) or "none"
-    words = f"Adopted effects: {adopted}. Stored trials of other tasks: {findings.others}."
-    parameters = Block("folded", "Parameters of the model", blocks=parameter_table(findings))
+    words = f"Adopted: {', '.join(findings.effects) or 'none'}."
+    parameters = Block("folded", "Parameters", blocks=parameter_table(findings))
     return [Block("text", words), channel_table(findings), parameters]

@@ -45,7 +45,7 @@ from grounded_trials.workspace.last_diagnosis import Since
 
 FEW = 4  # columns of errors from which the table of forecasts has a row for each trial instead
 MOST_COLUMNS = 6  # of errors beside a trial; more take a row for each model
-UNKNOWN = "–, not determined by these trials"
+UNKNOWN = "–"
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def candidate_table(findings: Findings) -> list[Block]:
         rows.append(cells)
     strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
     made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
-    words = f"{left} candidates are left out; this command shows all:"
+    words = f"{left} more"
     more = [
         Block("text", words),
         Block("command", rendered(NextCommand("status"), findings.folder), "c-status"),
@@ -130,8 +130,7 @@ def error_table(findings: Findings) -> list[Block]:
     columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
     columns |= {f"bias in 1 s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
-    words = f"bias: what the {findings.plain} misses in one step, per second"
-    return [table("errors", ("state", "unit", *columns), rows), Block("soft", f"{words}.")]
+    return [table("errors", ("state", "unit", *columns), rows)]
 
 
 def forecast_table(findings: Findings) -> list[Block]:
@@ -156,17 +155,7 @@ def forecast_table(findings: Findings) -> list[Block]:
     else:  # many logs are rows: as columns they left the screen
         ids = [trial.id or trial.candidate for trial in trials]
         made = _of_trials(ids, [words for words, _ in planners], errors, model)
-    note = (
-        "These predictions start from measured states and are not held out. The diagnosis predicts "
-        "from filtered states, in all of its trials, so its errors differ."
-    )
-    if late := late_in_vain(findings):
-        verb = "is" if len(late) == 1 else "are"
-        note += f" It corrects how late {listed(late)} {verb}, and these predictions do not."
-    if findings.estimated:
-        told = listed(findings.estimated)
-        note += f" Not measured: {told}. Starts and errors of these are told by an estimate."
-    return [title, made, *[Block("soft", note)] * (findings.diagnosis is not None)]
+    return [title, made]
 
 
 def late_in_vain(findings: Findings) -> list[str]:

@@ -37,7 +37,7 @@ class Space:
     def title(self) -> str:
         """The title of the first view."""
         if is_mechanism(self.body):
-            return "Real and predicted, from the side"
+            return "From the side"
         axes = [labelled(*one) for one in zip(self.scene.names, self.scene.units, strict=True)]
         return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
 
@@ -157,12 +157,10 @@ def _answer(findings: Findings) -> Any:
     """Return the views of the verdict and, beside it, of the credit: both seen at once."""
     import rerun.blueprint as rrb
 
-    told = rrb.TextDocumentView(
-        origin="/verdict", name="What to run next, and why the model was wrong"
-    )
+    told = rrb.TextDocumentView(origin="/verdict", name="Diagnosis")
     if findings.diagnosis is None or not findings.diagnosis.credit:
         return told
-    worth = rrb.TextDocumentView(origin="/credit", name="What each cause is worth")
+    worth = rrb.TextDocumentView(origin="/credit", name="Causes")
     return rrb.Horizontal(told, worth, column_shares=[3, 2])
 
 
@@ -195,7 +193,7 @@ def _trials(findings: Findings, space: Space) -> list[Any]:
     for run in findings.runs[-TRIALS:]:
         names = dict(NAMES)
         if run.explained is not None:
-            names["explained"] = "bias of the model as diagnosed"
+            names["explained"] = "bias as diagnosed"
         about = f"{run.label}, utility {figure(run.utility)}"
         shown.append(
             (f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body/**", "crash"])

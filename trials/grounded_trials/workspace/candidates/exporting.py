@@ -197,7 +197,8 @@ class Exported(Result):
             "candidate": self.candidate,
             "format": self.format,
         }
-        document |= {"search_ended": self.ended}
+        told = [*self.overridden, *self.findings]
+        document |= {"search_ended": self.ended, "findings": [one.to_json() for one in told]}
         return document | ({"runner": str(self.runner)} if self.runner else {})
 
 
@@ -229,7 +230,7 @@ def export_candidate(
         try:
             onboard.check_limits(identity, handed.candidate.policy)
         except ValueError as error:
-            raise refused("plan.unsafe", identity, why=str(error)) from None
+            raise refused("plan.refused", identity, why=str(error)) from None
     write_atomically(path, known[form](handed.candidate.policy, units_of(workspace), about))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:

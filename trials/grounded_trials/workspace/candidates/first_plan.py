@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.errors import NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -229,7 +229,7 @@ def off_target(plan: Plan) -> Iterator[Finding]:
     at = [name for name, part in limited if part > LIMITED]
     if at and share > MISSED:
         most = max(part for _, part in limited)
-        yield found("plan.at_limits", *at, share=most, what=what, off=off)
+        yield found("plan.falls_short", *at, share=most, what=what, off=off)
         return
     names, what = groups[0]
     states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
@@ -313,11 +313,10 @@ def leaving(plan: Plan) -> NDArray[np.bool_]:
 
 def unused_rows(plan: Plan) -> Iterator[Finding]:
     """target.csv has more rows than the horizon."""
-    name, task = str(plan.workspace.config.task.target), plan.task
+    name, used = str(plan.workspace.config.task.target), plan.task.horizon + 1
     rows = len(plan.workspace.read_target(plan.workspace.folder / name)[1])
-    if rows > task.horizon + 1:
-        end = Quantity(task.horizon * task.dt, "s")
-        yield found("plan.unused_rows", file=name, rows=rows, horizon=task.horizon, end=end)
+    if rows > used:
+        yield found("file.rows", name, rows=str(rows), used=used, weight=Weight.NOTE)
 
 
 CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (

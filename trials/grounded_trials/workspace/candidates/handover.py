@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.policy import Policy
@@ -190,11 +191,11 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         t, j = (int(i) for i in np.argwhere(wrong)[0])
         raise GroundedError(
             found(
-                "plan.rewritten",
-                identity,
+                "file.changed",
+                f"candidates/{identity}.mcap",
                 then=NextCommand("propose"),
-                file=f"candidates/{identity}.mcap",
-                why=f"at t = {t * policy.dt:g} s it sends {policy.input_names[j]} = "
+                what="candidate",
+                lost=f"at t = {t * policy.dt:g} s it sends {policy.input_names[j]} = "
                 f"{sent[0, t, j]:g}, but its own prediction has {predicted[t, j]:g}",
             )
         )
@@ -252,29 +253,29 @@ class Check:
             (made.policy.input_names, model.input_names),
         ):
             if names != own:
-                raise GroundedError(
-                    found("plan.other_robot", made.id, then=PROPOSE, has=names, model=own)
+                raise refused(
+                    "given.fit", made.id, then=PROPOSE, what="signals", theirs=names, own=own
                 )
         file, then = f"candidates/{made.id}.mcap", PROPOSE
         if found_hash not in self.workspace.noted.handed.get(made.id, {found_hash}):
-            raise GroundedError(found("plan.rewritten", made.id, then=then, file=file))
+            raise GroundedError(found("file.changed", file, then=then, what="candidate"))
         for one in self.trials:
             if one.trial.candidate == made.id and one.ran not in ("", found_hash):
                 ran = one.stored.id
-                raise GroundedError(found("plan.rewritten", made.id, then=then, file=file, ran=ran))
+                raise GroundedError(found("file.changed", file, then=then, what="policy", lost=ran))
 
     def reasons(self) -> Iterator[Finding]:
         """Yield the reasons why it must not be handed over."""
         made, config, name = self.candidate, self.workspace.config, self.candidate.id
         if abs(made.policy.dt - config.task.dt) > 1e-9:
             own, now = Quantity(made.policy.dt, "s"), Quantity(config.task.dt, "s")
-            yield found("plan.other_dt", name, own=own, now=now)
+            yield found("given.fit", name, what="dt", theirs=own, own=now)
         model = self.workspace.base_model
         for kind, own_units in (("states", model.states), ("inputs", model.inputs)):
             for signal, unit in json.loads(self.meta[kind]).items():
                 if unit != own_units[signal]:
-                    now_unit = own_units[signal]
-                    yield found("plan.other_unit", name, signal=signal, unit=unit, now=now_unit)
+                    wanted = own_units[signal]
+                    yield found("given.fit", signal, what="unit", theirs=unit, own=wanted)
         yield from outside_limits(self.workspace.task, made.policy)
         if not self.same_task and not (self.other_task and self._ever_ran):
             yield found(
@@ -300,7 +301,7 @@ class Check:
             *self._became(),
         ]
         if not self.same_task:
-            told.append(found("plan.of_other_task", name, candidate=name))
+            told.append(found("plan.other_task", name, weight=Weight.NOTE))
         elif self._changed:
             told.append(found("plan.outdated", name, candidate=name))
         if self.same_task and not self.standing.trials:
@@ -329,7 +330,7 @@ class Check:
         for stored in self.workspace.store.list() if aside else ():
             if stored.id in aside and self._ran(stored) == name:
                 why = aside[stored.id]
-                yield found("plan.run_aside", stored.id, trial=stored.id, candidate=name, why=why)
+                yield found("search.aside", stored.id, candidate=name, why=why, weight=Weight.NOTE)
 
     def _ran(self, stored: Stored) -> str:
         with suppress(GroundedError):
@@ -478,9 +479,10 @@ def outside_limits(task: Task, policy: Policy) -> Iterator[Finding]:
         outside += [v for v in sent if v < low - room or v > high + room]
         if outside:
             yield found(
-                "plan.outside_limits",
+                "plan.outside",
                 name,
-                input=name,
+                state=name,
+                table="limits",
                 value=f"{max(outside, key=abs):g}",
                 low=f"{low:g}",
                 high=f"{high:g}",
@@ -491,4 +493,4 @@ def disowned(tried: Tried, aside: Collection[str]) -> Finding:
     """Return that a candidate, never run, is void since a trial that it was made from is gone."""
     name = tried.candidate.id
     gone = what_became(tried.gone, aside)
-    return found("plan.disowned", name, candidate=name, trials=tried.gone, gone=gone)
+    return found("plan.void", name, candidate=name, trials=tried.gone, gone=gone)

@@ -509,5 +509,5 @@ def _namesakes(workspace: Folder) -> list[Finding]:
         if "~" in one.trial.candidate:
             names.setdefault(one.trial.candidate, []).append(one.stored.id)
     return [
-        found("search.namesake", *ids, candidate=name.split("~")[0]) for name, ids in names.items()
+        found("search.uncounted", *ids, candidate=name.split("~")[0]) for name, ids in names.items()
     ]

@@ -65,7 +65,9 @@ class Ran(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `run --json`."""
-        return {"trial_file": str(self.trial_file), "candidate": self.candidate}
+        told = [one.to_json() for one in self.findings]
+        document = {"trial_file": str(self.trial_file), "candidate": self.candidate}
+        return {**document, "findings": told}
 
 
 def run_candidate(
@@ -73,14 +75,14 @@ def run_candidate(
     candidate: str | None,
     *,
     anyway: bool = False,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[Finding], None] | None = None,
 ) -> Ran:
     """Run a candidate once and write its trial to runs/cNNNN-K.mcap, see `Workspace.run`."""
     system, identity = workspace.config.system, candidate_named(workspace, candidate)
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:
         for reason in handed.overridden:
-            warn(found("plan.anyway", identity, why=reason.sentence).sentence)
+            warn(found("plan.refused", identity, why=reason.sentence, anyway=True))
     path = _next_run(workspace.folder / "runs", identity)
     if system.command:
         _call(workspace, system.command, handed, path)

@@ -15,9 +15,8 @@ from grounded.adapters import mujoco
 from grounded.adapters.mujoco import MujocoStepper
 from grounded.adapters.mujoco_names import FIELDS, identifier
 from grounded.adapters.stepper import library
-from grounded.errors import GroundedError
-from grounded.findings import found
 from grounded.model import Model
+from grounded_trials.plain_file import unreadable
 from grounded_trials.workspace.home.held import value_of
 
 Effects = tuple[Mapping[str, Any], ...]
@@ -36,7 +35,7 @@ def simulated_model(path: Path) -> tuple[Any, dict[str, float], Effects]:
         spec = mj.MjSpec.from_file(str(path))
         whole = spec.compile()
     except ValueError as error:
-        raise GroundedError(found("model.not_loaded", str(path), why=str(error))) from None
+        raise unreadable(path, str(error), kind="MuJoCo model") from None
     late, effects = dict[str, float](), list[Mapping[str, Any]]()
     for i, one in enumerate(spec.actuators):
         name = identifier(one.name or f"actuator{i}")

@@ -26,10 +26,11 @@ import numpy as np
 from grounded import places
 from grounded.adapters.mujoco import MujocoStepper
 from grounded.adapters.mujoco_files import load
+from grounded.checks import unknown, wrong
 from grounded.diagnosis.parts import Estimate
 from grounded.effects import param_name
 from grounded.effects.joint import alone, pairs_of
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.findings import found as finding
 from grounded.model import Model
@@ -99,8 +100,7 @@ def export_actuator(workspace: Folder, path: Path, name: str | None = None) -> S
     if name is None and model.m == 1:
         name = model.input_names[0]
     if name not in model.input_names:
-        named = nearest(name or "", model.input_names)
-        raise GroundedError(finding("model.which_actuator", named=named))
+        raise unknown("input", name or "", model.input_names)
     drives = _driven(model).get(name, "")
     values = dict(_found(workspace, name, drives))
     if not values:
@@ -135,12 +135,11 @@ def begin_with(workspace: Folder, files: Sequence[str]) -> tuple[dict[str, Any],
         path = Path(file or text)
         table = read_yaml(path)
         if "actuator" not in table:
-            raise GroundedError(finding("model.yaml", str(path), why="it describes no actuator"))
+            raise wrong(path.name, must="actuator")
         alike = [n for n, unit in model.inputs.items() if unit == table.get("unit")]
         inputs = names.split(",") if names else alike
         if not inputs or not {*inputs} <= {*model.input_names}:
-            known = nearest(names, model.input_names)
-            raise GroundedError(finding("model.which_actuator", named=known))
+            raise unknown("input", names, model.input_names)
         for name in inputs:
             _begin(path, table, name, driven.get(name, ""), effects, priors)
     set_in_model(workspace.config.file, effects=effects)

@@ -19,6 +19,7 @@ import numpy as np
 
 from grounded.accounts.sound_trials import sound_trials
 from grounded.adapters.mujoco import MujocoStepper
+from grounded.checks import same_names
 from grounded.diagnosis.levels import LEAST, SURE
 from grounded.diagnosis.rivals import Predicted, predicted
 from grounded.errors import GroundedError
@@ -187,9 +188,9 @@ def _result(
         ratio = float(np.exp(abs(gain.mean)))
         told = [finding("gap.trusted", better, better=better, worse=worse, ratio=ratio)]
     else:
-        told = [finding("gap.undecided", *labels)]
+        told = [finding("gap.undecided", *labels, models=True)]
     if open_ := [one.name for one in numbers if not one.better]:
-        told.append(finding("gap.undecided_numbers", *open_))
+        told.append(finding("gap.undecided", *open_))
     ahead_s = a.by_horizon[ahead][0]
     return Compared(
         labels, better, size, ahead_s, errors, channels, tuple(numbers), trials, tuple(told)
@@ -204,7 +205,7 @@ def _rival(workspace: Folder, text: str) -> Rival:
         late, effects = other.config.task.latency, other.config.model.effects
         return Rival(text, other.base_model, tuple(effects), late)
     if not path.is_file():
-        raise GroundedError(finding("model.no_rival", text))
+        raise GroundedError(finding("file.missing", text))
     if path.suffix == ".py":
         return Rival(
             text, model_in(load_module(path.resolve().parent, path.name)), (), here.task.latency
@@ -253,9 +254,8 @@ def _aligned(workspace: Folder, one: Rival, other: Rival) -> tuple[Rival, Rival]
             one, other = (replace(rival, model=make(rival.compiled)) for rival in pair)
     base = workspace.base_model
     for rival in (one, other):
-        names = rival.model.state_names, rival.model.input_names
-        if names != (base.state_names, base.input_names):
-            raise GroundedError(finding("model.other_names", rival.label))
+        same_names(rival.label, "states", rival.model.state_names, base.state_names)
+        same_names(rival.label, "inputs", rival.model.input_names, base.input_names)
     return one, other
 
 

@@ -91,10 +91,10 @@ def export_model(workspace: Folder, path: Path | None) -> TakenHome:
     simulated = isinstance(model.step, MujocoStepper)
     source = model.step.source if isinstance(model.step, MujocoStepper) else _python_file(workspace)
     if source is None or not source.is_file():
-        raise GroundedError(finding("model.no_file"))
+        raise GroundedError(finding("model.other_form", workspace.base_model.name))
     path = path or Path(f"{source.stem}-found{source.suffix}")
     if path.suffix != source.suffix or path.resolve() == source:
-        raise GroundedError(finding("model.other_form", file=str(path), source=source.name))
+        raise GroundedError(finding("model.other_form", str(path), source=source.name))
     return (_simulated if simulated else _python)(workspace, source, path)
 
 
@@ -175,7 +175,7 @@ def _not_held(effect: str, c: Mapping[str, Estimate]) -> Finding:
     """Return the finding of an effect that a form can't hold: its equation with its values."""
     equation = installed_effects().family(effect.partition(":")[0]).equation
     values = tuple(f"{q} = {one.text}" for q, one in c.items() if q != "width")
-    return finding("model.not_held", effect, equation=equation, values=values)
+    return finding("model.no_place", effect, equation=equation, values=values)
 
 
 def _no_place(number: Number) -> Finding:

@@ -7,9 +7,8 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import GroundedError
-from grounded.findings import found
-from grounded_trials.plain_file import open_file
+from grounded.checks import wrong
+from grounded_trials.plain_file import open_file, unreadable
 
 LARGEST = 2**20  # [bytes] of a file
 
@@ -28,9 +27,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
             text = stream.read(LARGEST).decode("utf-8")
         table = YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeDecodeError, YAMLError, RecursionError, ValueError) as error:
-        raise GroundedError(found("model.yaml", str(path), why=str(error))) from None
+        raise unreadable(path, str(error), kind="YAML file") from None
     if not isinstance(table, dict):
-        raise GroundedError(found("model.yaml", str(path), why="it holds no table of names"))
+        raise wrong(path.name, must="dict")
     return {str(key): value for key, value in table.items()}
 
 
@@ -54,5 +53,5 @@ def number_in(path: Path, key: str, value: Any) -> tuple[float, float]:
     table = value if isinstance(value, Mapping) else {"value": value}
     numbers: list[Any] = [table.get("value"), table.get("std", float("nan"))]
     if not all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):
-        raise GroundedError(found("model.yaml", str(path), why=f"{key} is not a number"))
+        raise wrong(key, value, must="number", where=path.name)
     return float(numbers[0]), float(numbers[1])

@@ -143,7 +143,7 @@ def ingest_log(
     candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
-        raise refused("file.exported", path, candidate=path.stem)
+        raise refused("file.no_log", path, head=f"candidate {path.stem}")
     if candidate is not None and data:
         raise refused("given.either", "--data", "--candidate", how="one")
     if kind == TRIAL:

@@ -158,7 +158,7 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
             if not names:
-                raise refused("file.rows", path.name, rows="no", needs=2, then=SHAPE)
+                raise refused("file.rows", path.name, rows="no", needs=2, target=1, then=SHAPE)
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
@@ -176,7 +176,7 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     except FileNotFoundError:
         raise refused("file.missing", path, where="[task] target") from None
     except IsADirectoryError:
-        raise refused("file.folder", path, where="[task] target") from None
+        raise unreadable(path, "folder", where="[task] target") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise unreadable(path, error, kind="CSV") from None
     return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
@@ -193,7 +193,7 @@ def _numbers(
     path: Path, line: int, names: list[str], row: list[str], free: Collection[str]
 ) -> list[float]:
     if len(row) != len(names):
-        sizes = {"line": line, "has": len(row), "head": 1, "names": len(names)}
+        sizes = {"line": line, "has": len(row), "names": len(names)}
         raise refused("file.row", path.name, **sizes)
     values = []
     for name, cell in zip(names, row, strict=True):
@@ -234,7 +234,7 @@ def target_arrays(
             there = [*states, *inputs]
             raise unknown("state or input", name, there, "the model", where=path.name)
     if len(values) < 2:
-        raise refused("file.rows", path.name, rows=str(len(values)), needs=2, then=SHAPE)
+        raise refused("file.rows", path.name, rows=str(len(values)), needs=2, target=1, then=SHAPE)
     if len(values) < horizon + 1:
         sizes = {"rows": str(len(values)), "needs": horizon + 1, "horizon": len(values) - 1}
         raise refused("file.rows", path.name, **sizes)

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import Finding
 from grounded_trials.formats.text_tables import table_remarks
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.workspace.folder import Folder
@@ -35,11 +35,6 @@ from grounded_trials.workspace.intake.opening.stored_before import (
 from grounded_trials.workspace.where_to_mend import twice_in_time
 
 SLIGHT = 0.002  # of a control step, by which interpolated states may be early
-
-
-def as_finding(said: Finding | str, code: str) -> Finding:
-    """Return what another room says as a finding, under a code if it is a text still."""
-    return found(code, said) if isinstance(said, str) else said
 
 
 def read_log_file(
@@ -81,7 +76,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     early = grid.interpolated_s / trial.dt > SLIGHT
     facts |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
     encoded = encode(log.workspace, trial, facts, grid.start_ns)
-    remarks = [text for file in log_files(log.path) for text in table_remarks(file)]
+    remarks = [one for file in log_files(log.path) for one in table_remarks(file)]
     return Read(
         trial,
         encoded,
@@ -89,8 +84,8 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
             *misread(log),
             *log.unlike_units,
             *log.unread,
-            *(as_finding(one, "log.reading") for one in remarks),
-            *(as_finding(one, "log.reading") for one in grid.warnings),
+            *remarks,
+            *grid.findings,
             *(() if candidate else begun(grid, trial.dt, trial.input_names)),
         ),
         grid.reports,

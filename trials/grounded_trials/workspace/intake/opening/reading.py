@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, Quantity, Weight, found
 from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
@@ -103,7 +103,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
     ):
         same_names(str(path), what, theirs, own)
     if other := list(_other_units(workspace, meta)):
-        raise refused("log.stored_units", path, units=tuple(other))
+        raise refused("given.fit", path, what="units", theirs=tuple(other), own="others")
     same_dt(str(path), trial.dt, dt)
     if data:
         if not trial.candidate:
@@ -150,14 +150,14 @@ def check_candidate(
         GroundedError: if not.
     """
     if candidate not in workspace.candidate_ids():
-        raise refused("log.foreign_run", path, ran=candidate, what="unknown")
+        raise refused("log.earlier", path, ran=candidate, what="unknown")
     own = workspace.task.hash
     made, meta = workspace.candidate(candidate)
     if meta.get("task") != own or task not in ("", own):
         was = other_task(workspace.task, made)
-        raise refused("log.earlier", log=str(path), ran=candidate, was=was)
+        raise refused("log.earlier", path, ran=candidate, was=was)
     if policy is not None and policy != workspace.candidate_bytes(candidate):
-        raise refused("log.foreign_run", path, ran=candidate, what="policy")
+        raise refused("log.earlier", path, ran=candidate, what="policy")
 
 
 class NoneWaits(GroundedError):
@@ -208,7 +208,7 @@ def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Rea
     if (one := same_recording(workspace, path, read.data, read.log)) is None:
         return read
     refuse_as_another(workspace, path, (one,), wanted)
-    same = found("log.copy", one.stored.id)
+    same = found("log.repeats", one.stored.id, weight=Weight.NOTE)
     return Read(one.trial, workspace.store.read(one.stored), (same,), copy=True)
 
 

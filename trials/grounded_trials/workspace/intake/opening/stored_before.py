@@ -90,7 +90,7 @@ class Aside:
     def finding(self, *, used: bool) -> Finding:
         """Return that the log is used as before, or not."""
         as_ = self.candidate or "data"
-        return found("log.before" if used else "log.not_used", self.id, ran=as_)
+        return found("log.before", self.id, ran=as_, used=used)
 
 
 def set_aside_of(workspace: Folder, digest: str) -> Aside | None:

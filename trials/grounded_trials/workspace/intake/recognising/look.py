@@ -120,8 +120,6 @@ class Look:
         self.read = cut_there.telling(*kept)
         if start.missed:
             self.read = self.read.telling(self._not_sent(start.missed))
-        elif begins > 0:
-            self.read = self.read.telling(found("log.earlier_rows", ran=ran, seconds=begins))
         cut = apart.cut(ran, start.seconds)[0] if apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
 

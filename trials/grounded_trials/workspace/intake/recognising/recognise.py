@@ -350,7 +350,7 @@ def _refusal(case: Case, story: Story) -> GroundedError:
 def _of_earlier(workspace: Folder, path: str, ran: str) -> GroundedError:
     """Return the error of a log that a candidate of an earlier task ran."""
     was = other_task(workspace.task, workspace.candidate(ran)[0])
-    told = found("log.earlier", log=path, ran=ran, was=was)
+    told = found("log.earlier", path, ran=ran, was=was)
     return OfEarlierTask(told, NextCommand("ingest", (path, "--data")))
 
 

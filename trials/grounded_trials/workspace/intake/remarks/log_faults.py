@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
 TURNS, WIDER = 5.0, 2.0
 COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
-KINDS = "unit folded sign compass exchange dead offset axes pace clock"
+KINDS = "unit sign compass exchange dead offset axes pace clock"
 COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
 
 
@@ -41,7 +41,7 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
     faults = column_faults(workspace, known)
-    if not any(one.code in ("log.unit", "log.folded") for one in faults):
+    if not any(one.code == "log.unit" for one in faults):
         faults += _beyond_safety(workspace.task, trial)
     faults += _clocks_apart(workspace, trial)
     return tuple(_mended(workspace, known, one, own=own) for one in faults)

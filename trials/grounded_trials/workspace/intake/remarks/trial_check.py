@@ -48,7 +48,7 @@ def checked(workspace: Folder, trial: Trial, last_s: float = math.nan) -> Iterat
     for i, most in enumerate(excess.max(axis=0, initial=0.0)):
         if most > ROUNDED:
             name = whole.input_names[i]
-            yield found("log.outside", name, most=Quantity(most, task.model.inputs[name]))
+            yield found("log.limits", name, most=Quantity(most, task.model.inputs[name]))
     candidate, _ = workspace.candidate(trial.candidate)
     if np.ptp(candidate.predicted_states, axis=0).any():
         yield from _still(whole)
@@ -128,4 +128,4 @@ def left_afterwards(task: Task, whole: Trial) -> Finding | None:
     most = float(states[t, i])
     bound = Quantity(float(np.clip(most, task.safety_low[i], task.safety_high[i])), unit)
     after = Quantity(first * whole.dt, "s")
-    return found("run.after_safety", name, after=after, bound=bound, most=Quantity(most, unit))
+    return found("run.safety", name, after=after, bound=bound, most=Quantity(most, unit))
