@@ -8,7 +8,7 @@ queue of whole simulation steps between the policy and the simulator.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -38,10 +38,15 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A simulator behind the robot's interface; `delay` [s] before commands arrive."""
+    """A simulator behind the robot's interface; `delay` [s] before commands arrive.
+
+    `noise` (n,) is the standard deviation of what is measured, drawn anew in each run.
+    """
 
     simulator: Simulator
     delay: float = 0.0
+    noise: np.ndarray | None = None
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def run(self, policy: Policy) -> Trial:
         """Run once; end early if a measured state is not finite or absurdly large."""
@@ -53,13 +58,13 @@ class Robot:
         queue = deque([np.array(policy.past)] * late)
         runner = Runner(policy)
         sim.reset()
-        states, inputs = [sim.measure()], []
+        states, inputs = [self.measured()], []
         for t in range(H):
             command = runner.action(t * policy.dt, states[-1])
             for _ in range(steps):
                 queue.append(command)
                 sim.advance(queue.popleft())
-            measured = sim.measure()
+            measured = self.measured()
             inputs.append(command)
             states.append(measured)
             if not (np.isfinite(measured).all() and np.abs(measured).max() < 1e6):
@@ -74,6 +79,11 @@ class Robot:
             input_names=policy.input_names,
             start_inputs=policy.past,
         )
+
+    def measured(self) -> np.ndarray:
+        """Return the measured states (n,)."""
+        x = self.simulator.measure()
+        return x if self.noise is None else x + self.noise * self.rng.standard_normal(len(x))
 
 
 def with_true_model(task: Task, model: Model, delay: float = 0.0) -> Task:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from benchmarks.foreign import aircraft, cars, pushing
 from benchmarks.foreign import mechanisms as mech
-from benchmarks.foreign.robots import Robot
+from benchmarks.foreign.robots import Robot, with_true_model
+from grounded.adapters import mujoco
 from grounded.challenge.mechanism import arm_xml, cart_xml
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
@@ -20,6 +23,7 @@ class Setup:
     """One system and what is withheld from its crude model.
 
     truth: the same task planned in the simulator, where the simulator can be a Model.
+    cause: pattern of the names that a diagnosis may give to what is withheld.
     """
 
     name: str
@@ -27,6 +31,7 @@ class Setup:
     task: Task
     robot: Robot
     truth: Task | None = None
+    cause: str = ""
 
     def run(self, candidate: Candidate) -> Trial:
         """Run the candidate once on the robot."""
@@ -50,6 +55,23 @@ def arm(name: str, withheld: str, delay: float = 0.0, **what: object) -> Setup:
 def arm7(name: str, withheld: str, **what: float) -> Setup:
     task = mech.arm7_task()
     return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**what)))
+
+
+def shipped(
+    name: str, withheld: str, system: str, cause: str, delay: float = 0.0, noise: float = 0.0,
+    **what: float,
+) -> Setup:  # fmt: skip
+    task = mech.shipped_task(system)
+    compiled = mech.shipped_model(system, **what)
+    joints = [compiled.joint(n).id for n in task.model.state_names[: task.model.n // 2]]
+    columns = [*joints, *(compiled.nq + j for j in joints)]  # hinges and slides only
+    simulator = mech.MujocoRobot(compiled, np.asarray(task.start), columns)
+    scatter = noise * np.repeat([1.0, 10.0], len(joints)) if noise else None  # [rad], [rad/s]
+    truth = None
+    if not noise:
+        model = mujoco.model(compiled, without="unmoved")
+        truth = with_true_model(task, model, delay)
+    return Setup(name, withheld, task, Robot(simulator, delay, scatter), truth, cause)
 
 
 def block(name: str, withheld: str, kind: str, **what: float) -> Setup:
@@ -100,6 +122,25 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "multi-body-3": (car, f"{SLIP}, 3.2 m/s2", {"kind": "multi-body", "acceleration": 3.2}),
     "multi-body-5": (car, f"{SLIP}, 5 m/s2", {"kind": "multi-body", "acceleration": 5.0}),
 }  # fmt: skip
+
+# what is withheld of each shipped system, and the names that a diagnosis may give it
+WITHHELD: dict[str, tuple[str, dict[str, float]]] = {
+    "friction": ("(joint|coulomb|dry)_friction:.*{joint}_vel", {"friction": 1.0}),
+    "delay": ("delay:", {"delay": 0.04}),
+    "lag": ("first_order_lag:", {"lag": 0.04}),
+    "gear": ("input_gain:", {"gear": 0.8}),
+    "payload": ("parameter:.*_mass", {"payload": 1.0}),
+    "mixed": ("crosstalk:|coupling:", {"mixed": 0.3}),
+    "noise": ("(joint|coulomb|dry)_friction:.*{joint}_vel", {"friction": 1.0, "noise": 1e-3}),
+}
+ONE_MOTOR = ("pendulum", "double-pendulum", "acrobot")  # has no axes to mix
+for system, one in mech.SHIPPED.items():
+    for what, (cause, sizes) in WITHHELD.items():
+        unknown = what == "mixed" and system in ONE_MOTOR
+        stiff = "friction" in sizes and system == "acrobot"  # whose file disables dry friction
+        if not (unknown or stiff):
+            named = {"system": system, "cause": cause.format(joint=one.friction[0]), **sizes}
+            SETUPS[f"{system}-{what}"] = (shipped, what, named)
 
 
 def setup(name: str) -> Setup:

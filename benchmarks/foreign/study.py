@@ -7,6 +7,7 @@ with nothing withheld there is no gap.
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
 from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.report import Diagnosis
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
@@ -113,10 +115,13 @@ def adopting(setup: Setup, after: int) -> str:
     task, options = setup.task, SearchOptions()
     candidates: list[Candidate] = []
     trials: list[Trial] = []
-    planner, claimed = Planner(task, task), "ended before"
+    seconds = 0.0
+    planner, claimed, place = Planner(task, task), "ended before", "-"
     while True:
         if len(trials) == after and claimed == "ended before":
+            began = time.process_time()
             found = diagnose(task, trials)
+            seconds, place = time.process_time() - began, place_of(setup.cause, found)
             own = {k: e.value for k, e in found.known_parameters.items() if k in task.model.params}
             named = [n for n in found.effects if not n.startswith("parameter:")]
             fitted = task.with_model(task.model.with_values(own))
@@ -131,8 +136,27 @@ def adopting(setup: Setup, after: int) -> str:
     best, final = known().get(setup.name, {}).get("utility"), max(utilities)
     reached = reached_in(trials_to(setup, utilities, best))
     off = "-" if best is None else f"{100 * (best - final) / abs(best):.1f} %"
-    cells = (setup.name, claimed, f"{final:.4g}", off, str(len(trials)), reached)
+    cells = (
+        setup.name, claimed, place, f"{utilities[0]:.4g}", f"{final:.4g}", off, str(len(trials)),
+        reached, f"{seconds:.0f}",
+    )  # fmt: skip
     return f"| {' | '.join(cells)} |"
+
+
+def place_of(cause: str, found: Diagnosis) -> str:
+    """Return where what is withheld stands in a diagnosis: claimed, tied, its rank, or "-"."""
+    if not cause:
+        return "-"
+    true = re.compile(cause)
+    if any(true.match(name) for name in found.effects):
+        return "claimed"
+    groups = (*found.indistinguishable, *found.equivalent)
+    tied = [name for group in groups if {*group} & {*found.effects} for name in group]
+    tied += [one.like for one in found.lookalikes]
+    if any(true.match(name) for name in tied):
+        return "tied"
+    ranks = (k for k, row in enumerate(found.ranking, 1) if true.match(row.effect))
+    return str(next(ranks, "-"))
 
 
 def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple[int | None, ...]:

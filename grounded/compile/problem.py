@@ -198,6 +198,7 @@ class DescentOptions:
     max_iterations: int = 100
     tolerance: float = 1e-8  # stop when the predicted change is below this times the cost
     halvings: int = 11  # alpha = 1 ... 1/2^11
+    damped: int = 11  # the same where mu damps the step; not by compiled systems
     accept: float = 0.1  # least part of the predicted change
     enough: float = 0.0  # stop after an accepted step that gains less; not by compiled systems
 

@@ -17,8 +17,8 @@ starts, and the plan with the lowest cost is taken:
 
 A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
 iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of what standing still
-costs (an error of a thousandth of the way), and a rival gets as many iterations as the reference
-took. Its slopes are differences, which a joint that sticks or a contact makes wrong: smaller
+costs (an error of a thousandth of the way). The start that costs least is first, and a rival gets as
+many iterations as it took. Its slopes are differences, which a joint that sticks or a contact makes wrong: smaller
 promises are often not kept, and such a search would go on for as long again.
 
 A plan is made in a model with smoothed kinks and run in one without smoothing. If its run there
@@ -57,6 +57,7 @@ MORE_WORK = 2e8  # budget for MANY, in the same units
 WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry friction builds up over
 FOLLOWED = 200  # iterations of DDP for each of them
 ROUGH = 1e-3  # relative gain of an iteration below which a simulator's plan is done
+DAMPED = 4  # halvings of a simulator's damped step: more damping costs it less than more runs
 BLUNT = 1.2  # cost ratio, unsmoothed over smoothed, above which a plan is re-solved
 SHARPER = (0.5, 0.25, 0.1, 0.03, 0.01, 0.0)  # factors on the smoothing width
 FEWEST = 10  # a rival is not started with fewer iterations than this
@@ -64,6 +65,7 @@ CHECKED = 4  # steps of the plan at which the model's code is evaluated again to
 HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # factor of the best cost above which a start is dropped
 
 Tick = Callable[[str], None]
+Start = tuple[Array, Array | None, Array | None]  # inputs, feedback and its reference, see `solve`
 
 
 def first_policy(
@@ -87,16 +89,19 @@ def first_policy(
     """
     task = cautious(task, caution)
     problem, guess = task.problem(), first_guess(task)
-    best = finished(problem, guess.inputs, guess.gain, guess.z[:-1], tick=tick)
-    rivals = list(_rivals(task))
+    reference = (guess.inputs, guess.gain, guess.z[:-1])
+    starts: list[Start] = [reference, *((inputs, None, None) for inputs in _rivals(task))]
+    if problem.system.simulated:
+        starts.sort(key=lambda start: _start_cost(problem, start))
+    best, rivals = finished(problem, *starts[0], tick=tick), starts[1:]
     size = problem.horizon * (problem.nz + task.model.m) ** 2
     share = WORK / (len(rivals) * size)
     if problem.system.simulated:
         share = len(best.trace)
     most = int(np.clip(share, FEWEST, ITERATIONS))
     elsewhere = False
-    for inputs in rivals if share >= FEWEST else rivals[:2]:
-        found = _pursued(problem, inputs, best, most, tick)
+    for start in rivals if share >= FEWEST else rivals[:2]:
+        found = _pursued(problem, start, best, most, tick)
         elsewhere |= _other_optimum(found, best)
         best = _better(found, best)
     if elsewhere and share >= FEWEST and task.model.system.how == "compiled":
@@ -139,8 +144,7 @@ def _sharpened(task: Task, problem: Problem, best: ddp.Solution, tick: Tick | No
 
 def _cost(problem: Problem, plan: ddp.Solution) -> float:
     """Return the cost of a plan's run with its feedback; infinite if it diverges."""
-    cost = float(problem.system.rollout(problem, plan.u, plan.K, plan.z[:-1]).cost[0])
-    return cost if np.isfinite(cost) else np.inf
+    return _start_cost(problem, (plan.u, plan.K, plan.z[:-1]))
 
 
 def cautious(task: Task, caution: int) -> Task:
@@ -186,7 +190,7 @@ def _hopped(
             found = finished(problem, *start, most=SKETCH, tick=tick) if early.ok else None
         else:
             inputs = _random(task, rng, i // 4) if i % 4 else _kicked(task, rng, best.u)
-            found = _pursued(problem, inputs, best, SKETCH, tick)
+            found = _pursued(problem, (inputs, None, None), best, SKETCH, tick)
         work -= size * (len(found.trace) if found else 1)
         if found is not None and found.status == "max iterations":
             if found.cost > PROMISING * best.cost:
@@ -228,7 +232,7 @@ def finished(
     if problem.system.simulated:
         still = tracking_error(problem, np.tile(problem.z_start(), (problem.horizon + 1, 1)))
         enough = ROUGH**2 * float(np.sum(problem.state_weight * still**2))
-        options = DescentOptions(max_iterations=most, tolerance=ROUGH, enough=enough)
+        options = DescentOptions(most, ROUGH, damped=DAMPED, enough=enough)
     result = ddp.solve(problem, inputs, K, z, options, told)
     trace = list(result.trace)
     while result.status == "max iterations" and len(trace) < most:
@@ -244,15 +248,21 @@ def finished(
 
 
 def _pursued(
-    problem: Problem, inputs: Array, best: ddp.Solution, most: int, tick: Tick | None
+    problem: Problem, start: Start, best: ddp.Solution, most: int, tick: Tick | None
 ) -> ddp.Solution | None:
     """Run DDP from a start; return None if the initial cost is hopelessly high."""
-    cost = float(problem.system.rollout(problem, inputs).cost[0])
+    cost = _start_cost(problem, start)
     cheap = problem.system.how == "compiled" and most > FEWEST
     most_cost = HOPELESS if cheap else HOPELESS_SLOW
     if not np.isfinite(cost) or (best.ok and cost > most_cost * best.cost):
         return None
-    return finished(problem, inputs, most=most, tick=tick)
+    return finished(problem, *start, most=most, tick=tick)
+
+
+def _start_cost(problem: Problem, start: Start) -> float:
+    """Return the cost of the run that DDP starts from; infinite if it diverges."""
+    cost = float(problem.system.rollout(problem, *start).cost[0])
+    return cost if np.isfinite(cost) else np.inf
 
 
 def _better(found: ddp.Solution | None, best: ddp.Solution) -> ddp.Solution:

@@ -161,7 +161,10 @@ def _search(
 ) -> tuple[_State, float]:
     """The first alpha that keeps its promise; 0 and a higher regularisation if none does."""
     gains, alphas = found.gains, np.float64(0.5) ** np.arange(options.halvings + 1)
-    for some in (alphas[:1], alphas[1:5], alphas[5:]):  # the first is nearly always enough
+    if found.mu:
+        alphas = alphas[: options.damped + 1]
+    parts = (alphas[:1], alphas[1:5], alphas[5:])  # the first is nearly always enough
+    for some in filter(len, parts):
         swarm = problem.system.rollout(problem, state.u, gains.K, state.z, gains.k, some)
         enough = swarm.cost - state.cost <= options.accept * (some * gains.d1 + some**2 * gains.d2)
         if enough.any():
