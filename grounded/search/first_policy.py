@@ -17,9 +17,9 @@ starts, and the plan with the lowest cost is taken:
 
 A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
 iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of what standing still
-costs (an error of a thousandth of the way). The start that costs least is first, and a rival gets as
-many iterations as it took. Its slopes are differences, which a joint that sticks or a contact makes wrong: smaller
-promises are often not kept, and such a search would go on for as long again.
+costs (an error of a thousandth of the way). The start that costs least is first, and a rival gets
+as many iterations as that took. Slopes are differences, which a joint that sticks or a contact
+makes wrong: smaller promises are often not kept, and such a search would go on for as long again.
 
 A plan is made in a model with smoothed kinks and run in one without smoothing. If its run there
 costs much more, it is re-solved while the smoothing is reduced (`_sharpened`).
