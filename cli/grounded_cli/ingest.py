@@ -137,7 +137,9 @@ def _tell(name: str, one: Ingested, model: Model, details: bool) -> None:
         gained = "no utility" if ended else f"utility {number(one.utility)}"
         if one.runs > 1 and number(one.mean) != number(one.utility) and math.isfinite(one.mean):
             gained += f" (mean of its {one.runs} runs: {number(one.mean)})"
-        text = ASIDE if one.verdict == ASIDE and ended else f"{gained}, {one.verdict}"
+        early = one.verdict == "crashed" and one.then.verb == "discard"
+        text = f"{gained}, {'ended early' if early else one.verdict}"
+        text = ASIDE if one.verdict == ASIDE and ended else text
         show(field(one.candidate, text, "  "))
     if one.off_target:
         show(field("off target", "; ".join(each.finding.what for each in one.off_target), "  "))

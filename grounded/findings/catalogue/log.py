@@ -172,16 +172,6 @@ ENTRIES: dict[str, Entry] = {
         "if {name} was 0, add a row before it that says so, or ingest it with `--before {name}=0`: "
         "it then begins with the step, from which a delay or a lag can be told",
     ),
-    "slow": Entry(
-        "note",
-        "the commands of {about} come every {every:.3g} s, but [task] dt is {dt:g} s",
-        "did you mean dt = {every:.3g}?",
-    ),
-    "rows": Entry(
-        "note",
-        "its rows repeat the commands every {every:.3g} s: a delay is known to +- {half:.3g} s "
-        "only",
-    ),
     "start_doubt": Entry(
         "warn",
         "where {ran} begins is in doubt: its commands fit as well from {rival:.3f} s of the log on "

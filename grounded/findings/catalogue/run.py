@@ -171,15 +171,13 @@ ENTRIES: dict[str, Entry] = {
     "start": Entry(
         "warn",
         "the run started with {state} = {began}, the task's start is {start}: {off} off[[, as "
-        "those of {runs} other runs, off by {rms} (rms)]][[; by the model that changes its utility "
-        "by {change:+.3g}]]: the run counts[[, and is to be run once {again:True=more}]]",
-        "place the robot nearer to the start next time",
-    ),
-    "start_always": Entry(
-        "warn",
-        "the run started with {state} = {began}, {off} off the task's start, and so did {others}",
-        "if the robot always starts there, write {values} in [task] start and propose again: the "
-        "search begins again, all logs stay for fit and diagnose",
+        "those of {runs} other runs, off by {rms} (rms)]][[, and so did {others}]][[; by the model "
+        "that changes its utility by {change:+.3g}]]: the run counts[[, and is to be run once "
+        "{again:True=more}]]",
+        "[[!values? place the robot nearer to the start next time]][[if the robot always starts "
+        "there, write {values} in [task] start and propose again: the search begins again, all "
+        "logs "
+        "stay for fit and diagnose]]",
     ),
     # its end
     "safety": Entry(

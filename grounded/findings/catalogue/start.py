@@ -64,7 +64,8 @@ ENTRIES: dict[str, Entry] = {
         "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[, its rows come "
         "every "
         "{rows:.3g} s]][[read as seconds, its rows are {apart:.3g} s apart]]",
-        "[[every? --dt sets another]][[apart? if the times are in ms or us, end that column's name "
+        "[[every? [task] dt (--dt) sets another]][[apart? if the times are in ms or us, end that "
+        "column's name "
         "with _ms or _us and create the workspace again in another folder]]",
     ),
     "encoder": Entry(
@@ -113,10 +114,5 @@ ENTRIES: dict[str, Entry] = {
         "{end}]]",
         "omit it[[rate?, or ask for 0 (--to {about}=0)]]"
         "[[; --hold 1 lets the path end at rest and stay there{hold:1=}]]",
-    ),
-    "no_way": Entry(
-        "refuse",
-        "the line ends where it starts, at {to}",
-        "change --to[[: it ends at rest, so say where, such as --to {goes}=1.0]]",
     ),
 }

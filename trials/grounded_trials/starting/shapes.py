@@ -262,7 +262,7 @@ def line_target(
         there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
         still = {*to} <= {*velocities_of(model)}
         goes = next((q for q in (*position_names(model), *velocities(model)) if q not in to), "")
-        raise refused("start.no_way", to=there, goes=goes if still and goes else None)
+        raise wrong("--to", got=there, must="way", like=f"{goes}=1.0" if still and goes else None)
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
         _grid(seconds + drive.hold, dt)

@@ -20,7 +20,7 @@ def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
     log = record(w, tmp_path / "a.csv", policy, 0.7, until=until)
     out = grounded("-C", w.folder, "ingest", log)
     told = " ".join(f"{out.out} {out.err}".split())
-    assert holds(told, "no utility: it ended early") and "crashed:" not in told
+    assert holds(told, "no utility", "ended early") and "crashed:" not in told
     assert f"`grounded -C {w.folder} discard t0001`" in told
     now = w.forget().status()
     assert now.then.arguments == ("t0001",) and holds(now.notes[0], "t0001", "recording")

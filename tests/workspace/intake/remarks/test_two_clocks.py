@@ -40,7 +40,7 @@ def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
     ran = w.propose().candidate
     log = two_tables(w, tmp_path / "run.npz", ran.policy, apart)
     for how in ({"data": True}, {}):
-        with pytest.raises(GroundedError, match="clocks that differ") as refused:
+        with pytest.raises(GroundedError, match="differ by about") as refused:
             w.ingest(log, **how)
     lines = dict(re.findall(r"\[log\.state\.(\w)\] (delay_s = -?\d+\.\d+)", str(refused.value)))
     assert list(lines) == ["x", "v"]

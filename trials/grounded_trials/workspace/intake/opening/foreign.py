@@ -321,9 +321,7 @@ def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
     slow = [one for one in grid.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER]
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
-        yield found("log.slow", *(one.name for one in slow), every=every, dt=dt)
-    if grid.row_s > dt / 20:
-        yield found("log.rows", every=grid.row_s, half=grid.row_s / 2)
+        yield found("start.interval", *(one.name for one in slow), every=every, dt=dt)
 
 
 def misread(log: ForeignLog) -> list[Finding]:

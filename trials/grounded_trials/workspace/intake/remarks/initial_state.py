@@ -121,9 +121,7 @@ def _always_there(workspace: Folder, trial: Trial, off: Array) -> Finding | None
     values = tuple(f"{name} = {value:.4g}" for name, value in whole.items())
     facts = _placed(task, trial, odd[0], off[odd[0]])
     others_too = (*stood, *began)
-    return found(
-        "run.start_always", *(names[i] for i in odd), others=others_too, values=values, **facts
-    )
+    return found("run.start", *(names[i] for i in odd), others=others_too, values=values, **facts)
 
 
 def _inside(task: Task, states: Array) -> Array:
