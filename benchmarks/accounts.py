@@ -347,73 +347,69 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     turning = [n for n in model.states if units[n] in ("rad", "rad/s")]
     lengths = [n for n in model.states if units[n] == "m"]
     speeds = [n for n in model.states if units[n] == "m/s"]
-    yield Fault("angle in degrees", "unit", one(str(angle)), times([str(angle)], DEGREES))
-    yield Fault("all angles in degrees", "unit", one(*turning), times(turning, DEGREES))
+    yield Fault("angle: degrees", "unit", one(str(angle)), times([str(angle)], DEGREES))
+    yield Fault("angles: degrees", "unit", one(*turning), times(turning, DEGREES))
     first = [*times([str(angle)], DEGREES, trials[:1]), *trials[1:]]
-    yield Fault("angle of one trial in degrees", "unit", one(str(angle)), first)
+    yield Fault("degrees once", "unit", one(str(angle)), first)
     if rate:
-        yield Fault("rate in degrees", "unit", one(rate), times([rate], DEGREES))
-        yield Fault("rate in rpm", "unit", one(rate), times([rate], RPM))
-        yield Fault("sign of a rate", "sign", one(rate), times([rate], -1.0))
+        yield Fault("rate: degrees", "unit", one(rate), times([rate], DEGREES))
+        yield Fault("rate: rpm", "unit", one(rate), times([rate], RPM))
+        yield Fault("rate: sign", "sign", one(rate), times([rate], -1.0))
         scaled = float(rng.choice([0.75, 1.3]))
-        yield Fault("scale of a rate", "scale", one(rate), times([rate], scaled))
+        yield Fault("rate: scale", "scale", one(rate), times([rate], scaled))
         noise = max(robot.noise)
         dead = _set(trials, lambda c: c.update({rate: noise * rng.normal(size=len(c[rate]))}))
-        yield Fault("dead rate (noise)", "dead", one(rate), dead)
+        yield Fault("rate: noise", "dead", one(rate), dead)
         none = _set(trials, lambda c: c.update({rate: np.full(len(c[rate]), 0.0)}))
-        yield Fault("dead rate (zero)", "dead", one(rate), none)
+        yield Fault("rate: zero", "dead", one(rate), none)
         first = [dead[0], *trials[1:]]
-        yield Fault("dead rate of one trial", "dead", one(rate), first)
+        yield Fault("noise once", "dead", one(rate), first)
         late = float(rng.uniform(0.06, 0.15)) / dt
         yield Fault("late rate", "late", one(rate), shifted([rate], late))
     if length:
-        yield Fault("position in mm", "unit", one(length), times([length], 1e3))
-        yield Fault("positions in mm", "unit", one(*lengths), times(lengths, 1e3))
+        yield Fault("position: mm", "unit", one(length), times([length], 1e3))
+        yield Fault("positions: mm", "unit", one(*lengths), times(lengths, 1e3))
         feet = (frozenset(lengths),)
-        yield Fault("positions in feet", "unit", feet, times(lengths, 3.28084))
+        yield Fault("positions: feet", "unit", feet, times(lengths, 3.28084))
         yield Fault(
             "positions exchanged",
             "exchange",
             one(*lengths[:2]),
             _set(trials, exchanged(*lengths[:2])),
         )
-        yield Fault("sign of a position", "sign", one(length), times([length], -1.0))
+        yield Fault("position: sign", "sign", one(length), times([length], -1.0))
         late = float(rng.uniform(0.12, 0.25)) / dt
         yield Fault("late positions", "late", one(*lengths), shifted(lengths, late))
     if speed:
-        yield Fault("speeds in km/h", "unit", one(*speeds), times(speeds, 3.6))
-        yield Fault("speeds in knots", "unit", one(*speeds), times(speeds, 1.943844))
-        yield Fault(
-            "all lengths in mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3)
-        )
+        yield Fault("speeds: km/h", "unit", one(*speeds), times(speeds, 3.6))
+        yield Fault("speeds: knots", "unit", one(*speeds), times(speeds, 1.943844))
+        yield Fault("lengths: mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3))
     if length and angle and "heading" in model.roles:
         yield Fault(
-            "position and heading exchanged",
+            "heading exchanged",
             "exchange",
             one(length, angle),
             _set(trials, exchanged(length, angle)),
         )
         turn = float(rng.choice([np.pi / 2, -0.7, 1.2]))
         off = _set(trials, lambda c: c.update({angle: c[angle] + turn}))
-        yield Fault("heading with an offset", "offset", one(angle), off)
+        yield Fault("heading: offset", "offset", one(angle), off)
         others = {n for n in model.states if n == "r"}
         compass = _set(trials, lambda c: c.update({angle: np.pi / 2 - c[angle]}))
         yield Fault("compass heading", "sign", one(angle), compass)
         both = _set(compass, lambda c: c.update({n: -c[n] for n in others}))
         if others:
-            yield Fault("compass and gyro", "sign", one(angle, *others), both)
-        yield Fault("sign of the heading", "sign", one(angle), times([angle], -1.0))
+            yield Fault("compass, gyro", "sign", one(angle, *others), both)
+        yield Fault("heading: sign", "sign", one(angle), times([angle], -1.0))
     pairs = [
         (q, w)
         for q, w in (("q1", "w1"), ("th", "w"), ("x", "vx"), ("psi", "r"))
         if {q, w} <= {*units}
     ]
     for q, w in pairs[:1]:
-        yield Fault(
-            "position and velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w))
-        )
+        yield Fault("velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w)))
     for q, w in [one for one in pairs if one[0] in ("q1", "th")][:1]:
-        yield Fault("sign of a joint", "sign", one(q, w), times([q, w], -1.0))
+        yield Fault("joint: sign", "sign", one(q, w), times([q, w], -1.0))
     if "q2" in units:
         swap = _set(_set(trials, exchanged("q1", "q2")), exchanged("w1", "w2"))
         both = (frozenset({"q1", "q2", "w1", "w2"}), frozenset({"tau1", "tau2"}))
@@ -423,10 +419,10 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     yield Fault("commands exchanged", "exchange", one(a, b), _set(trials, exchanged(a, b)))
     factors = {"rad": DEGREES, "%": 0.01, "N": 1000.0, "N m": 1000.0, "1": 100.0}
     same = [n for n in model.inputs if units[n] == units[b]]
-    yield Fault("commands in another unit", "unit", one(*same), times(same, factors[units[b]]))
+    yield Fault("commands: unit", "unit", one(*same), times(same, factors[units[b]]))
     first = [*times([b], -1.0, trials[:1]), *trials[1:]]
     if not robot.held:
-        yield Fault("command of one trial reversed", "sign", one(b), first)
+        yield Fault("reversed once", "sign", one(b), first)
     early = max(2, round(0.25 / dt))
     moved = [
         replace(t, states=t.states[early:], inputs=t.inputs[: t.steps - early]) for t in trials
@@ -444,7 +440,7 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         for at in range(30, len(c[name]) - 30, 60):
             c[name][at : at + 20] = c[name][at]
 
-    yield Fault("stuck at times", "stuck", one(name), _set(trials, sticks))
+    yield Fault("stuck", "stuck", one(name), _set(trials, sticks))
 
     gone = 40 * float(np.std(trials[0].states[:, model.state_names.index(name)])) + 5
 

@@ -684,18 +684,18 @@ def user_code(rng: random.Random, seconds: float) -> Tally:
     return tally
 
 
-ATTACKS: dict[str, tuple[str, Callable[[random.Random, float], Tally]]] = {
-    "mutants": ("MCAP mutants with sound checksums: read, inspect, recover", mutants),
-    "configurations": ("grounded.toml, model.py, target.csv mutated", configurations),
-    "kills": ("each writing command killed, and run again", kills),
-    "short writes": ("each writing command on a disk that takes no more", short_writes),
-    "crowds": ("six commands at once in one workspace", crowds),
-    "flips": ("one bit of any file of a workspace", flips),
-    "bombs": ("small MCAP files that ask for gigabytes or hours", bombs),
-    "other bombs": ("the same as bags, tables, archives and PX4 logs", other_bombs),
-    "policies": ("exported policies mutated: load, run", policies),
-    "calls": ("random calls of the exported runner", calls),
-    "user code": ("model.py and real.py that print, exit, raise or change the folder", user_code),
+ATTACKS: dict[str, Callable[[random.Random, float], Tally]] = {
+    "mutants": mutants,
+    "configurations": configurations,
+    "kills": kills,
+    "short writes": short_writes,
+    "crowds": crowds,
+    "flips": flips,
+    "bombs": bombs,
+    "other bombs": other_bombs,
+    "policies": policies,
+    "calls": calls,
+    "user code": user_code,
 }
 
 
@@ -707,7 +707,7 @@ def apart(name: str, seed: int, seconds: float) -> Tally:
         import pickle
 
         os.close(read)
-        tally = ATTACKS[name][1](random.Random(f"{seed} {name}"), seconds)
+        tally = ATTACKS[name](random.Random(f"{seed} {name}"), seconds)
         with os.fdopen(write, "wb") as out:
             pickle.dump(tally, out)
         os._exit(0)

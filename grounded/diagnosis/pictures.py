@@ -45,9 +45,8 @@ def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
     panels = _over_horizons(errors, columns) if apart else _by_channel(errors[0], columns)
     if not panels:
         return None
-    held = "held-out data" if errors[0].held_out != "no" else "the data used for the diagnosis"
+    caption = "" if errors[0].held_out != "no" else "not held out"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
-    caption = f"Rms error of predictions on {held}."
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
@@ -114,10 +113,9 @@ def credit_figure(diagnosis: Diagnosed, states: int = STATES) -> Figure | None:
     panels = [worth_of(name, error, diagnosis) for name in names if error]
     if credit:
         bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST]]
-        panels.insert(0, Bars("Errors without each, mean of all (logarithmic)", tuple(bars)))
-    caption = "All but: with every cause of this diagnosis except one, fitted again."
+        panels.insert(0, Bars("Errors without each", tuple(bars)))
     found = tuple(panel for panel in panels if panel.bars)
-    return Figure("credit", "What each is worth", caption, found) if found else None
+    return Figure("credit", "What each is worth", "", found) if found else None
 
 
 def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
@@ -126,10 +124,10 @@ def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
     If effects were adopted before, also that of the model without them.
     """
     causes = diagnosis.credit
-    rows = [(("limit", "model.py, nothing adopted"), error.outset)]  # {} if it is so
-    rows += [(("model", "model before these causes" if causes else "model"), error.crude)]
+    rows = [(("limit", "model.py"), error.outset)]  # {} if it is so
+    rows += [(("model", "model"), error.crude)]
     if causes:  # else nothing was found: the same error once more
-        rows += [(("best", "with all causes"), error.with_effects)]
+        rows += [(("best", "all causes"), error.with_effects)]
     if len(causes) > 1:  # without the only one, it is the model before
         rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST]]
     rows += [(("other", columns_told(diagnosis)["noise_floor"]), error.noise_floor)]
@@ -148,10 +146,10 @@ def where_figure(diagnosis: Diagnosed) -> Figure | None:
         if math.isfinite(c.share)
     ]
     by_time = [(f"{t.start:.4g} to {t.end:.4g} s", t.share, "") for t in where.times]
-    by_region = [(r.told, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
+    by_region = [(r.told, r.share, f", {percent(r.occupancy)} occupancy") for r in where.regions]
     panels = [
         Bars(
-            f"Share of the gap by {word}",
+            f"Share by {word}",
             tuple(Bar(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST]),
         )
         for word, shares, role in (
@@ -166,12 +164,6 @@ def where_figure(diagnosis: Diagnosed) -> Figure | None:
             Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
             for r in diagnosis.ranking[:MOST]
         )
-        panels.append(Bars("Evidence for an effect [nats]", evidence))
-    caption = "Shares are of the squared one-step errors beyond the noise." * bool(by_channel)
-    if diagnosis.ranking:
-        caption += (
-            " Evidence: of a claimed effect (blue) what is lost without it, of another one what it "
-            "gains in place of all claimed ones."
-        )
+        panels.append(Bars("Evidence [nats]", evidence))
     title = "Where the gap is" if by_channel else "Effects compared"
-    return Figure("gap", title, caption.strip(), tuple(panels)) if panels else None
+    return Figure("gap", title, "", tuple(panels)) if panels else None

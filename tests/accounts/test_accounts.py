@@ -37,36 +37,36 @@ def logs():
             (name, fault)
             for name in ("boat",)
             for fault in (
-                "angle of one trial in degrees",
-                "positions in feet",
+                "degrees once",
+                "positions: feet",
                 "positions exchanged",
-                "speeds in knots",
-                "position and heading exchanged",
-                "heading with an offset",
+                "speeds: knots",
+                "heading exchanged",
+                "heading: offset",
                 "compass heading",
                 "commands exchanged",
             )
         ),
-        ("car", "all lengths in mm"),
-        ("boat", "compass and gyro"),
+        ("car", "lengths: mm"),
+        ("boat", "compass, gyro"),
         *(
             (name, fault)
             for name in ("drone",)
             for fault in (
-                "all angles in degrees",
-                "rate in rpm",
-                "sign of a rate",
-                "dead rate (noise)",
+                "angles: degrees",
+                "rate: rpm",
+                "rate: sign",
+                "rate: noise",
                 "late rate",
-                "position and velocity exchanged",
+                "velocity exchanged",
                 "states early",
-                "stuck at times",
+                "stuck",
             )
         ),
         ("arm", "joints exchanged"),
-        ("arm", "command of one trial reversed"),
-        ("rover", "angle in degrees"),
-        ("rover", "commands in another unit"),
+        ("arm", "reversed once"),
+        ("rover", "angle: degrees"),
+        ("rover", "commands: unit"),
     ],
 )
 def test_a_fault_is_named_with_its_signals(logs, robot, fault):
@@ -130,7 +130,7 @@ def test_dead_comes_before_exchanged():
 
 
 def test_a_refusal_names_the_trials_the_table_and_the_next_command(logs):
-    model, odd = ROBOT["car"].model, logs["car"]["positions in mm"].trials
+    model, odd = ROBOT["car"].model, logs["car"]["positions: mm"].trials
     trials = [replace(trial, id=f"t{k}") for k, trial in enumerate(odd)]
     with pytest.raises(UnusableTrials) as refused:
         sound_trials(model, trials)
@@ -143,8 +143,8 @@ def test_a_refusal_names_the_trials_the_table_and_the_next_command(logs):
 def test_what_is_certain_is_corrected_and_keeps_its_key_of_log(logs):
     model, sound = ROBOT["arm"].model, logs["arm"]["sound"].trials
     for name, kind, factor in (
-        ("rate in rpm", "degrees", 30 / np.pi),
-        ("sign of a rate", "sign", -1),
+        ("rate: rpm", "degrees", 30 / np.pi),
+        ("rate: sign", "sign", -1),
     ):
         fault = logs["arm"][name]
         looked = sound_trials(model, fault.trials)

@@ -71,8 +71,7 @@ def make_cases(
     if json_:
         show_json({"workspace": folder, "labels": str(sealed), "cases": names})
         return
-    made = count(len(names), "case")
-    show(f"{made} in {folder}, the labels in {sealed} (keep them apart)")
+    show(f"{folder}: {count(len(names), 'case')}; labels: {sealed}")
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
 
 
@@ -114,10 +113,7 @@ def run_cases(
         return
     if waiting:
         mean = sum(times.values()) / max(len(times), 1)
-        are = "case is" if len(waiting) == 1 else "cases are"
-        show(f"{len(waiting)} {are} diagnosed now; {mean:.1f} s of CPU a case")
-    else:
-        show("nothing to do: every case is diagnosed already (--again repeats them)")
+        show(f"{count(len(waiting), 'case')}: {mean:.1f} s CPU")
     show(f"\n{_scored(folder)}")
 
 

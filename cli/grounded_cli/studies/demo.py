@@ -55,23 +55,23 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         raise refused("file.exists", target)
     workspace = Workspace.create(target, example=name)
     located(str(target))  # for the commands in its texts
-    say(f"workspace {target}: {name}, a crude model and a simulated real system\n")
+    say(f"{target}: {name}\n")
     status = narrated(workspace)
-    with progress("finding the optimum with the true model"):
+    with progress("optimum"):
         best = optimum(workspace)
     save_optimum(workspace, best)
     with stages() as tell:
-        tell("diagnosing the gap")
+        tell("diagnosis")
         some, engine = _few(workspace, status), Engine(idle())
         diagnosed = workspace.diagnose(
             some, max_effects=MOST if some else None, engine=engine, progress=tell
         )
-    with progress("writing the report"):
+    with progress("report"):
         html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
         report = workspace.report(html=html, rrd=rrd)
     for made, what, extra in ((html, "page", "report"), (rrd, "recording", "view")):
         if not made:
-            remark("note", f"no {what} was written: it needs the extra `{extra}`")
+            remark("note", f"no {what}: extra `{extra}`")
     document = {
         "workspace": str(target),
         "utilities": status.standing.utilities,
@@ -88,10 +88,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         return
     say("")
     show(summary(status))
-    once = bool(status.standing.lead_doubt) and not any(
-        len(tried.trials) > 1 for tried in status.standing.history
-    )
-    _tell(document, [sentence(one) for one in told(diagnosed).lines], once=once)
+    _tell(document, [sentence(one) for one in told(diagnosed).lines])
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
@@ -108,21 +105,16 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
     return chosen[:most] if standing.trials > MANY * most else []
 
 
-def _tell(document: dict[str, Any], verdict: list[str], *, once: bool) -> None:
-    """Print what was learned and diagnosed; `once`: no run was repeated, so scatter is unknown."""
+def _tell(document: dict[str, Any], verdict: list[str]) -> None:
+    """Print what was learned and diagnosed."""
     first, last = document["utilities"][0], document["utilities"][-1]
     gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
-    gain += ", none of them repeated" * once
-    show(
-        "\n"
-        + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")
-    )
+    show("\n" + field("learned", f"{number(first)}, {number(last)} now: {gain}"))
     if document["optimum"] is not None:
-        known = "planned with the true model, which the search never saw"
-        show(field("optimum", f"{number(document['optimum'])}, {known}"))
+        show(field("optimum", f"{number(document['optimum'])}, by the true model"))
     used, trials = document["diagnosed_trials"], document["trials"]
     if 0 < used < trials:
-        verdict = [*verdict, f"Diagnosed with {used} of {trials} trials."]
+        verdict = [*verdict, f"{used} of {trials} trials"]
     for k, line in enumerate(verdict):
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():
@@ -131,6 +123,4 @@ def _tell(document: dict[str, Any], verdict: list[str], *, once: bool) -> None:
     if "rrd" in document["paths"]:
         show(f"\n{next_line(NextCommand('view'))}")
     else:
-        page = document["paths"].get("html")
-        opened = f"open {page} in a browser, then " * bool(page)
-        show(f"\nnext: {opened}{rendered(NextCommand('init', ('robot', '--from', 'LOG')))}")
+        show(f"\nnext: {rendered(NextCommand('init', ('robot', '--from', 'LOG')))}")

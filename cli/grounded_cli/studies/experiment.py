@@ -18,11 +18,11 @@ from grounded_trials.store.documents import StudyStore
 
 # name -> (function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
 STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
-    "flight": (flight.run, "count", "Table 1 and Figure 1: the aircraft's figure-8"),
-    "car": (car.run, "seeds", "the car's three tasks, Figures 4 and 5"),
-    "nondeterminism": (nondeterminism.run, "runs", "repeated open-loop runs (5.2)"),
-    "footnote9": (footnote9.run, "", "a model that is wrong by a constant"),
-    "theorem1": (theorem1.run, "seeds", "gradient error and where the search ends"),
+    "flight": (flight.run, "count", "Table 1, Figure 1"),
+    "car": (car.run, "seeds", "Figures 4, 5"),
+    "nondeterminism": (nondeterminism.run, "runs", "section 5.2"),
+    "footnote9": (footnote9.run, "", "footnote 9"),
+    "theorem1": (theorem1.run, "seeds", "theorem 1"),
 }
 
 

@@ -32,7 +32,7 @@ from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
-from grounded.progress import interruptible, within
+from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
@@ -79,38 +79,14 @@ def attribute(
 
 
 def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:
-    """Return a summary of the best hypothesis so far, shown when a diagnosis is interrupted.
+    """Return the causes so far, told when a diagnosis is interrupted and not stored.
 
     decided: the effects confirmed before a further one was sought; None before that.
     """
-    if not search.of_size(0):
-        return "no hypothesis has been fitted yet"
-    best = search.chosen(most)
-    causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
-    told = f"the likeliest of {len(search.fits)} hypotheses has {listed(causes) or 'no cause'}"
-    more = "not confirmed on held-out trials"
     if decided is not None:
-        more = f"confirmed before the search for one more: {listed(decided) or 'no cause'}"
-    told = f"so far, {told}; {more}; no diagnosis is stored"
-    try:
-        with np.errstate(all="ignore"), within(ANSWER_S):
-            return f"{told}. Predictions {_misses(search, best)}"
-    except KeyboardInterrupt:  # a simulator may need minutes for them
-        return told
-
-
-def _misses(search: HypothesisSearch, best: Fitted) -> str:
-    """Return the errors of a hypothesis beside those of the model alone."""
-    ruler, crude = Ruler(search.predictor), search.of_size(0)[0]
-    crude = search.fits.get((Structure(), 0.0, ()), crude)
-    at = len(ruler.steps) - 1
-    before, after = (ruler.errors(fit).rms[at] for fit in (crude, best))
-    model, seconds = search.data.model, ruler.steps[at] * search.data.dt
-    rows = ", ".join(
-        f"{name} by {after[i]:.3g} instead of {before[i]:.3g} {model.states[name]}"
-        for i, name in zip(ruler.shown, ruler.names, strict=True)
-    )
-    return f"{seconds:.2g} s ahead miss {rows}"
+        return f"confirmed: {listed(decided) or '-'}"
+    best = search.chosen(most).hypothesis.names if search.of_size(0) else ()
+    return f"unconfirmed: {listed(best) or '-'}"
 
 
 def _searched(
