@@ -2,8 +2,9 @@
 
     python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--adopt N] [--list]
 
-Needs mujoco, jsbsim, commonroad-vehicle-models; set-ups of a missing simulator are skipped with a
-note.
+Needs mujoco, jsbsim, commonroad-vehicle-models, and the packages gymnasium, dm_control, robosuite
+for the files that they ship (`pip install --no-deps` does); set-ups of a missing one are skipped
+with a note.
 """
 
 from __future__ import annotations

@@ -111,14 +111,19 @@ def measured(setup: Setup) -> Row:
 
 
 def adopting(setup: Setup, after: int) -> str:
-    """Run the search, adopting what a diagnosis of `after` trials claims; return a table line."""
+    """Run the search, adopting what a diagnosis claims; return a table line.
+
+    The diagnosis is one of `after` trials, or of fewer where the search ends before.
+    """
     task, options = setup.task, SearchOptions()
     candidates: list[Candidate] = []
     trials: list[Trial] = []
     seconds = 0.0
-    planner, claimed, place = Planner(task, task), "ended before", "-"
+    planner, claimed, place = Planner(task, task), "", "-"
     while True:
-        if len(trials) == after and claimed == "ended before":
+        proposal = propose(task, candidates, trials, options, planner=planner)
+        made = proposal.candidate
+        if not claimed and trials and (made is None or len(trials) == after):
             began = time.process_time()
             found = diagnose(task, trials)
             seconds, place = time.process_time() - began, place_of(setup.cause, found)
@@ -127,8 +132,8 @@ def adopting(setup: Setup, after: int) -> str:
             fitted = task.with_model(task.model.with_values(own))
             planner = planner_of(fitted, [{"name": n, **found.values(n)} for n in named])
             planner, claimed = replace(planner, task=task), " + ".join([*named, *own]) or "nothing"
-        proposal = propose(task, candidates, trials, options, planner=planner)
-        if (made := proposal.candidate) is None:
+            continue
+        if made is None:
             break
         candidates += [made] * proposal.is_new
         trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
@@ -147,8 +152,8 @@ def place_of(cause: str, found: Diagnosis) -> str:
     """Return where what is withheld stands in a diagnosis: claimed, tied, its rank, or "-"."""
     if not cause:
         return "-"
-    true = re.compile(cause)
-    if any(true.match(name) for name in found.effects):
+    true, off = re.compile(cause), (f"parameter:{name}" for name in found.verdict.parameters)
+    if any(true.match(name) for name in (*found.effects, *off)):
         return "claimed"
     groups = (*found.indistinguishable, *found.equivalent)
     tied = [name for group in groups if {*group} & {*found.effects} for name in group]

@@ -23,7 +23,11 @@ from grounded.trusted import TRUST, check_own, suspicion
 from grounded_cli import main
 from grounded_cli.console.terminal import harmless, show, show_json, style, table
 from grounded_trials.store.store import Store, write_atomically
+from pace import crowding, slowness
+from reported import car
 from workspaces import make
+
+__all__ = ["car"]
 
 EVIL = "\x1b]0;title\x07\x1b[8m\x9b2J\u202e\u200b\r"
 
@@ -183,6 +187,27 @@ def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
             continue  # Python's own start is out of our hands
         assert "Traceback" not in err, err
         assert child.returncode in (0, 130, -signal.SIGINT), (child.returncode, err)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("verb", "after"), [("diagnose", 1.5), ("diagnose", 3.0), ("fit", 1.5)])
+def test_an_interrupt_ends_a_long_computation_soon(verb: str, after: float, car: Path) -> None:
+    psutil = pytest.importorskip("psutil", reason="not needed on Linux")
+    child = subprocess.Popen(
+        [*COMMAND, "-C", str(car), verb],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    at_work = psutil.Process(child.pid)
+    while child.poll() is None and sum(at_work.cpu_times()[:2]) < after:
+        time.sleep(0.05)
+    began = time.perf_counter()
+    child.send_signal(signal.SIGINT)
+    _, err = child.communicate()
+    taken = time.perf_counter() - began
+    assert child.returncode in (0, 130) and "Traceback" not in err, err  # 0: it had ended before
+    assert taken < 2.0 * slowness() * max(crowding(), 2.0)
 
 
 @pytest.mark.parametrize("words", [["learn"], ["report", "--html"], ["init", "new"]])

@@ -17,3 +17,11 @@ def slowness() -> float:
     for i in range(_TURNS):
         total += i * i
     return max(1.0, (time.process_time() - began) / _REFERENCE)
+
+
+def crowding() -> float:
+    """Return how many times longer than its CPU time a computation takes now, at least 1."""
+    used, began = time.process_time(), time.perf_counter()
+    while time.process_time() - used < _REFERENCE:
+        sum(range(1000))
+    return max(1.0, (time.perf_counter() - began) / _REFERENCE)
