@@ -103,6 +103,8 @@ def test_three_commands_lead_to_a_diagnosis(folder: Path, monkeypatch: pytest.Mo
     assert grounded("-C", "arm", "ingest", "--data", "so100").code == 0
     again = json.loads(grounded("-C", "arm", "ingest", "--data", "so100", "--json").out)
     assert [one["known"] for one in again["trials"]] == [True] * 3
+    last = Workspace("arm").ingest("so100", data=True)  # in Python it is all of them, too
+    assert last.known and last.trial == "t0003"
     found = Workspace("arm").diagnose()
     assert "tau_gripper" in found.verdict.parameters
     assert any(effect.startswith("delay:") for effect in found.verdict.effects)

@@ -152,18 +152,21 @@ class Workspace(Folder):
         """Check, resample and store a trial; a trial that is already stored is not added again.
 
         Args:
-            path: a trial file of grounded's, a log of another format, or the folder of a bag.
+            path: a trial file of grounded's, a log of another format, or the folder of a bag. Of a
+                LeRobot data set each episode is stored, and the last one is returned.
             candidate: the candidate that was run, or `best`; None: the log's, else the outstanding.
             data: the log ran no candidate and serves fitting and diagnosis only.
             group: the condition that it was run in ("wet"); a diagnosis fits its values without a
                 group and predicts that.
             before: inputs' values until the log's first row, which it then need not hold.
         """
+        from grounded_trials.logs.log_files import logs_in
         from grounded_trials.workspace.intake.ingest import ingest_log
 
-        here = self.forget()
         about: dict[str, Any] = {"data": data, "group": group, "sent_before": before}
-        return ingest_log(here, path_of(path), candidate, ahead=True, **about)
+        each = logs_in(path_of(path))
+        done = [ingest_log(self.forget(), log, candidate, ahead=True, **about) for log in each]
+        return done[-1]
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
