@@ -51,7 +51,8 @@ class Task:
         low: (m,) hard lower limits of the inputs; -inf for no limit.
         high: (m,) hard upper limits of the inputs; inf for no limit.
         feedback: whether policies have feedback gains; False for open-loop input sequences.
-        latency: (m,) transport delay of each input [s]; None for zero.
+        latency: (m,) transport delay of each input [s]; None for that which a simulator's file states,
+            or zero.
         input_target: (H, m) inputs that the input penalty is relative to; None for zero.
         safety_low: (n,) lower bounds on predicted states; -inf for no bound.
         safety_high: (n,) upper bounds on predicted states; inf for no bound.
@@ -92,8 +93,9 @@ class Task:
             raise wrong("task: target", target.shape, shape=f"(H + 1, {n})", do=do)
         H = len(target) - 1
         whole_number("task: horizon", H, 1, MAX_HORIZON)
+        stated = getattr(self.model.step, "latency", {})
         defaults = {
-            "latency": np.zeros(m),
+            "latency": np.array([stated.get(name, 0.0) for name in self.model.input_names]),
             "input_target": np.zeros((H, m)),
             "safety_low": np.full(n, -np.inf),
             "safety_high": np.full(n, np.inf),

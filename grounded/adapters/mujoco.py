@@ -106,7 +106,9 @@ def model(
 
     Raises:
         GroundedError: if mujoco is not installed or can't load the file, for unknown names, and for
-            simulator state beyond qpos, qvel and act (actuator delays, plugins).
+            simulator state beyond qpos, qvel and act (plugins).
+
+    Delays of actuators are no part of the model: `model.step.latency` has them for [task] latency.
     """
     mj = library("mujoco")
     compiled = load(xml)
@@ -180,6 +182,12 @@ class MujocoStepper(Stepper):
         self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
         self.threads = threads
         self._model = copy.deepcopy(compiled)  # private: parameters are written into it
+        late = getattr(self._model, "actuator_delay", np.zeros(compiled.nu))
+        self.latency = dict[str, float]()  # [s] of the inputs that the file delays
+        if not controls.torques:
+            each = zip(controls.names, late[list(controls.columns)].tolist(), strict=True)
+            self.latency = {name: by for name, by in each if by > 0}
+        late[:] = 0.0
         self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
         self._made = np.array([s.nominal for s in settings])  # its current parameters
@@ -208,7 +216,9 @@ class MujocoStepper(Stepper):
         whole = mj.mjtState.mjSTATE_FULLPHYSICS.value
         self._base = np.zeros(mj.mj_stateSize(compiled, whole))
         mj.mj_getState(compiled, self._data[0], self._base, whole)
-        if len(self._base) != 1 + compiled.nq + compiled.nv + compiled.na:
+        late = getattr(mj.mjtState, "mjSTATE_HISTORY", None)  # of delays, which are taken off
+        past = 0 if late is None else mj.mj_stateSize(compiled, late.value)
+        if len(self._base) != 1 + compiled.nq + compiled.nv + compiled.na + past:
             sizes = {"theirs": str(len(self._base)), "own": "that of qpos, qvel and act"}
             raise refused("given.fit", "MuJoCo model", what="state", **sizes)
 
@@ -405,9 +415,9 @@ class MujocoStepper(Stepper):
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
         x, u = np.where(wild, 0.0, x), np.where(wild, 0.0, u)
         state = np.tile(self._base, (len(x), 1))
-        ends = np.cumsum([1, compiled.nq, nv])
+        ends = np.cumsum([1, compiled.nq, nv + compiled.na])
         state[:, 1 : ends[1]] = self.coordinates.to_qpos(x[:, :nv])
-        state[:, ends[1] :] = x[:, nv:]
+        state[:, ends[1] : ends[2]] = x[:, nv:]
         wide = np.zeros((len(x), 1, nv if self.controls.torques else compiled.nu))
         wide[:, 0, list(self.controls.columns)] = u
         kind = (
@@ -418,9 +428,8 @@ class MujocoStepper(Stepper):
             models, self._data[:threads], state, wide, control_spec=kind, nstep=steps
         )
         last = rolled[:, -1]
-        moved = np.hstack(
-            [self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv]), last[:, ends[1] :]]
-        )
+        pose = self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv])
+        moved = np.hstack([pose, last[:, ends[1] : ends[2]]])
         h = (models[0] if isinstance(models, list) else models).opt.timestep
         stopped = last[:, :1] < (steps - 0.5) * h  # MuJoCo stopped an unstable sample
         wild = wild | stopped | ~(np.abs(moved) < HUGE).all(axis=1, keepdims=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded.adapters import mujoco
 from grounded.errors import GroundedError
 from grounded.policy import Policy
 from grounded.rollout import simulate
@@ -214,3 +215,16 @@ effects = [ { name = "coulomb_friction:elbow_vel", c = 2.0, width = 0.01 } ]
     assert compiled.dof_damping == pytest.approx([0.05])
     M = 0.004 + 0.6 * 0.1**2 + 0.01  # kg m^2, about the joint
     assert compiled.dof_frictionloss == pytest.approx([2.0 * M])
+
+
+def test_a_delay_of_the_file_is_the_task_s_latency(tmp_path):
+    late = ACTUATORS.replace('gear="2"', 'gear="2" delay="0.03" nsample="20"')
+    (tmp_path / "arm.xml").write_text(ARM.replace("{actuators}", late), encoding="utf-8")
+    w = Workspace.create(tmp_path / "w", model=tmp_path / "arm.xml")
+    assert w.config.task.latency == {"m1": 0.03}
+    # the model's own step has no delay, and the file keeps what it has
+    plain = mujoco.model(ARM.replace("{actuators}", ACTUATORS))
+    x, u = np.full((1, plain.n), 0.1), np.full((1, plain.m), 0.2)
+    after = [m.system.step(x, u, m.values, 0.02) for m in (w.base_model, plain)]
+    np.testing.assert_array_equal(*after)
+    assert w.export_model(tmp_path / "again.xml").values == ()

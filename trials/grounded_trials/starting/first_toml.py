@@ -33,7 +33,7 @@ horizon = {horizon}                 # steps
 target = "target.csv"         # `grounded target` draws another; no column: free
 start = {start}
 feedback = true               # false: open loop
-latency = {{ }}                 # [s] transport delay of inputs, unless `diagnose` finds it
+latency = {latency}  # [s] transport delay of inputs, unless `diagnose` finds it
 
 [reward]                      # quadratic weights: 1 / (range in the target, at least
                               # 0.1)^2, for coordinates of a position the smaller range
@@ -94,6 +94,7 @@ def write_first(
     weights = usual_weights(model, columns)
     changes = {name: change_weight(ranges[name], model.inputs[name]) for name in model.input_names}
     stated = getattr(model.step, "limits", {})  # limits in an MJCF or URDF file
+    late = getattr(model.step, "latency", {})  # of an MJCF file's actuators
     limits = [
         f"{key(name)} = {_span(found)}"
         + f"  # the model's file says {_span(stated.get(name, ()))}" * (name in stated)
@@ -106,6 +107,7 @@ def write_first(
         dt=f"{dt:g}",
         horizon=horizon,
         start=_inline(held) if held else "{ }",
+        latency=_inline(late) if late else "{ }",
         state=_inline(weights),
         terminal=_inline({name: OFFERED * weight for name, weight in weights.items()}),
         changes=_inline(changes),

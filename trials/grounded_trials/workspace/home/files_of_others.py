@@ -1,7 +1,6 @@
-"""An MJCF or URDF file from elsewhere as a Model: its delays and lags taken out, its numbers named.
+"""An MJCF or URDF file from elsewhere as a Model: its lags taken out, its numbers named.
 
-A log has no column for an actuator's activation or for its history, so a delay becomes a latency
-and a filter a first-order lag.
+A log has no column for an actuator's activation, so a filter becomes a first-order lag.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ FILTERS = (2, 3)  # mjDYN_FILTER, mjDYN_FILTEREXACT
 AFFINE = 1  # mjBIAS_AFFINE
 
 
-def simulated_model(path: Path) -> tuple[Any, dict[str, float], Effects]:
-    """Return a file, compiled without delays and lags, its latencies [s], and its lags as effects.
+def simulated_model(path: Path) -> tuple[Any, Effects]:
+    """Return a file, compiled without lags, and these as effects.
 
     Raises:
         GroundedError: if MuJoCo can't load it.
@@ -36,17 +35,14 @@ def simulated_model(path: Path) -> tuple[Any, dict[str, float], Effects]:
         whole = spec.compile()
     except ValueError as error:
         raise unreadable(path, str(error), kind="MuJoCo model") from None
-    late, effects = dict[str, float](), list[Mapping[str, Any]]()
+    effects = list[Mapping[str, Any]]()
     for i, one in enumerate(spec.actuators):
         name = identifier(one.name or f"actuator{i}")
-        if getattr(one, "delay", 0.0):
-            late[name] = float(one.delay)
-            one.delay, one.nsample = 0.0, 0
         if int(whole.actuator_dyntype[i]) in FILTERS:
             tau = float(whole.actuator_dynprm[i, 0])
             effects.append({"name": f"first_order_lag:{name}", "tau": tau})
             one.dyntype = mj.mjtDyn.mjDYN_NONE
-    return spec.compile(), late, tuple(effects)
+    return spec.compile(), tuple(effects)
 
 
 def numbers_of_file(

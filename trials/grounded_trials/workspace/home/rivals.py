@@ -217,10 +217,11 @@ def _rival(workspace: Folder, text: str) -> Rival:
 
 def _of_file(workspace: Folder, path: Path) -> Rival:
     """Return the model of an MJCF or URDF file; its delays and lags are latency and effects."""
-    compiled, late, effects = simulated_model(path)
+    compiled, effects = simulated_model(path)
     step = workspace.base_model.step
     own = step if isinstance(step, MujocoStepper) else None
     model = numbers_of_file(compiled, (), own)
+    late = getattr(model.step, "latency", {})
     return Rival(str(path), model, effects, late, compiled)
 
 

@@ -160,7 +160,9 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
 
 def _adopted(workspace: Folder, held: Held, values: Mapping[str, Estimate]) -> Any:
     """Add latencies and adopted effects to what a file holds; yield those that it can't."""
-    for name, late in workspace.config.task.latency.items():
+    own, latency = held.stepper.latency, workspace.config.task.latency
+    for name in {**own, **latency}:
+        late = latency.get(name, 0.0) - own.get(name, 0.0)
         if late and not held.adopt(f"delay:{name}", {"d": late}, {"d": 0.0}):
             yield _not_held(f"delay:{name}", {"d": Estimate(late, unit="s")})
     for effect in workspace.config.model.effects:
