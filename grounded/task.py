@@ -51,7 +51,7 @@ class Task:
         low: (m,) hard lower limits of the inputs; -inf for no limit.
         high: (m,) hard upper limits of the inputs; inf for no limit.
         feedback: whether policies have feedback gains; False for open-loop input sequences.
-        latency: (m,) transport delay of each input [s]; None for that which a simulator's file states,
+        latency: (m,) transport delay of each input [s]; None: as a simulator's file states it,
             or zero.
         input_target: (H, m) inputs that the input penalty is relative to; None for zero.
         safety_low: (n,) lower bounds on predicted states; -inf for no bound.
