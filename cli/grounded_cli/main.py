@@ -14,7 +14,7 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import wraps
 from io import StringIO, TextIOWrapper
@@ -241,7 +241,7 @@ def _run() -> tuple[int, str]:
             raise
         return 1, f"error: something that grounded called ended the program ({error.code})"
     except Exception as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # while Python 3.11 made a class
+        if any(isinstance(one, KeyboardInterrupt) for one in _leading_to(error)):
             return 130, INTERRUPTED
         from grounded_cli.console.terminal import ALARM, style
 
@@ -252,6 +252,13 @@ def _run() -> tuple[int, str]:
             raise
         return 1, f"{style('error:', ALARM)} {error}"
     return code if isinstance(code, int) else 0, ""
+
+
+def _leading_to(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and those before it: an import turns Ctrl-C into an error of its own."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def _silence() -> None:

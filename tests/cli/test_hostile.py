@@ -161,11 +161,19 @@ def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
 
 
-def test_an_interrupt_while_a_class_is_made_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    def made(**_: object) -> None:  # as Python 3.11 raises it from an import
-        raise RuntimeError("Error calling __set_name__ on 'Field'") from KeyboardInterrupt()
+@pytest.mark.parametrize("told", [False, True])
+def test_an_interrupt_while_a_module_is_imported_is_one(
+    told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def imported(**_: object) -> None:
+        try:  # as Python 3.11 raises it from a class, and a module in C from its start
+            raise RuntimeError("Error calling __set_name__ on 'Field'") from KeyboardInterrupt()
+        except RuntimeError:
+            if told:
+                raise GroundedError("this needs the package 'mujoco'") from None
+            raise
 
-    monkeypatch.setattr(main.cli, "main", made)
+    monkeypatch.setattr(main.cli, "main", imported)
     assert grounded("status").code == 130
 
 
