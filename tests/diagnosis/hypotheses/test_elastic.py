@@ -59,10 +59,10 @@ def load_behind(x, u):
     return spring(x, u, 0.4, 8.0, 0.0)
 
 
-def logs(rates, count, seed, steps=400):
+def logs(rates, count, seed, steps=250):
     """Runs under multisines, with process noise and sensor noise."""
     rng, found = np.random.default_rng(seed), []
-    for _ in range(5):
+    for _ in range(4):
         t = DT * np.arange(steps)
         waves = zip((0.25, 0.2, 0.15), rng.uniform(0.5, 6, 3), rng.uniform(0, 6, 3), strict=True)
         u = sum(a * np.sin(2 * np.pi * f * t + at) for a, f, at in waves)
@@ -82,7 +82,7 @@ def logs(rates, count, seed, steps=400):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
     ("rates", "count", "name", "known"),
     [

@@ -1,5 +1,6 @@
 """Standard deviations from the information: right where it is regular, honest where it is not."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,10 @@ from grounded import Model, Param, Trial, diagnose
 from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.validation.blame import moved_parameters
+from grounded.effects import Library
 
 
 def test_of_two_parameters_that_hide_each_other_one_stays():
@@ -79,3 +83,38 @@ def test_a_delay_is_no_surer_than_states_between_two_samples(samples):
     d, least = row.params["d"], max(log.interpolated_s, 1e-5)
     assert row.effect == "sensor_delay:w" and abs(d.value - 0.05) < 2 * d.std
     assert least <= d.std < least + 1e-3
+
+
+def test_values_are_no_surer_than_the_constant_that_was_tuned_beside_them():
+    rng, trials, dt = np.random.default_rng(3), [], 0.01
+    for _ in range(3):
+        u = sum(a * np.sin(f * dt * np.arange(300)) for a, f in ((0.2, 9.0), (0.15, 23.0)))
+        x = np.zeros((301, 2))
+        for k in range(300):
+            q, w = x[k]
+            for _ in range(10):
+                w += 0.1 * dt * (u[k] - 0.08 * np.clip(w / 0.3, -1, 1)) / 0.02
+                q += 0.1 * dt * w
+            x[k + 1] = q, w + 1e-3 * rng.standard_normal()
+        log = x + rng.standard_normal(x.shape) * [1e-4, 3e-3]
+        trials.append(Trial(log, u[:, None], dt, ("q", "w"), ("tau",), start_inputs=np.zeros(1)))
+    model = Model(
+        states={"q": "rad", "w": "rad/s"},
+        inputs={"tau": "N m"},
+        derivative=lambda s, a, p: {"q": s.w, "w": a.tau / 0.02},
+    )
+    data = prepare(model, trials)
+    effect = Library().effect("joint_friction:tau<-w", model, data.scales)
+    search = HypothesisSearch(data, (effect,))
+    h = Hypothesis().plus(effect, {"c": 0.08, "b": 0.0, "width": 0.3})
+    constant = replace(h, effects=(replace(h.effects[0], quantities=_untuned(h.effects[0])),))
+    std = []
+    for one in (constant, h):
+        (fit,) = search.refined([search.fresh(one)], 20)
+        std.append(standard_deviations(search.predictor, fit, data.trial_of)[0])
+    assert len(std[0]) == len(std[1]) == len(h.theta)
+    assert std[1][0] > 1.2 * std[0][0]
+
+
+def _untuned(effect):
+    return tuple(replace(q, tuned=False) for q in effect.quantities)
