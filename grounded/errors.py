@@ -49,7 +49,7 @@ class GroundedError(Exception):
         if self.finding.code.startswith(f"{unless}."):
             return self
         inner = self.finding.facts.get("where", "")
-        whole = f"{where}: {inner}" if inner else where
+        whole = where if inner in ("", where) else f"{where}: {inner}"
         return GroundedError(self.finding.also(where=whole), self.then)
 
     def __reduce__(self) -> tuple[Any, ...]:

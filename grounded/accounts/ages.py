@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import (
-    AS_LATE,
     Finding,
     a_mean,
     derived_from,
@@ -46,10 +45,12 @@ from grounded.accounts.lag import (
     lag_between,
 )
 from grounded.accounts.signals import quantum
+from grounded.findings import Quantity
+from grounded.findings import found as found_
 from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.model import Model
 from grounded.places import Integral, integrals, partner, true_values
-from grounded.result import SMALL, with_error
+from grounded.result import SMALL
 from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
@@ -137,7 +138,7 @@ class Ages:
             if found := self.derived(relation, clear):
                 yield self.filtered(relation, found)
             elif {one.i, one.j} <= {*log} and clear.filtered and clear.delay > 0:
-                yield self.in_time(relation.j, clear, f"the derivative of {self.names[relation.i]}")
+                yield self.in_time(relation.j, clear, self.names[relation.i], rate=True)
             elif not clear.filtered and clear.mean >= SMOOTH * self.dt:
                 yield self.smoothed(relation, clear.mean)
 
@@ -158,7 +159,8 @@ class Ages:
             name = self.names[i]
             if name in names and name not in {f.signal for f in late}:
                 self.put(i, [earlier(x, one.delay_s / self.dt) for x in self.column(i)])
-                yield replace(one, signal=name, finding=f"{AS_LATE} {one.signal}")
+                said = found_("sensor.late", name, message=one.signal)
+                yield replace(one, signal=name, said=said)
 
     def scale(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Report a scale, which may be that of either sensor; equal ones rule effects out."""
@@ -191,27 +193,29 @@ class Ages:
         if beyond < max(SURE * lag.std, least):
             return
         if lag.delay > 0:
-            yield self.in_time(relation.j, lag, f"the derivative of {q}")
+            yield self.in_time(relation.j, lag, q, rate=True)
         elif relation.exact:
-            yield self.in_time(relation.i, lag, f"{w} says")
+            yield self.in_time(relation.i, lag, w)
         else:  # a disturbed heading also looks late
-            yield Finding(q, f"{_size(d, lag)} later than {w} says", "delay", d, lag.std)
+            yield Finding(q, found_("sensor.late", q, by=_size(d, lag), of=w), "delay", d, lag.std)
 
-    def in_time(self, i: int, lag: Lag, other: str) -> Finding:
+    def in_time(self, i: int, lag: Lag, of: str, *, rate: bool = False) -> Finding:
         """Undo the delay of state i. A filtered state is only reported: a shift can't restore it.
 
         Args:
             i: the state.
             lag: its delay, of either sign.
-            other: what it lags behind, in words.
+            of: what it lags behind.
+            rate: whether it lags behind the derivative of that.
         """
         d, name = float(abs(lag.delay)), self.names[i]
         if lag.filtered:
-            text = f"follows {other} through a filter of {d:.3g} s"
-            return put_right(name, text, "lag", "", delay_s=d, std_s=lag.std)
+            said = found_("sensor.late", name, tau=d, of=of, derivative=rate)
+            return put_right(name, said, "lag", {}, delay_s=d, std_s=lag.std)
         self.put(i, [earlier(x, d / self.dt) for x in self.column(i)])
-        text, log = f"{_size(d, lag)} later than {other}", f"delay_s = {d:.3g}"
-        return put_right(name, text, "delay", log, delay_s=d, std_s=lag.std)
+        said = found_("sensor.late", name, by=_size(d, lag), of=of, derivative=rate)
+        keys = {"delay_s": float(f"{d:.3g}")}
+        return put_right(name, said, "delay", keys, delay_s=d, std_s=lag.std)
 
     def smoothed(self, relation: Integral, over: float) -> Finding:
         """Drop a velocity that is a mean over a time [s], as a difference of its position is.
@@ -235,7 +239,7 @@ class Ages:
         q, w = (self.names[k] for k in (relation.i, relation.j))
         if abs(found.gain - 1) + SURELY * found.gain_std < SAME:
             self.rule_out(q, w)
-        return replace(self.smoothed(relation, found.over), finding=derived_from(q, found.age))
+        return replace(self.smoothed(relation, found.over), said=derived_from(w, q, found.age))
 
     def constant(self, relation: Integral) -> Iterator[Finding]:
         """Report a constant bias: of the velocity's sensor, or a drift of the position.
@@ -249,10 +253,9 @@ class Ages:
         if found.refuted:
             self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
         elif found.found:
-            size = f"{abs(found.value):.3g} {self.model.states[w]}"
-            more = "more" if found.value > 0 else "less"
-            text = f"shows {size} {more} than the rate of {q} throughout"
-            yield Finding(w, f"{text}: a sensor bias, or {q} drifts", "offset")
+            size = Quantity(abs(found.value), self.model.states[w])
+            way = "more" if found.value > 0 else "less"
+            yield Finding(w, found_("sensor.bias", w, size=size, way=way, of=q), "offset")
 
     def positions(self) -> Iterator[Finding]:
         """Correct both positions of a plane that share a delay."""
@@ -260,16 +263,14 @@ class Ages:
         both = [row for row in rows if plane and row.i in (plane.i, plane.j)]
         if len(both) == 2 and (lag := late_positions(self.model, self.trials, both)):
             for row in both:
-                yield self.in_time(row.i, lag, "the motion by velocities and angles")
+                yield self.in_time(row.i, lag, "the motion")
 
 
-def _size(delay: float, lag: Lag) -> str:
-    """Return a delay with its standard deviation, if that is known; in ms if that is small."""
-    if not (np.isfinite(lag.std) and lag.std > 0):
-        return f"{delay:.3g} s"
+def _size(delay: float, lag: Lag) -> Quantity:
+    """Return a delay with its standard deviation; in ms if that is small."""
     if lag.std < SMALL:
-        return f"{with_error(1e3 * delay, 1e3 * lag.std)} ms"
-    return f"{delay:.3g} +- {lag.std:.2g} s"
+        return Quantity(1e3 * delay, "ms", 1e3 * lag.std)
+    return Quantity(delay, "s", lag.std)
 
 
 # --- a velocity and its position ------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import finding as told
@@ -15,9 +16,7 @@ from grounded.result import Document
 from grounded.trial import Trial
 
 RPM = 9.549296585513721  # revolutions per minute in one radian per second
-LEFT_OUT = "left out of the diagnosis: it tells nothing more than"  # the log of its position
 SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
-AS_LATE = "is in one message with, and so as late as,"  # the signal that shows the delay
 ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
 
 
@@ -27,7 +26,7 @@ class Finding(Document):
 
     Args:
         signal: a state or an input, or several joined by "+".
-        finding: one clause that continues a sentence after the signal's name.
+        said: what is wrong with it, as an entry of the catalogue.
         kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
             missing, quantised, saturated, beyond (its limits), constant, copy, mismatch (with
             others), unresolved (too fast for the model's time step) or time step (of the
@@ -37,36 +36,60 @@ class Finding(Document):
         scale: measured value over true value.
         share: share of the samples affected, 0 to 1.
         corrected: whether the trials were corrected before the physics was identified.
-        log: key and value for the signal's [log] table that correct the logs as well.
-        advice: what to change in the log itself, where no key of [log] corrects it.
+        keys: keys of the signal's [log] table that correct the logs as well.
+        mend: the finding whose remedy says what to change, where no key of [log] corrects it.
         source: the position from which a velocity was computed.
     """
 
     signal: str
-    finding: str
+    said: told.Finding | None = field(default=None, metadata={"brief": True})
     kind: str = ""
     delay_s: float = 0.0
     std_s: float = field(default=float("nan"), metadata={"brief": True})
     scale: float = 1.0
     share: float = field(default=float("nan"), metadata={"brief": True})
     corrected: bool = False
-    log: str = field(default="", metadata={"brief": True})
-    advice: str = field(default="", metadata={"brief": True})
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    mend: told.Finding | None = field(default=None, metadata={"brief": True})
     source: str = field(default="", metadata={"brief": True})
+
+    @property
+    def finding(self) -> str:
+        """One clause that continues a sentence after the signal's name."""
+        return self.said.clause if self.said is not None and self.said.printable else ""
+
+    @property
+    def log(self) -> str:
+        """The keys of its [log] table as text, "" for none."""
+        return ", ".join(
+            f"{key} = {'true' if value is True else f'{value:.8g}'}"
+            for key, value in self.keys.items()
+        )
+
+    @property
+    def advice(self) -> str:
+        """What to change where no key of [log] corrects it, "" for nothing."""
+        return self.mend.remedy if self.mend is not None and self.mend.printable else ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields by JSON key, with what they say in words."""
+        words = {"log": self.log, "advice": self.advice}
+        some = {key: text for key, text in words.items() if text}
+        return {**super().to_json(), "finding": self.finding, **some}
 
 
 def put_right(
     name: str,
-    text: str,
+    said: told.Finding,
     kind: str,
-    log: str,
+    keys: Mapping[str, Any],
     *,
     delay_s: float = 0.0,
     std_s: float = float("nan"),
     scale: float = 1.0,
 ) -> Finding:
     """Return a finding for which the trials were corrected."""
-    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
+    return Finding(name, said, kind, delay_s, std_s, scale, corrected=True, keys=keys)
 
 
 def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
@@ -86,7 +109,7 @@ def late_effects(findings: Iterable[Finding]) -> dict[str, dict[str, float]]:
     """
     found = dict[str, dict[str, float]]()
     for one in findings:
-        if one.corrected and one.kind == "lag" and one.delay_s > 0 and not one.log:
+        if one.corrected and one.kind == "lag" and one.delay_s > 0 and not one.keys:
             found[f"sensor_lag:{one.signal}"] = {"tau": one.delay_s}
         elif one.corrected and one.kind == "delay" and one.delay_s > 0:
             name = f"{SENSOR_DELAY}{one.signal}"
@@ -116,32 +139,26 @@ def late_as_positions(
         }
         if late and sum(late.values()) > 0 and f"{SENSOR_DELAY}{one.signal}" not in known:
             d, position = sum(late.values()), one.source
-            text = f"is older by another {d:.3g} s, by which the log of {position} itself is late"
-            yield Finding(one.signal, text, "delay", d, corrected=True, source=position)
+            said = told.found("sensor.late", one.signal, more=d, position=position)
+            yield Finding(one.signal, said, "delay", d, corrected=True, source=position)
 
 
 def a_mean(name: str, position: str, over: float) -> Finding:
     """Return the finding of a velocity that is a difference of its position over a time [s]."""
-    text = f"is a mean over {over:.2g} s, as from differences of {position}; {LEFT_OUT} {position}"
-    return Finding(name, text, "smoothed", corrected=True, source=position)
+    said = told.found("sensor.derived", name, over=over, of=position)
+    return Finding(name, said, "smoothed", corrected=True, source=position)
 
 
-def derived_from(position: str, age: float) -> str:
-    """Return what is said of a velocity that a filter computes from its position."""
-    return (
-        f"is a filtered derivative of {position}, {age:.2g} s behind it on average; "
-        f"{LEFT_OUT} {position}"
-    )
+def derived_from(name: str, position: str, age: float) -> told.Finding:
+    """Return what is found of a velocity that a filter computes from its position."""
+    return told.found("sensor.derived", name, of=position, age=age)
 
 
 def scaled(name: str, position: str, size: float, unit: str) -> Finding:
     """Return the finding of a velocity that is `size` times the rate of its position."""
-    text = f"shows {100 * size:.3g} % of the rate of {position}"
-    if unit == "rad/s" and abs(size * RPM - 1) < ALIKE:
-        text = f"{text}, 2 pi / 60 times it: it was probably converted from rpm by mistake"
-    else:
-        text = f"{text}; either may be wrong"
-    return Finding(name, text, "scale", scale=size)
+    rpm = unit == "rad/s" and abs(size * RPM - 1) < ALIKE
+    said = told.found("sensor.scale", name, share=size, of=position, rpm=rpm)
+    return Finding(name, said, "scale", scale=size)
 
 
 @dataclass(frozen=True, eq=False)

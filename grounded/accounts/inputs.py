@@ -13,6 +13,7 @@ import numpy as np
 from grounded.accounts.finding import Finding
 from grounded.accounts.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
 from grounded.accounts.table import OVER
+from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import extent
@@ -45,17 +46,19 @@ def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
     for j, name in enumerate(task.model.input_names):
         share = float(past[:, j].mean())
         if share > OFTEN:
-            percent = f"is it in percent? then multiply scale in [log.input.{name}] by 0.01"
-            mend = percent if in_percent(task, inputs, j) else "widen [limits] if the robot can"
-            text = (
-                f"beyond its limits, {limits_of(task, j)}, {100 * share:.0f} % of the time "
-                f"({span(inputs[:, j])}): {mend}"
+            said = found(
+                "sensor.limits",
+                name,
+                limits=limits_of(task, j),
+                share=share,
+                logged=span(inputs[:, j]),
+                how="percent" if in_percent(task, inputs, j) else "widen",
             )
-            yield Finding(name, text, "beyond", share=share)
+            yield Finding(name, said, "beyond", share=share, mend=said)
         share = float(at[:, j].mean())
         if share > OFTEN:
-            text = f"at its limits {100 * share:.0f} % of the time"
-            yield Finding(name, text, "saturated", share=share)
+            said = found("sensor.limits", name, at=True, share=share)
+            yield Finding(name, said, "saturated", share=share)
 
 
 def in_percent(task: Task, inputs: Array, j: int) -> bool:
@@ -92,8 +95,8 @@ def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Fin
     for j, name in enumerate(names):
         values = sorted({float(x[0]) for x in columns[j]})
         if fixed[j] and len(values) > 1:
-            shown = ", ".join(f"{v:.4g}" for v in values[:6])
-            yield Finding(name, f"constant within each trial ({shown})", "constant")
+            shown = tuple(f"{v:.4g}" for v in values[:6])
+            yield Finding(name, found("sensor.same", name, values=shown), "constant")
     if isinstance(subject, Task):
         yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
     longest = max(trials, key=lambda trial: trial.steps).inputs
@@ -110,5 +113,6 @@ def _copy(first: str, second: str, lag: Lag) -> Finding:
     if lag.delay < 0:
         first, second = second, first
     d = abs(lag.delay)
-    late = f", {d:.3g} s later" if d > max(SURE * lag.std, LEAST_S) else ""
-    return Finding(second, f"the same signal as {first}{late}", "copy", d, lag.std, lag.low)
+    late = d if d > max(SURE * lag.std, LEAST_S) else None
+    said = found("sensor.same", second, of=first, late=late)
+    return Finding(second, said, "copy", d, lag.std, lag.low)

@@ -100,11 +100,12 @@ def _reported(model: Model, told: Told, account: Account, column: int | None) ->
     return scaled(model, names, account.factor, account.unit)
 
 
-def keys(model: Model, account: Account, column: int) -> str:
+def keys(model: Model, account: Account, column: int) -> dict[str, float]:
     """Return the keys of a column's table of [log] that correct it."""
     if account.kind == "unit":
-        return f"scale = {1 / account.factor:.8g}"
+        return {"scale": float(f"{1 / account.factor:.8g}")}
     if account.kind != "sign":
-        return ""
+        return {}
     angle = {**model.states, **model.inputs}[names_of(model, [column])[0]] == "rad"
-    return "scale = -1" + f", offset = {account.offset:.8g}" * bool(account.fitted and angle)
+    offset = {"offset": account.offset} if account.fitted and angle else {}
+    return {"scale": -1.0, **offset}

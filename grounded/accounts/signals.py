@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding
+from grounded.findings import Quantity, found
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
@@ -143,11 +144,11 @@ def _wrapped(s: Signal) -> Found | None:
             steps = np.diff(x)
             off = np.where(np.abs(np.abs(steps) - turn) < 0.1 * turn, np.sign(steps), 0.0)
             whole.append((x - turn * np.concatenate([[0.0], np.cumsum(off)])) * (2 * np.pi / turn))
-        times = f"{count} time{'s' * (count > 1)}"
-        text = f"is in degrees: jumps by 360 {times}" if degrees else f"jumps by 2 pi {times}"
-        log = "scale = 0.017453293, unwrap = true" if degrees else "unwrap = true"
+        said = found("sensor.jumps", s.name, degrees=degrees, count=count)
+        keys: dict[str, Any] = {"scale": 0.017453293} if degrees else {}
         kind, scale = ("degrees", 180 / np.pi) if degrees else ("wrapped", 1.0)
-        finding = Finding(s.name, text, kind, scale=scale, corrected=True, log=log)
+        keys["unwrap"] = True
+        finding = Finding(s.name, said, kind, scale=scale, corrected=True, keys=keys)
         return finding, replace(s, columns=whole)
     return None
 
@@ -175,8 +176,8 @@ def _dropouts(s: Signal) -> Found | None:
         before, after = np.roll(x, 1), np.roll(x, -1)
         gone.append((x == value) & ((np.abs(x - before) > far) | (np.abs(x - after) > far)))
     share = _share(gone)
-    text = f"drops to {value:g} for single samples ({100 * share:.1f} %)"
-    return Finding(s.name, text, "dropout", share=share, corrected=True), s.without(gone)
+    said = found("sensor.samples", s.name, low=value, share=share)
+    return Finding(s.name, said, "dropout", share=share, corrected=True), s.without(gone)
 
 
 def _held(s: Signal) -> Found | None:
@@ -197,10 +198,9 @@ def _held(s: Signal) -> Found | None:
         old = np.ones(len(x), bool)
         old[runs(x)[0]] = False
         gone.append(old & np.isfinite(x))
-    text = f"has a new value only every {each * s.dt:.3g} s, and each is logged {each:g} times"
-    advice = "in a table, leave its cell empty in rows that repeat a value"
-    found = Finding(s.name, text, "held", share=_share(gone), corrected=True, advice=advice)
-    return found, s.without(gone)
+    said = found("sensor.samples", s.name, every=each * s.dt)
+    one = Finding(s.name, said, "held", share=_share(gone), corrected=True, mend=said)
+    return one, s.without(gone)
 
 
 def _stuck(s: Signal) -> Found | None:
@@ -223,8 +223,8 @@ def _stuck(s: Signal) -> Found | None:
         gone.append(flat)
     if not longest:
         return None
-    text = f"sticks to its last value, up to {longest * s.dt:.3g} s at a time, and then jumps"
-    return Finding(s.name, text, "stuck", share=_share(gone), corrected=True), s.without(gone)
+    said = found("sensor.samples", s.name, stuck=longest * s.dt)
+    return Finding(s.name, said, "stuck", share=_share(gone), corrected=True), s.without(gone)
 
 
 def _missing(s: Signal) -> Finding | None:
@@ -240,8 +240,8 @@ def _missing(s: Signal) -> Finding | None:
     for g in gone:
         start, length = runs(g.astype(float))
         longest = max([longest, *length[g[start]]])
-    text = f"{100 * share:.2g} % of its samples are missing, up to {longest * s.dt:.3g} s at a time"
-    return Finding(s.name, text, "missing", share=share)
+    said = found("sensor.samples", s.name, gap=longest * s.dt, share=share)
+    return Finding(s.name, said, "missing", share=share)
 
 
 def quantum(columns: Sequence[Array]) -> float:
@@ -264,8 +264,8 @@ def _quantised(s: Signal) -> Finding | None:
     rms = float(np.sqrt(np.nanmean(d**2))) if np.isfinite(d).any() else 0.0
     if step == 0 or step < COARSE * rms:
         return None
-    text = f"comes in steps of {step:.3g} {s.unit}, as large as its changes"
-    return Finding(s.name, text, "quantised")
+    said = found("sensor.samples", s.name, step=Quantity(step, s.unit))
+    return Finding(s.name, said, "quantised")
 
 
 def _clipped(s: Signal) -> Finding | None:
@@ -282,6 +282,7 @@ def _clipped(s: Signal) -> Finding | None:
             stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
         share = samples / values.size
         if stays >= 3 and share > CLIPPED:
-            text = f"is clipped {side} {limit:.4g} {s.unit} ({100 * share:.0f} % of the time)"
-            return Finding(s.name, text, "saturated", share=share)
+            at = Quantity(float(limit), s.unit)
+            said = found("sensor.limits", s.name, side=side, limit=at, share=share)
+            return Finding(s.name, said, "saturated", share=share)
     return None

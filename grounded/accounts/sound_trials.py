@@ -27,8 +27,10 @@ from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_signal, signal_of
 from grounded.accounts.table import Told
 from grounded.accounts.time_step import judge_resolution, judge_time_step
+from grounded.findings import Quantity
+from grounded.findings import found as told_
 from grounded.model import Model
-from grounded.result import listed, per_second, with_unit
+from grounded.result import per_second
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -129,7 +131,7 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
         () if told.whole else tuple(trials[k].id or f"trial number {k + 1}" for k in told.trials)
     )
     for k in account.columns if told.certain or account.kind == "offset" else ():
-        (name,), said = names_of(model, [k]), reported(model, told, k)[0].also(which=which).clause
+        (name,), said = names_of(model, [k]), reported(model, told, k)[0].also(which=which)
         if account.kind == "dead":
             yield Finding(name, said, "stuck", corrected=True)
         elif account.kind == "offset":
@@ -137,8 +139,8 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
         else:
             kind = "degrees" if account.kind == "unit" else "sign"
             kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
-            log = "" if which else keys(model, account, k)
-            yield put_right(name, said, kind, log, scale=account.factor)
+            mended = {} if which else keys(model, account, k)
+            yield put_right(name, said, kind, mended, scale=account.factor)
 
 
 def stop_at_folded(
@@ -174,12 +176,9 @@ def _unexplained(
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         rate = float(np.median([gap.rate for gap in some]))
-        off = with_unit(f"{rate:.3g}", per_second(model.states[name]))
-        text = (
-            f"does not move as {listed(by)} {'imply' if len(by) > 1 else 'implies'} (its rate is "
-            f"off by {off}): check units, axes and signs"
-        )
-        yield Finding(name, text, "mismatch")
+        off = Quantity(rate, per_second(model.states[name]))
+        said = told_("sensor.mismatch", name, of=tuple(by), off=off)
+        yield Finding(name, said, "mismatch", mend=said)
 
 
 def _by_the_clock(
@@ -197,12 +196,9 @@ def _by_the_clock(
     pace = float(np.exp(np.mean(np.log(ratios))))
     if max(abs(r / pace - 1) for r in ratios) > ALIKE or abs(pace - 1) < 2 * ALIKE:
         return list(found)
-    text = (
-        f"the clock is wrong, not a sensor: every rate is {pace:.3g} times the derivative of its "
-        f"position by the time stamps, so one second of stamps is {1 / pace:.3g} s of the run: "
-        f"multiply the stamps by {1 / pace:.3g} and ingest the logs again"
-    )
+    names = [one.signal for one in rates]
+    said = told_("log.pace", *names, by=1 / pace)
     at = min(found.index(one) for one in rates)
     rest = [one for one in found if one not in rates]
-    one = Finding("+".join(one.signal for one in rates), text, "scale", scale=pace)
+    one = Finding("+".join(names), said, "scale", scale=pace, mend=said)
     return [*rest[:at], one, *rest[at:]]

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from grounded import findings as told
 from grounded.accounts.finding import Finding
+from grounded.findings import Quantity
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import percent
 from grounded.trial import Trial
 
 MISSED = 0.05  # part of a state's change in a step, rms, from which a step is too long
@@ -39,22 +41,11 @@ class TooLong:
     substeps: int  # that are enough; 0: more than were tried
 
     @property
-    def told(self) -> str:
-        """Say what is missed: a clause that continues a sentence after the state's name."""
-        size = percent(self.missed) if self.missed < 1 else f"{self.missed:.2g} times"
-        return (
-            f"is missed by {size}{' of' * (self.missed < 1)} its change: the integrator's steps of "
-            f"{1e3 * self.dt:.3g} ms are too long for the model"
-        )
-
-    @property
-    def advice(self) -> str:
-        """Say what to change."""
-        if self.substeps:
-            return f"set substeps={self.substeps} in Model(...)"
-        return (
-            f"even {PARTS[-1] // 2} parts of a step miss much of it, so make the model less stiff"
-        )
+    def finding(self) -> told.Finding:
+        """What is missed, and what to change."""
+        step = Quantity(1e3 * self.dt, "ms")
+        facts: dict[str, Any] = {"missed": self.missed, "step": step, "substeps": self.substeps}
+        return told.found("sensor.step", self.state, **facts)
 
 
 def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Finding]:
@@ -71,8 +62,7 @@ def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int])
     found = too_long(model, np.where(hidden, 0.0, x), u, trials[0].dt)
     if found is None or hidden[model.state_names.index(found.state)]:
         return []
-    more = f"{found.advice}, and diagnose again: what is fitted here makes up for such steps"
-    return [Finding(found.state, found.told, "time step", advice=more)]
+    return [Finding(found.state, found.finding, "time step", mend=found.finding)]
 
 
 def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong | None:
@@ -166,14 +156,17 @@ def judge_resolution(
         worst = max(shown, key=lambda i: missed[keep, i] / max(usual[i], 1e-300))
         name = model.state_names[worst]
         unit = model.states[name]
-        where = f"trial {trial.id or f'number {k + 1}'}"
-        text = (
-            f"reaches {reach[k, worst]:.3g} {unit} in {where}, {far[worst]:.3g} {unit} in most "
-            f"others: from {keep * trial.dt:.3g} s on, the model can't be integrated with time "
-            f"steps of {1000 * trial.dt:.3g} ms, and the rest of that trial is left out"
+        said = told.found(
+            "sensor.unresolved",
+            name,
+            reach=Quantity(float(reach[k, worst]), unit),
+            trial=trial.id or f"trial {k + 1}",
+            far=Quantity(float(far[worst]), unit),
+            at=Quantity(keep * trial.dt, "s"),
+            step=Quantity(1000 * trial.dt, "ms"),
         )
         share = 1 - keep / len(trial.inputs)
-        yield k, keep, Finding(name, text, "unresolved", share=share, corrected=True)
+        yield k, keep, Finding(name, said, "unresolved", share=share, corrected=True)
 
 
 def _extent(trial: Trial) -> tuple[Array, Array]:

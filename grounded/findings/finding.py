@@ -83,6 +83,11 @@ class Finding:
         return slots(entry.short) | slots(entry.remedy) <= {"about", *self.facts}
 
     @property
+    def remedy(self) -> str:
+        """What to do about it, "" for nothing."""
+        return filled(entry_of(self.code).remedy, {"about": self.about, **self.facts}).strip()
+
+    @property
     def what(self) -> str:
         """What was found, without a remedy."""
         return filled(entry_of(self.code).short, {"about": self.about, **self.facts})

@@ -16,6 +16,7 @@ from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.tables import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
+from grounded.findings import Quantity, found
 
 DT = 0.04
 SWING = Model(
@@ -85,8 +86,10 @@ def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted
     assert not [*late_as_positions(seen, {"sensor_delay:x": 0.03}, ("sensor_delay:v",))]
     assert not [*late_as_positions(seen, {"sensor_delay:x+v": 0.03}, ())]  # v's own delay
     assert not [*late_as_positions(seen, {}, ())]
-    own = put_right("v", "0.02 s later than the derivative of x", "delay", "", delay_s=0.02)
+    own = put_right(
+        "v", found("sensor.late", "v", by=Quantity(0.02, "s"), of="x"), "delay", {}, delay_s=0.02
+    )
     both = late_effects([own, *seen, late])
     assert both["sensor_delay:v"]["d"] == pytest.approx(0.05)
     (line,) = instrument_lines([own, *seen, late])
-    assert "0.02 s later" in line and "mean over" in line and "another 0.03 s" in line
+    assert "0.0200 s later" in line and "mean over" in line and "another 0.03 s" in line

@@ -224,7 +224,7 @@ def test_one_factor_of_all_rates_is_the_clock(off, told):
     found = [one for one in preflight(BOTH, trials).findings if one.kind == "scale"]
     assert [one.signal for one in found] == told
     assert found[0].scale == pytest.approx(off[2], rel=0.05)
-    assert ("clock" in found[0].finding) == ("+" in told[0])
+    assert (found[0].said.code == "log.pace") == ("+" in told[0])
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_results_plot_what_the_page_shows(cart):
     findings = gathered(cart)
     assert findings.diagnosis is not None and findings.best is not None
     for result, titles in (
-        (findings.diagnosis, ("Share of the gap by channel",)),
+        (findings.diagnosis, ("Share by channel",)),
         (findings.standing, ("Utility of each candidate", "Step size")),
         (findings.best.candidate, ("x", "v", "force")),
     ):

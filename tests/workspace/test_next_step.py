@@ -38,7 +38,7 @@ TWO = {"verdict": BOTH, "ranking": [FIRST, LATE]}
 UNKNOWN = {"kind": "unknown", "effects": [], "limit": "model.few"}
 UNKNOWABLE = {"verdict": UNKNOWN}
 LAGGING = {"signal": "v", "finding": "", "kind": "lag", "delay_s": 0.03, "corrected": True}
-DELAYED = LAGGING | {"kind": "delay", "log": "delay_s = 0.05"}  # on top of 0.02 s in [log]
+DELAYED = LAGGING | {"kind": "delay", "keys": {"delay_s": 0.05}}  # on top of 0.02 s in [log]
 ROW = {"horizon_s": 1.0, "unit_by_channel": {"v": "m/s"}, "crude": {"v": 0.3}}
 DIFFERS = {"effect": "viscous_friction:v", "quantity": "k", "agrees": False, "chance": 0.0}
 
@@ -146,7 +146,7 @@ FOLLOWS |= {
         (
             LAGGING | {"delay_s": 1e-4},
             LAGGING | {"corrected": False},
-            LAGGING | {"log": "delay_s = 0.03"},
+            LAGGING | {"keys": {"delay_s": 0.03}},
             DELAYED | {"delay_s": 1e-4},
             DELAYED | {"corrected": False},
         )
@@ -228,7 +228,7 @@ def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_a
     w.ingest(log, data=True)
     w.reports.mkdir()
     written = w.config.file.read_text()
-    late = LAGGING | {"kind": "delay", "log": "delay_s = 0.02", "delay_s": 0.02}
+    late = LAGGING | {"kind": "delay", "keys": {"delay_s": 0.02}, "delay_s": 0.02}
     for name, now, preflight, then in (
         ("v", 'path = "/csv.v"', [], "adopt viscous_friction:v"),
         ("v", 'path = "/csv.v"\ndelay_s = 0.02', [late], "adopt viscous_friction:v"),

@@ -127,6 +127,6 @@ def test_what_log_has_already_is_counted(w, kind, has, logged, mended):
 def test_an_offset_that_is_found_adds_to_that_of_log(w, has, mended):
     foreign(w, has)
     (used,) = (replace(late(), id=one.stored.id) for one in w.trials())
-    compass = Finding("v", "turns the other way", "sign", log="scale = -1, offset = 1.5")
+    compass = Finding("v", None, "sign", keys={"scale": -1.0, "offset": 1.5})
     (one,) = where_to_mend(w, [used], [compass])
     assert keys_of(one.log) == mended

@@ -485,6 +485,7 @@ _AS = {Finding: FindingJson, Quantity: QuantityJson}  # types that are written i
 _MORE: dict[str, dict[str, Any]] = {  # what a document has beside its fields
     "Diagnosis": {"next_trial": str, "unknowable": list[str]},
     "Verdict": {"sentence": str},
+    "Finding": {"finding": str},
 }
 _PLAIN = {str: "string", Path: "string", bool: "boolean", int: "integer", NoneType: "null"}
 

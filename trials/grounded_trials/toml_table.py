@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from grounded.checks import near, unknown, wrong
+from grounded.checks import near, refused, wrong
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.plain_file import open_file
@@ -52,7 +52,8 @@ class Table:
         if value:
             facts = near(value, valid)
             return wrong(self._full(key), got=repr(value), where=self.file.name, **facts)
-        return unknown("key", self._full(key), valid, where=self.file.name)
+        place = {"where": self.file.name, **near(key, valid)}
+        return refused("given.name", self._full(key), kind="key", **place)
 
     def expect(self, *names: str) -> None:
         """Raise an error for a key that is not among `names`; called before any key is taken."""

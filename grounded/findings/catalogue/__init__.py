@@ -11,7 +11,19 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 
-AREAS = ("file", "gap", "given", "log", "model", "plan", "run", "search", "start", "target")
+AREAS = (
+    "file",
+    "gap",
+    "given",
+    "log",
+    "model",
+    "plan",
+    "run",
+    "search",
+    "sensor",
+    "start",
+    "target",
+)
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from grounded import findings as said
-from grounded.accounts.finding import AS_LATE, SENSOR_DELAY, Finding, late_effects
+from grounded.accounts.finding import SENSOR_DELAY, Finding, late_effects
 from grounded.places import heading, position
-from grounded.result import listed
 from grounded_trials.workspace.identity import READ_BY
 from grounded_trials.workspace.last_diagnosis import PLAIN
 from grounded_trials.workspace.user_files.task_file import seen_in
@@ -39,48 +38,36 @@ def where_to_mend(
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
         strange = no_angles(workspace.base_model, workspace.log_mapping)
-        odd = [Finding(one.about[0], one.clause, "mismatch") for one in strange]
+        odd = [Finding(one.about[0], one, "mismatch") for one in strange]
         findings = (*odd, *findings)
-        whole = (replace(one, log=_whole(one, read[-1])) for one in findings)
+        whole = (replace(one, keys=_whole(one, read[-1])) for one in findings)
         return tuple(
             replace(
                 one,
-                advice=(_alike(one) if AS_LATE in one.finding else _either(one))
-                if feedback and one.log and late_effects([one])
-                else one.advice or _late_message(workspace, one, read[-1]),
+                mend=_either(one)
+                if feedback and one.keys and late_effects([one])
+                else one.mend or _late_message(workspace, one, read[-1]),
             )
             for one in whole
         )
-    fed = ": the runner's feedback also gets it late" * feedback
-    late = f"should read it with less delay, or filter it less{fed}"
-    mend = {"delay": late, "lag": late, "sign": "should flip its sign"}
-    mend["degrees"] = "should write it in the model's unit"
-    whose = "the program that writes the trials"
+    how = {"delay": "late", "lag": "late", "sign": "sign", "degrees": "degrees"}
     return tuple(
-        replace(one, log="", advice=f"{whose} {mend[one.kind]}")
-        if one.corrected and one.kind in mend
+        replace(one, keys={}, mend=_in_program(one.signal, how[one.kind], fed=feedback))
+        if one.corrected and one.kind in how
         else one
         for one in findings
     )
 
 
-def _either(one: Finding) -> str:
+def _in_program(name: str, how: str, *, fed: bool) -> said.Finding:
+    """Return what the program that writes the trials should do."""
+    return said.found("sensor.mend", name, how=how, fed=fed and how == "late")
+
+
+def _either(one: Finding) -> said.Finding:
     """Return what to do about a late sensor, by whether the robot's program gets it as late."""
-    name = one.signal
-    return (
-        f"If the robot's program gets {name} as late as this log does, `adopt` sensor_delay:{name}:"
-        f" the plan then allows for it. Otherwise (only the log is late, or the program predicts "
-        f"{name} ahead by as much) set {one.log} in its table of [log]. Do not do both"
-    )
-
-
-def _alike(one: Finding) -> str:
-    """Return what to do about a sensor that is in one message with another late one."""
-    other = one.finding.removeprefix(AS_LATE).strip()
-    return (
-        f"Treat it as {other}: either `adopt` sensor_delay:{one.signal} or set {one.log} in its "
-        "table of [log], not both"
-    )
+    other = one.said.facts.get("message") if one.said else None
+    return said.found("sensor.adopt", one.signal, log=one.log, of=other)
 
 
 def one_message(workspace: Folder) -> tuple[str, ...]:
@@ -96,25 +83,22 @@ def one_message(workspace: Folder) -> tuple[str, ...]:
     return tuple(pose) if len(topics) == 1 else ()
 
 
-def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> str:
+def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> said.Finding | None:
     """Return what to set if a speed is early: no sensor is, so the message of the position is late.
 
-    "" for other findings, if both come in one message, or if its states were read differently.
+    None for other findings, if both come in one message, or if its states were read differently.
     """
     where, mapping = position(workspace.base_model), workspace.log_mapping
     states = mapping.states if mapping else {}
     if one.kind != "delay" or one.delay_s >= 0 or not {*where, one.signal} <= {*states}:
-        return ""
+        return None
     topic = _topic(states[where[0]].path)
     names = [name for name, spec in states.items() if _topic(spec.path) == topic]
     whole = {_keys(meta, name).get("delay_s", 0.0) - one.delay_s for name in names}
     if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
-        return ""
-    ahead = " and let the robot's program predict them ahead by as much"
-    return (
-        f"{listed(names)} are in one message, more likely late: set delay_s = {whole.pop():.3g} "
-        f"for each in [log.state]{ahead * workspace.config.task.feedback}"
-    )
+        return None
+    fed = workspace.config.task.feedback
+    return said.found("sensor.message", *names, delay=whole.pop(), fed=fed)
 
 
 def _topic(path: str) -> str:
@@ -128,13 +112,13 @@ def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, flo
         workspace: the workspace with the current [log].
         findings: the findings of the diagnosis, with the whole key of [log].
     """
-    late = [one for one in findings if one.kind == "delay" and "delay_s = " in one.log]
+    late = [one for one in findings if one.kind == "delay" and "delay_s" in one.keys]
     if not late:
         return {}
     mapping = workspace.log_mapping
     states, found = mapping.states if mapping else {}, dict[str, float]()
     for one in late:
-        whole = float(dict(part.split(" = ") for part in one.log.split(", "))["delay_s"])
+        whole = float(one.keys["delay_s"])
         now = states[one.signal].delay_s if one.signal in states else 0.0
         if now > whole - one.delay_s / 2:  # the trial was read with whole - delay_s
             found |= dict.fromkeys(late_effects([one]), now)
@@ -187,20 +171,20 @@ def _at_limits(
     ]
 
 
-def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
+def _whole(finding: Finding, meta: Mapping[str, str]) -> Mapping[str, Any]:
     """Return the whole key of [log] for a finding, combined with the keys used for a trial."""
     now = _keys(meta, finding.signal)
-    if not finding.log or not now:
-        return finding.log
-    keys = dict(part.split(" = ") for part in finding.log.split(", "))
+    if not finding.keys or not now:
+        return finding.keys
+    keys = dict(finding.keys)
     if "scale" in keys:
         by = float(keys["scale"])
-        keys["scale"] = f"{by * now['scale']:.8g}"
+        keys["scale"] = by * now["scale"]
         offset = by * now["offset"] + float(keys.get("offset", 0.0))
-        keys |= {"offset": f"{offset:.8g}"} if offset else {}
+        keys |= {"offset": offset} if offset else {}
     if "delay_s" in keys:
-        keys["delay_s"] = f"{float(keys['delay_s']) + now['delay_s']:.3g}"
-    return ", ".join(f"{key} = {value}" for key, value in keys.items())
+        keys["delay_s"] = float(f"{keys['delay_s'] + now['delay_s']:.3g}")
+    return keys
 
 
 def _keys(meta: Mapping[str, str], signal: str) -> dict[str, float]:

@@ -125,7 +125,7 @@ def test_a_log_of_other_driving_that_names_a_candidate_is_to_be_discarded(tmp_pa
     log = record(w, tmp_path / "hand.csv", other, 0.0)
     done = grounded("-C", w.folder, "next", log, "--candidate", "c0001")
     said = " ".join(f"{done.out} {done.err}".split())
-    assert holds(said, "not what c0001 sends", "nothing is proposed")
+    assert holds(said, "not what c0001 sends", "discard t0001")
     assert "The run counts" not in said and done.out.split()[-1] == "t0001"
     status = w.forget().status()
     assert status.then == NextCommand("discard", ("t0001",)) and holds(status.notes[0], "ingest")
@@ -171,6 +171,7 @@ def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     assert done.code == 0 and done.json == {
         "trials": ["t0002"],
         "unchanged": [],
+        "findings": [],
         "discarded": {"t0002": "a wheel was loose"},
     }
     now = w.status()

@@ -1,0 +1,90 @@
+"""Findings on the signals of a log: clauses that continue a sentence after the signal's name."""
+
+from __future__ import annotations
+
+from grounded.findings.catalogue import Entry
+
+ENTRIES: dict[str, Entry] = {
+    "late": Entry(
+        "warn",
+        "[[{by} later than ]][[tau? follows ]][[derivative? the derivative of ]][[{of}]]"
+        "[[ through a filter of {tau:.3g} s]][[is older by another {more:.3g} s, by which the log "
+        "of {position} itself is late]][[is in one message with, and so as late as, {message}]]",
+    ),
+    "derived": Entry(
+        "note",
+        "is [[a mean over {over:.2g} s, as from differences of {of}]][[a filtered derivative of "
+        "{of}, {age:.2g} s behind it on average]]; left out of the diagnosis: it tells nothing "
+        "more than {of}",
+    ),
+    "scale": Entry(
+        "warn",
+        "shows {share:%} of the rate of {of}[[rpm? , 2 pi / 60 times it: it was probably converted "
+        "from rpm by mistake]][[!rpm? ; either may be wrong]]",
+    ),
+    "bias": Entry(
+        "warn",
+        "shows {size} {way} than the rate of {of} throughout: a sensor bias, or {of} drifts",
+    ),
+    "limits": Entry(
+        "warn",
+        "[[beyond its limits, {limits}, ]][[at? at its limits ]][[is clipped {side} {limit}, ]]"
+        "{share:%} of the time[[ ({logged})]]",
+        "[[{how:percent=is it in percent? then multiply scale in [log.input] by 0.01,widen=widen "
+        "[limits] if the robot can}]]",
+    ),
+    "same": Entry(
+        "note",
+        "[[the same signal as {of}]][[, {late:.3g} s later]][[constant within each trial "
+        "({values})]]",
+    ),
+    "samples": Entry(
+        "warn",
+        "[[drops to {low:g} for single samples]][[has a new value only every {every:.3g} s]]"
+        "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]][[misses "
+        "samples, up to {gap:.3g} s at a time]][[comes in steps of {step}, as large as its "
+        "changes]][[ ({share:%})]]",
+        "[[every? in a table, leave its cell empty in rows that repeat a value]]",
+    ),
+    "jumps": Entry(
+        "warn", "[[degrees? is in degrees: jumps by 360]][[!degrees? jumps by 2 pi]] {count:time}"
+    ),
+    "mismatch": Entry(
+        "warn",
+        "does not move as {of} {of:implies/imply} (its rate is off by {off})",
+        "check units, axes and signs",
+    ),
+    "step": Entry(
+        "warn",
+        "is missed by {missed:%} of its change: the integrator's steps of {step} are too long for "
+        "the model",
+        "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]], and "
+        "diagnose again: what is fitted here makes up for such steps",
+    ),
+    "unresolved": Entry(
+        "warn",
+        "reaches {reach} in {trial}, {far} in most others: from {at} on, the model can't be "
+        "integrated with time steps of {step}, and the rest of that trial is left out",
+    ),
+    # how to mend it for good
+    "mend": Entry(
+        "note",
+        "{about} is written otherwise than the model has it",
+        "the program that writes the trials should {how:late=read it with less delay or filter it "
+        "less,sign=flip its sign,degrees=write it in the model's unit}[[fed? : the runner's "
+        "feedback also gets it late]]",
+    ),
+    "adopt": Entry(
+        "note",
+        "{about} comes late",
+        "[[treat it as {of}: ]]if the robot's program gets {about} as late as this log does, "
+        "`adopt` sensor_delay:{about}, and the plan allows for it; else set {log} in its table of "
+        "[log]; not both",
+    ),
+    "message": Entry(
+        "note",
+        "{about} are in one message, more likely late",
+        "{about} are in one message, more likely late: set delay_s = {delay:.3g} for each in "
+        "[log.state][[fed?  and let the robot's program predict them ahead by as much]]",
+    ),
+}
