@@ -26,7 +26,7 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.hypotheses.tuning import sweep, tune
 from grounded.diagnosis.hypotheses.variations import HOPEFUL, TUNED, reordered, swapped, varied
 from grounded.diagnosis.levels import NATS
-from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
@@ -68,14 +68,28 @@ def attribute(
     Returns:
         The search and its best fit.
     """
-    search = HypothesisSearch(data, candidates, tick, joints)
+    few = fewer(data)
+    search = HypothesisSearch(few, candidates, tick, joints)
     most = min(max_effects or USUAL_EFFECTS, USUAL_EFFECTS)
     with (
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, most)),
     ):
-        search, best = _searched(search, alone, max_effects)
-        return search, grown(search, best, max(most, len(best.hypothesis.effects)))
+        search, best = _searched(search, alone if few is data else (), max_effects)
+        most = max(most, len(best.hypothesis.effects))
+        best = grown(search, best, most)
+        return (search, best) if few is data else _confirmed(search, data, most)
+
+
+def _confirmed(search: HypothesisSearch, data: Data, most: int) -> tuple[HypothesisSearch, Fitted]:
+    """Return a search on all data with the likeliest sets of another one, and its best fit."""
+    other = HypothesisSearch(data, search.candidates, search.tick, tuple(search.joints.values()))
+    likely = {f.hypothesis.names for k in range(most + 1) for f in search.of_size(k)[:HOPEFUL]}
+    fits = [fit for fit in search.fits.values() if fit.hypothesis.names in likely]
+    starts = [(f.hypothesis, f.noise.plain, other.fresh(f.hypothesis)[2]) for f in fits]
+    other.refined(starts, TO_THE_TOP)
+    settle(other, most)
+    return other, other.chosen(most)
 
 
 def so_far(search: HypothesisSearch, most: int, decided: Sequence[str] | None = None) -> str:

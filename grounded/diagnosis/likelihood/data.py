@@ -34,6 +34,7 @@ LONGEST_RUN, SHORTER_RUN = 200, 150  # most steps of a run; the second applies t
 PIECES, SHORTEST_PIECE = 5, 50  # a single log is held out in pieces of at least this many steps
 MOST_NUMBERS = 1.2e6  # size of one (L, B, N, N) array above which only informative runs are kept
 SIMULATED = 800  # total steps kept for a simulator, since each is evaluated thousands of times
+SEARCHED, RUNS_SEARCHED = 300, 3  # of these, steps and least runs on which causes are sought
 SESSION, ROOMY = 16, 2.5  # runs of a session at the robot, all kept up to ROOMY times that size
 UNKNOWN = 10  # samples of a run until a state is known that no sensor shows
 SHOWN = 3  # samples at the start of a log that show which input was held before it
@@ -269,6 +270,24 @@ def entire(data: Data) -> Data:
     state_at, step_at, valid, trial_of = _cut(data.lengths, LONGEST_RUN)
     all_ = {"state_at": state_at, "step_at": step_at, "valid": valid, "trial_of": trial_of}
     return replace(data, **all_, skipped=0)
+
+
+def fewer(data: Data) -> Data:
+    """Return the data of the most informative runs, on which a simulator's causes are sought.
+
+    All others are returned as they are: their steps are cheap.
+    """
+    if not simulated(data.model):
+        return data
+    most = max(RUNS_SEARCHED, SEARCHED // data.step_at.shape[1])
+    signals = [data.filled[data.state_at], data.runs(data.commands).swapaxes(0, 1)]
+    begins = np.flatnonzero(np.diff(data.trial_of, prepend=-1))
+    keep = _informative(signals, begins, most, ())
+    if len(keep) == len(data.valid):
+        return data
+    runs = (data.state_at, data.step_at, data.valid, data.trial_of)
+    state_at, step_at, valid, trial_of = (of[keep] for of in runs)
+    return replace(data, state_at=state_at, step_at=step_at, valid=valid, trial_of=trial_of)
 
 
 def _signals(model: Model, used: Sequence[tuple[Trial, int]], hidden: Sequence[str]) -> Signals:
