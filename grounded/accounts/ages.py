@@ -255,7 +255,7 @@ class Ages:
         elif found.found:
             size = Quantity(abs(found.value), self.model.states[w])
             way = "more" if found.value > 0 else "less"
-            yield Finding(w, found_("sensor.bias", w, size=size, way=way, of=q), "offset")
+            yield Finding(w, found_("sensor.scale", w, size=size, way=way, of=q), "offset")
 
     def positions(self) -> Iterator[Finding]:
         """Correct both positions of a plane that share a delay."""

@@ -144,7 +144,7 @@ def _wrapped(s: Signal) -> Found | None:
             steps = np.diff(x)
             off = np.where(np.abs(np.abs(steps) - turn) < 0.1 * turn, np.sign(steps), 0.0)
             whole.append((x - turn * np.concatenate([[0.0], np.cumsum(off)])) * (2 * np.pi / turn))
-        said = found("sensor.jumps", s.name, degrees=degrees, count=count)
+        said = found("sensor.samples", s.name, degrees=degrees, count=count)
         keys: dict[str, Any] = {"scale": 0.017453293} if degrees else {}
         kind, scale = ("degrees", 180 / np.pi) if degrees else ("wrapped", 1.0)
         keys["unwrap"] = True

@@ -44,8 +44,8 @@ class TooLong:
     def finding(self) -> told.Finding:
         """What is missed, and what to change."""
         step = Quantity(1e3 * self.dt, "ms")
-        facts: dict[str, Any] = {"missed": self.missed, "step": step, "substeps": self.substeps}
-        return told.found("sensor.step", self.state, **facts)
+        facts: dict[str, Any] = {"share": self.missed, "step": step, "substeps": self.substeps}
+        return told.found("plan.time_step", self.state, file="model.py", **facts)
 
 
 def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Finding]:

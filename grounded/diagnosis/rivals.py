@@ -79,6 +79,6 @@ def predicted(task: Task, trials: Sequence[Trial], hidden: Sequence[str]) -> Pre
     with np.errstate(all="ignore"):
         fits = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
         if not fits:
-            raise GroundedError(found("gap.rival_lost", model.name))
+            raise GroundedError(found("model.not_finite", model.name))
         ruler = Ruler(search.predictor)
         return Predicted(ruler, ruler.errors(fits[0]))

@@ -97,7 +97,7 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
         if left_out and one.kind == "delay":
             done = f"; {left_out.finding}"
         done += old
-        if one.mend is not None and one.mend.code == "sensor.adopt":  # says when to set it
+        if one.mend is not None and "log" in one.mend.facts:  # says when to set it
             lines.append(f"{one.signal}: {one.finding}{done}. {one.advice}")
             continue
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)

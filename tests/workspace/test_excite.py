@@ -35,7 +35,7 @@ CERTAIN = MODEL.replace(', "kg", 0.1, 10.0', "").replace(', "N s/m", 0.0, 5.0', 
 @pytest.mark.parametrize(
     ("files", "seconds", "code"),
     [
-        ({"config": BARE}, None, "plan.drive_unbounded"),
+        ({"config": BARE}, None, "plan.no_drive"),
         ({"config": SAFE.replace("force = [-5.0, 5.0]", "")}, None, "plan.no_limits"),
         ({"config": SAFE, "model": CERTAIN}, None, "given.constant"),
         ({"config": SAFE}, 0.01, "given.value"),

@@ -49,7 +49,11 @@ ENTRIES: dict[str, Entry] = {
     # tables
     "no_times": Entry(
         "refuse",
-        "{about} has no column of times[[ among {names}]]",
+        "{about} [[begins with '{line}', not with column names]][[!line? has no column of times]]"
+        "[[ among {names}]]",
+        "[[line? add a line such as 't,x,v', or name the columns: `--columns t,x,v`, or `columns` "
+        "in "
+        "[log]; ]]"
         f"add or name {_STAMPS}[[; '{{rises}}' increases in every row]]; or give the rate of "
         "its rows [Hz], `--rate 100`, or `rate = 100` in [log]",
     ),
@@ -57,12 +61,6 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "{about}[[, line {line}]]: '{name}' has no times[[ in {lost:row}]][[: '{text}']]",
         f"expected {_STAMPS}, 2026-11-21 10:05:00.250, 21.11.2026 10:05:00.250 or 10:05:00.250",
-    ),
-    "no_names": Entry(
-        "refuse",
-        "{about} begins with '{line}'",
-        "expected a line with column names above the rows, such as 't,x,v'; or name them, "
-        "`--columns t,x,v`, or `columns` in [log]",
     ),
     "row": Entry(
         "refuse",
@@ -162,10 +160,6 @@ ENTRIES: dict[str, Entry] = {
         'use one clock, such as clock = "log"[[by? , or cut the log there]][[, or align them: '
         "{lines}]]",
     ),
-    "never": Entry(
-        "refuse",
-        "[log.span] {about}: {path} is never {wanted} in this log; it is {low:g} to {high:g}",
-    ),
     "steps": Entry(
         "refuse",
         "the trial would have {steps} steps of {dt:g} s, from {start:.3f} s to {stop:.3f} s[[; "
@@ -188,7 +182,9 @@ ENTRIES: dict[str, Entry] = {
     "vanished": Entry(
         "warn",
         "[[{about} {about:has/have} no sample after {until:.2f} s of the log, in which other "
-        "states go on until {whole:.2f} s: the trial ends there]][[all states are known from "
+        "states go on until {whole:.2f} s: the trial ends there]][[{about} is not a finite number "
+        "at {ends}: the trial "
+        "ends there]][[all states are known from "
         "{late:.3f} s on: the trial starts there]]",
     ),
     "odd_values": Entry(

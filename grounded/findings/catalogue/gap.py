@@ -213,5 +213,4 @@ ENTRIES: dict[str, Entry] = {
         "these trials can't decide [[models? between ]]{about}",
         "[[!models? record runs in which {about:it/they} matter{about:s/}]]",
     ),
-    "rival_lost": Entry("refuse", "{about} can't follow these trials at all"),
 }

@@ -104,15 +104,11 @@ ENTRIES: dict[str, Entry] = {
         "add {add:.3g} to the offset in {tables} (a missing one is 0)",
     ),
     # columns: what [log] and names say
-    "crossed": Entry(
-        "warn",
-        OF + "{about} are read from {paths}: by their {by} they are exchanged",
-        "exchange the paths in [log]",
-    ),
     "path": Entry(
         "warn",
-        OF + "{about} is read from {path}, {what}[[: {instead} is the angle]]",
-        "check its path in [log]",
+        OF + "{about} {about:is/are} read from [[{path}, {what}]][[: {instead} is the angle]]"
+        "[[{paths}: by their {by} they are exchanged]]",
+        "check {about:its path/their paths} in [log]",
     ),
     "stated": Entry(
         "warn",
@@ -143,9 +139,6 @@ ENTRIES: dict[str, Entry] = {
     "gaps": Entry(
         "warn",
         "{samples} lost samples were interpolated, the longest gap is {longest} of {about} at {at}",
-    ),
-    "not_finite": Entry(
-        "warn", "{about} is not a finite number at {at}: the trial is treated as ended there"
     ),
     "short": Entry(
         "warn",
@@ -231,12 +224,6 @@ ENTRIES: dict[str, Entry] = {
         OF + "its commands are like those of {ran}, but not the same, and it holds no copy of it",
         "if another workspace's {ran} ran, `discard` it; to be sure, write trials with "
         "TrialWriter(..., policy=Path(candidate).read_bytes())",
-    ),
-    "speeds": Entry(
-        "note",
-        "most of its commands are near those of {ran} on the {about} that [estimate] finds here; "
-        "its program used its own",
-        "to have them judged exactly, log and map those too",
     ),
     "late": Entry(
         "warn",

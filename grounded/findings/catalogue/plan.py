@@ -242,10 +242,11 @@ ENTRIES: dict[str, Entry] = {
     ),
     "time_step": Entry(
         "warn",
-        "in each step of the predicted run {about} is off by {share:%} of its change: the "
-        "integrator's steps of {step} are too long for the model",
+        "{about} is missed by {share:%} of its change in a step: the integrator's steps of {step} "
+        "are "
+        "too long for the model",
         "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]] in "
-        "{file}, and propose again",
+        "{file}, and plan or diagnose again",
     ),
     "last_command": Entry(
         "note",
@@ -270,15 +271,13 @@ ENTRIES: dict[str, Entry] = {
         "to rest inside",
     ),
     # a drive that excites the model's parameters
-    "drive_unbounded": Entry(
-        "refuse",
-        "[safety] bounds no state, and no log shows where the robot may go",
-        "enter where it may go, such as [safety] {state} = [-1.0, 1.0]",
-    ),
     "no_drive": Entry(
         "refuse",
-        "by the model, no drive stays inside [safety] from [task] start",
-        "widen [safety], start where there is room, or make it shorter (--seconds)",
+        "[[!state? by the model, no drive stays inside [safety] from [task] start]][[state? "
+        "[safety] "
+        "bounds no state, and no log shows where the robot may go]]",
+        "[[!state? widen [safety], start where there is room, or make it shorter (--seconds)]]"
+        "[[enter where it may go, such as [safety] {state} = [-1.0, 1.0]]]",
     ),
     "drive_weak": Entry(
         "note",

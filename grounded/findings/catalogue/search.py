@@ -165,7 +165,6 @@ ENTRIES: dict[str, Entry] = {
         "[[log? name it with --candidate ID, or use --data for a log that ran none]][[!log? make "
         "the next one, or name the candidate that is run]]",
     ),
-    "no_best": Entry("refuse", "no run of this task is stored, so no candidate is the best"),
     "undiagnosed": Entry("refuse", "there is no diagnosis[[ of {about}]] yet", "diagnose first"),
     # how sure a gain is
     "gain": Entry(

@@ -19,12 +19,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "scale": Entry(
         "warn",
-        "shows {share:%} of the rate of {of}[[rpm? , 2 pi / 60 times it: it was probably converted "
-        "from rpm by mistake]][[!rpm? ; either may be wrong]]",
-    ),
-    "bias": Entry(
-        "warn",
-        "shows {size} {way} than the rate of {of} throughout: a sensor bias, or {of} drifts",
+        "shows [[{share:%} of]][[{size} {way} than]] the rate of {of}[[rpm? , 2 pi / 60 times it: "
+        "it was probably converted from rpm by mistake]][[!rpm? ; either may be wrong]]",
     ),
     "limits": Entry(
         "warn",
@@ -40,26 +36,17 @@ ENTRIES: dict[str, Entry] = {
     ),
     "samples": Entry(
         "warn",
-        "[[drops to {low:g} for single samples]][[has a new value only every {every:.3g} s]]"
+        "[[degrees? is in degrees: ]][[jumps by a full turn {count:time}]][[drops to {low:g} for "
+        "single samples]][[has a new value only every {every:.3g} s]]"
         "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]][[misses "
         "samples, up to {gap:.3g} s at a time]][[comes in steps of {step}, as large as its "
         "changes]][[ ({share:%})]]",
         "[[every? in a table, leave its cell empty in rows that repeat a value]]",
     ),
-    "jumps": Entry(
-        "warn", "[[degrees? is in degrees: jumps by 360]][[!degrees? jumps by 2 pi]] {count:time}"
-    ),
     "mismatch": Entry(
         "warn",
         "does not move as {of} {of:implies/imply} (its rate is off by {off})",
         "check units, axes and signs",
-    ),
-    "step": Entry(
-        "warn",
-        "is missed by {missed:%} of its change: the integrator's steps of {step} are too long for "
-        "the model",
-        "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]], and "
-        "diagnose again: what is fitted here makes up for such steps",
     ),
     "unresolved": Entry(
         "warn",
@@ -69,22 +56,12 @@ ENTRIES: dict[str, Entry] = {
     # how to mend it for good
     "mend": Entry(
         "note",
-        "{about} is written otherwise than the model has it",
-        "the program that writes the trials should {how:late=read it with less delay or filter it "
-        "less,sign=flip its sign,degrees=write it in the model's unit}[[fed? : the runner's "
-        "feedback also gets it late]]",
-    ),
-    "adopt": Entry(
-        "note",
-        "{about} comes late",
-        "[[treat it as {of}: ]]if the robot's program gets {about} as late as this log does, "
-        "`adopt` sensor_delay:{about}, and the plan allows for it; else set {log} in its table of "
-        "[log]; not both",
-    ),
-    "message": Entry(
-        "note",
-        "{about} are in one message, more likely late",
-        "{about} are in one message, more likely late: set delay_s = {delay:.3g} for each in "
-        "[log.state][[fed?  and let the robot's program predict them ahead by as much]]",
+        "{about} can be mended for good",
+        "[[the program that writes the trials should {how:late=read it with less delay or filter "
+        "it less,sign=flip its sign,degrees=write it in the model's unit}]][[treat it as {of}: ]]"
+        "[[if the robot's program gets it as late as this log does, `adopt` sensor_delay, and the "
+        "plan allows for it; else set {log} in its table of [log]; not both]][[{about} are in one "
+        "message, more likely late: set delay_s = {delay:.3g} for each in [log.state]]]"
+        "[[fed? ; the runner's feedback gets it late as well]]",
     ),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 from grounded.findings.catalogue import Entry
 
 ENTRIES: dict[str, Entry] = {
-    "beyond": Entry("warn", "{about} goes to {goes}, beyond its bound in [safety], {bound:g}"),
     "readings": Entry(
         "note",
         "the sensor of {about} reads {bias}, and the target is in its readings[[; it ends at "

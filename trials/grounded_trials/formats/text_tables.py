@@ -43,7 +43,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # characters read of a line
 BEFORE = 20  # rows before the last one that show how many digits its last cell should have
-NAMELESS = ("file.no_names", "file.no_times")  # which [log] says then
+NAMELESS = ("file.no_times",)  # which [log] says then
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
 SECONDS = re.compile(r"(^|[\W_])s(ec|ecs|econds)?[\])]?$")  # at the end of a column's name
@@ -311,7 +311,7 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     mark = next((m for m in "\t;," if m in lines[0]), ",")
     cells = _cells(lines[0], mark)
     if not any(map(column_name, cells)) or _share(cells) == 1:
-        raise GroundedError(found("file.no_names", str(path), line=lines[0][:40].strip()))
+        raise GroundedError(found("file.no_times", str(path), line=lines[0][:40].strip()))
     return _named(lines, 0, mark)
 
 

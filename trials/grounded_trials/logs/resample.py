@@ -328,8 +328,16 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
     if not beyond.any():
         limits = {"above": crossing.above, "below": crossing.below}
         wanted = " and ".join(f"{k} {v}" for k, v in limits.items() if v is not None)
-        facts: dict[str, Any] = {"low": float(y.min()), "high": float(y.max())}
-        raise GroundedError(found("file.never", which, path=crossing.path, wanted=wanted, **facts))
+        facts: dict[str, Any] = {"given": f"{y.min():g} to {y.max():g}"}
+        raise GroundedError(
+            found(
+                "given.value",
+                f"[log.span] {which}: {crossing.path}",
+                like=wanted,
+                must="span",
+                **facts,
+            )
+        )
     return int(t[np.argmax(beyond)])
 
 

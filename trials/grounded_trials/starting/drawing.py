@@ -357,8 +357,10 @@ def _beyond_safety(case: _Case) -> Iterator[Finding]:
         least, most = bounds.get(name, (-math.inf, math.inf))
         low, high = float(column.min()), float(column.max())
         if low < least or high > most:
-            end, bound = (low, least) if low < least else (high, most)
-            yield found("target.beyond", name, goes=Quantity(end, case.units[name]), bound=bound)
+            end = low if low < least else high
+            goes = Quantity(end, case.units[name])
+            facts: dict[str, Any] = {"state": name, "value": goes, "low": least, "high": most}
+            yield found("plan.outside", name, table="safety", weight=Weight.WARN, **facts)
 
 
 def _in_readings(case: _Case) -> Iterator[Finding]:

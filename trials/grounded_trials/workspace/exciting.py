@@ -130,7 +130,7 @@ def _bounded(workspace: Folder) -> Task:
         task = near(planner, trials)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([*task.safety_low, *task.safety_high]).any():
-        raise GroundedError(found("plan.drive_unbounded", state=task.model.state_names[0]))
+        raise GroundedError(found("plan.no_drive", state=task.model.state_names[0]))
     stands = resting(task, np.zeros(task.model.n, bool), planner.loose)
     return task if stands is None else replace(task, past=stands[task.model.n :])
 

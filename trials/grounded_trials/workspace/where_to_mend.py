@@ -67,7 +67,7 @@ def _in_program(name: str, how: str, *, fed: bool) -> said.Finding:
 def _either(one: Finding) -> said.Finding:
     """Return what to do about a late sensor, by whether the robot's program gets it as late."""
     other = one.said.facts.get("message") if one.said else None
-    return said.found("sensor.adopt", one.signal, log=one.log, of=other)
+    return said.found("sensor.mend", one.signal, log=one.log, of=other)
 
 
 def one_message(workspace: Folder) -> tuple[str, ...]:
@@ -98,7 +98,7 @@ def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> s
     if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
         return None
     fed = workspace.config.task.feedback
-    return said.found("sensor.message", *names, delay=whole.pop(), fed=fed)
+    return said.found("sensor.mend", *names, delay=whole.pop(), fed=fed)
 
 
 def _topic(path: str) -> str:

@@ -66,5 +66,5 @@ def test_an_input_in_the_column_of_a_state_is_told_at_ingest(tmp_path):
     other = Workspace(w.folder)
     with pytest.raises(GroundedError, match=holding("/csv.force", "/csv.v", "exchanged")):
         other.ingest(log)
-    (told,) = of_code(other.ingest(log, data=True), "log.crossed")
+    (told,) = of_code(other.ingest(log, data=True), "log.path")
     assert set(told.about) == {"v", "force"}

@@ -172,7 +172,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:
-        raise refused("search.no_best")
+        raise refused("search.no_trial")
     return best.candidate.id
 
 

@@ -45,7 +45,7 @@ def crossed(model: Model, mapping: LogMapping) -> list[Finding]:
         if _of_the_other(a, b, paths, units) or _crossed(a, b, paths)
     }
     return lengths + [
-        found("log.crossed", a, b, paths=(paths[a], paths[b]), by=what)
+        found("log.path", a, b, paths=(paths[a], paths[b]), by=what)
         for (a, b), what in by.items()
         if not {a, b} <= set(axes)
     ]
