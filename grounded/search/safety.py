@@ -211,7 +211,7 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> Finding | Non
     )
 
 
-def as_sent(model: Model, inputs: Array, digits: int = 3) -> tuple[str, ...]:
+def as_sent(model: Model, inputs: Array) -> tuple[str, ...]:
     """Return inputs (m,) as `force = 0 N`, each."""
     pairs = zip(model.inputs.items(), inputs + 0.0, strict=True)
-    return tuple(with_unit(f"{name} = {x:.{digits}g}", unit) for (name, unit), x in pairs)
+    return tuple(with_unit(f"{name} = {x:.3g}", unit) for (name, unit), x in pairs)

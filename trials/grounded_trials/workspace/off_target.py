@@ -302,13 +302,10 @@ def cost_of_inputs(task: Task, run: Trial) -> float:
     return -(terms.get("input", 0.0) + terms.get("input_change", 0.0))
 
 
-def began_elsewhere(
-    task: Task, trials: Sequence[Trial], predicted: Array, estimated: Collection[str] = ()
-) -> dict[str, str]:
+def began_elsewhere(task: Task, trials: Sequence[Trial], predicted: Array) -> dict[str, str]:
     """Return how far from [task] start runs of one candidate began, `{"x": "+0.02 m in x"}`.
 
-    Differences within the sensors' noise or below their resolution do not count, nor do `estimated`
-    states, whose error no sensor's noise bounds.
+    Differences within the sensors' noise or below their resolution do not count.
     """
     off = np.array([task.model.difference(t.began, task.start) for t in trials])
     mean = off.mean(axis=0)
@@ -316,7 +313,7 @@ def began_elsewhere(
     return {
         name: f"{with_unit(f'{mean[i]:+.2g}', unit)} in {name}"
         for i, (name, unit) in enumerate(task.model.states.items())
-        if told[i] and name not in estimated
+        if told[i]
     }
 
 
