@@ -163,7 +163,7 @@ def test_mismatch_is_an_error_with_both_values():
         return {"x": s.v * len(calls), "v": a.u}
 
     system, (x, u, p) = make(forgetful), points()
-    with pytest.raises(GroundedError, match=r"test_compile_trace.py:\d+.*'x', .*\d.*\d"):
+    with pytest.raises(GroundedError, match=r"test_compile_trace.py:\d+.*'x' .*\d.*\d"):
         system.check(x, u, p, 0.1)
 
 
