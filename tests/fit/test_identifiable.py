@@ -6,6 +6,10 @@ import pytest
 from facts import holding, of_code
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation.limits import identifiable
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.fit import fit
@@ -65,6 +69,19 @@ def test_of_a_combination_the_surest_parameter_stays():
     verdicts = {one.parameter: one.verdict for one in diagnosis.identifiable}
     assert verdicts["mass"] == "not identifiable"
     assert "mass" not in diagnosis.known_parameters
+
+
+def test_a_parameter_that_is_found_off_is_identified_by_what_shows_that():
+    model = motor(mass=Param(2.0), gain=Param(2.0, "1", 0.1, 20), drag=Param(0.5, "1", 0.05, 10))
+    data = prepare(model, trials(), np.zeros(1))
+    search = HypothesisSearch(data, Library().candidates(model, data.scales))
+    search.nulls()
+    off = Library().effect("parameter:gain", model, data.scales)
+    start = search.fresh(Hypothesis(shift=np.zeros(3), spread=1.0).plus(off, {"d": 1.0}))
+    (found, *_) = search.refined([start], 12)
+    assert found.hypothesis.values[0]["d"] == pytest.approx(1.0, abs=0.1)
+    verdicts = {one.parameter: one.verdict for one in identifiable(search.predictor, found)}
+    assert verdicts == {"gain": "identifiable", "drag": "identifiable"}
 
 
 def drags(noise=0.02, T=80):

@@ -421,11 +421,13 @@ def without_others(data: Data, adopted: Collection[str], library: Library) -> Mo
 def _information(predictor: Predictor, fit: Fitted) -> Array:
     """Return the information on uncertain parameters in units of their priors, (K, K).
 
-    The values of the effects are marginalised.
+    The values of the effects are marginalised, but for a parameter that is off: that is its value.
     """
-    k, G = len(fit.hypothesis.theta), information(predictor, fit)
-    across = G[k:, :k]
-    return np.asarray(G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T)
+    h, G = fit.hypothesis, information(predictor, fit)
+    k, each = len(h.theta), [effect.name for effect in h.effects for _ in effect.free]
+    others = [i for i, name in enumerate(each) if not name.startswith("parameter:")]
+    across, among = G[k:][:, others], G[np.ix_(others, others)]
+    return np.asarray(G[k:, k:] - across @ np.linalg.pinv(among, hermitian=True) @ across.T)
 
 
 def _left(information: Array) -> Array:
