@@ -103,7 +103,7 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
     h = np.abs(np.sin(0.1 * np.arange(60)))[:, None]
     h[17] = -0.004
     trials = [Trial(h, np.ones((59, 1)), 0.1, ("h",), ("u",), id=f"t000{k}") for k in (1, 2)]
-    with pytest.raises(GroundedError, match=r"trial t0001, t = 1\.7 s, h = -0\.004") as raised:
+    with pytest.raises(GroundedError, match=r"t0001, t = 1\.7 s, h = -0\.004") as raised:
         diagnose(tank, trials)
     assert "np.maximum" in str(raised.value)
 
