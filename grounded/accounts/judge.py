@@ -29,7 +29,7 @@ from grounded.accounts.kinematics import (
 )
 from grounded.accounts.motion import HALF, HINT, LIKE, Ahead, Fit, horizon_of, plainly_missed
 from grounded.accounts.table import Account, Term, Told, accounts, versions
-from grounded.frozen import Array
+from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
@@ -44,6 +44,7 @@ NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and 
 CLEAR = 1.0  # [nats] by which an account must lead in calibrated predictions
 TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
+NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
 FAR = 20.0  # times as large as in other trials: a trial to be examined
 
 
@@ -82,7 +83,7 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
     rows += [Row(r.i, (r.j,), r.c) for r in plain if r.i not in known]
     with np.errstate(all="ignore"):
         # dead sensors first: as noise they would look like anything
-        for one in _dead(model, mended, shown):
+        for one in _dead(model, mended, rows, shown):
             told.append(one)
             mended = _without(one, mended)
         for one in _by_rows(model, mended, rows, shown):
@@ -105,9 +106,19 @@ def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
     return [told.account.mended(t) if k in told.trials else t for k, t in enumerate(trials)]
 
 
-def _dead(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Told]:
-    """Yield the velocities that show no motion."""
+def _dead(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> Iterator[Told]:
+    """Yield the velocities that show no motion: of a position's rate, or in a row that is bad."""
     each = [dead(model, trial, shown) for trial in trials]
+    units, several = list(model.states.values()), [row for row in rows if len(row.by) > 1]
+    for found, trial in zip(each, trials, strict=True):
+        noise = NOISE_ALONE * white_noise(trial.states)
+        for row in _bad(gaps(model, trial, several)):
+            for j in (j for j in row.by if units[j].endswith("/s")):
+                x = trial.states[:, j]
+                if np.nanstd(x) <= noise[j] and abs(mean := float(np.nanmean(x))) <= noise[j]:
+                    found[j] = (row.i, mean, float(np.nanstd(trial.states[:, row.i])))
     for j in sorted({j for one in each for j in one}):
         some = tuple(k for k, one in enumerate(each) if j in one)
         account = Account("dead", (j,))

@@ -1,10 +1,11 @@
 """What positions, velocities and headings imply of each other, whatever the physics.
 
 The rate of some states consists of logged velocities, perhaps rotated by logged angles: q' = w,
-x' = u cos psi - v sin psi. No input or uncertain parameter enters such a row, except as a constant
-(a current). The displacement that a row predicts over stretches of a log is compared with that of
-its own sensor: the unexplained share is about 1 where a column is dead, in another unit, of the
-other sign or in another's place, and small in an honest log, however wrong the model.
+x' = u cos psi - v sin psi. No input enters such a row; an uncertain parameter only as a constant (a
+current), or as its size (the radius of a wheel), which is fitted within the parameter's bounds. The
+displacement that a row predicts over stretches of a log is compared with that of its own sensor:
+the unexplained share is about 1 where a column is dead, in another unit, of the other sign or in
+another's place, and small in an honest log, however wrong the model.
 """
 
 from __future__ import annotations
@@ -33,11 +34,16 @@ WINDOWS = 40  # windows of a piece over which a rate is sought dead
 
 @dataclass(frozen=True)
 class Row:
-    """The rate of state i depends on the states `by` alone; with `c` set, c times a single one."""
+    """The rate of state i depends on the states `by` alone; with `c` set, c times a single one.
+
+    Uncertain parameters may make it `low` to `high` times as large.
+    """
 
     i: int
     by: tuple[int, ...]
     c: float = 0.0
+    low: float = 1.0
+    high: float = 1.0
 
     @property
     def states(self) -> frozenset[int]:
@@ -75,7 +81,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     dt = places.probe(model, SHORT)
     if dt > SHORT:
         return found
-    # rates that no input and no uncertain parameter changes, and that double with all velocities
+    # rates that no input changes, and a parameter in size only; they double with all velocities
     x, u = places.within_limits(model, 8)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     slopes = (f_x - np.eye(model.n)) / dt
@@ -83,18 +89,24 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     rates, doubled = (_rates(model, z) for z in (x, np.where(fast, 2 * x, x)))
     size = SMALL * np.abs(rates).max(axis=0)
     fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
+    low, high = np.ones((2, model.n))
     for k, one in enumerate(model.params.values()):
-        if one.uncertain:
+        ends = (one.low, one.high) if one.uncertain else ()
+        for end, other in zip(ends, (0.9, 1.1), strict=False):
             values = np.array(model.values)
-            values[k] = 1.1 * values[k] + 0.01
+            values[k] = other * values[k] + 0.01 if end is None else end
             moved = (model.system.step(x, u, values, dt) - x) / dt
-            fixed &= np.ptp(moved - rates, axis=0) < size
+            times = (moved * rates).sum(axis=0) / np.maximum((rates**2).sum(axis=0), 1e-300)
+            plain = np.ptp(moved - rates, axis=0) < size
+            times = np.where(plain, 1.0, times)
+            fixed &= plain | ((np.abs(moved - times * rates).max(axis=0) < size) & (times > 0))
+            low, high = low * np.minimum(times, 1), high * np.maximum(times, 1)
     fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
     for i in (i for i in shown if i < model.n):
         slope = np.abs(slopes[:, i]).max(axis=0)
         by = tuple(int(j) for j in np.flatnonzero(slope > SMALL * slope.max()))
         if fixed[i] and i not in by and {*by} <= {*shown}:
-            found.append(Row(i, by))
+            found.append(Row(i, by, 0.0, float(low[i]), float(high[i])))
     return found
 
 
@@ -152,7 +164,13 @@ def _over(
 
     It is relative to the motion of all states of the same unit: a row's own may hardly move.
     """
-    units = list(model.states.values())
+    units, told = list(model.states.values()), np.array(told)
+    for row in rows:
+        if row.low < row.high:  # of a size that is fitted
+            times = (far[:, row.i] @ told[:, row.i]) / max(
+                float((told[:, row.i] ** 2).sum()), 1e-300
+            )
+            told[:, row.i] *= np.clip(times, row.low, row.high)
     moved, said, off = _size(far), _size(told), _size(far - told)
     varying, power = np.std(far - told, axis=0), told.var(axis=0)
     steady = power < STEADY * said**2  # at a constant velocity a drift is no drift
