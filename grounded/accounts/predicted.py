@@ -12,11 +12,13 @@ from typing import Protocol
 
 import numpy as np
 
+from grounded.accounts.sent import as_sent
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.trial import Trial
 
 NEAR = 0.3  # of a state's usual size: smaller differences from the prediction are alike
+CLOSE = 0.6  # the same in every state: a sign or a unit puts a column farther off
 ALIKE = 1.0  # largest usual difference of a run that is like its prediction; unrelated: 1.4
 
 
@@ -65,3 +67,17 @@ def like_predicted(own: Ran, trial: Trial) -> bool:
     known = far(own, trial)
     known = known[np.isfinite(known)]
     return not len(known) or bool(np.median(known) < ALIKE)
+
+
+def as_planned(own: Ran, trial: Trial) -> bool:
+    """Return whether a run's commands are its candidate's to the last digits, and its motion near.
+
+    Then it came about as it is logged, and no other account is asked for: a column in another unit,
+    of the other sign, dead or in another's place is far from its prediction.
+
+    Args:
+        own: the candidate.
+        trial: its run, with gaps bridged.
+    """
+    known = far(own, trial)
+    return as_sent(own.policy, trial) and bool((known[np.isfinite(known)] < CLOSE).all())

@@ -19,7 +19,6 @@ import numpy as np
 
 from grounded.accounts.commands import STARTS, Acts, how_inputs_act
 from grounded.accounts.motion import HALF, HORIZONS, Ahead
-from grounded.effects.memory import late_inputs
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.search.planner import Planner
@@ -121,6 +120,8 @@ def _missed(planner: Planner, trial: Trial, most: int) -> tuple[Array, Array]:
         trial: a run; only its part without gaps is used.
         most: the largest lag of interest [steps].
     """
+    from grounded.effects.memory import late_inputs
+
     assert planner.plan.latency is not None
     shifts = np.arange(-most - 1.0, most + BEYOND + 1)
     lifted = planner.lift(trial.until(max(trial.finite_steps, 0)))

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.returned import Kind, stories
 from grounded.accounts.sent import (
     LATEST,
     LEAST,
@@ -35,7 +34,6 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
 from grounded.search.feedback.sample_age import sample_age
-from grounded.search.run_motion import Late, what_is_late
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -60,6 +58,8 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     own, whole = workspace.candidate(trial.candidate)[0], interpolate_gaps(trial).trial
     if as_sent(own.policy, whole):
         return None
+    from grounded.accounts.returned import Kind, stories
+
     if one := steps_skipped(workspace.task, own, whole):
         return one
     run = whole.until(workspace.task.horizon)
@@ -77,6 +77,8 @@ def _late(workspace: Folder, own: Candidate, run: Trial, ran: Following) -> Find
 
     Cut where its commands begin in the log, late commands seem to act on samples steps old.
     """
+    from grounded.search.run_motion import Late, what_is_late
+
     task, steps = workspace.task, ran.late
     if not steps:
         steps = round(sample_age(task, own, [run]) / task.dt)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.accounts.predicted import like_predicted
+from grounded.accounts.predicted import as_planned, like_predicted
 from grounded.accounts.sent import LEAST
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
@@ -57,14 +57,15 @@ def gone_wrong(
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
     """
-    from grounded.search.run_motion import reversed_input
-
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
     missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
     astray = missed > FAR * usual
     run = trial.until(workspace.task.horizon) if trial.candidate else trial
-    if turned := reversed_input(workspace.planner, run, astray=astray):
-        return _is_it_wired(workspace, trial, turned)
+    if tried is None or not as_planned(tried.candidate, run):
+        from grounded.search.run_motion import reversed_input
+
+        if turned := reversed_input(workspace.planner, run, astray=astray):
+            return _is_it_wired(workspace, trial, turned)
     if tried is None:
         return None
     ran, each = tried.candidate.id, zip(tried.trials, tried.utilities, strict=True)

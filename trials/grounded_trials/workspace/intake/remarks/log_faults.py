@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.accounts.predicted import as_planned
 from grounded.findings import Finding, found
 from grounded.share import STEPS
 from grounded.task import Task
@@ -38,6 +39,10 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
         trial: the trial, with gaps bridged; of a long one its first steps are looked at.
         own: it was written by grounded, and not read through [log].
     """
+    if trial.candidate in workspace.candidate_ids():
+        ran, _ = workspace.candidate(trial.candidate)
+        if as_planned(ran, trial.until(ran.policy.horizon)):
+            return ()
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
     faults = column_faults(workspace, known)
