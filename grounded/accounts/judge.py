@@ -21,7 +21,6 @@ from grounded.accounts.kinematics import (
     Row,
     Turned,
     away,
-    dead,
     folded,
     gaps,
     kinematic_rows,
@@ -83,7 +82,7 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
     rows += [Row(r.i, (r.j,), r.c) for r in plain if r.i not in known]
     with np.errstate(all="ignore"):
         # dead sensors first: as noise they would look like anything
-        for one in _dead(model, mended, rows, shown):
+        for one in _dead(model, mended, rows):
             told.append(one)
             mended = _without(one, mended)
         for one in _by_rows(model, mended, rows, shown):
@@ -106,23 +105,24 @@ def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
     return [told.account.mended(t) if k in told.trials else t for k, t in enumerate(trials)]
 
 
-def _dead(
-    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
-) -> Iterator[Told]:
-    """Yield the velocities that show no motion: of a position's rate, or in a row that is bad."""
-    each = [dead(model, trial, shown) for trial in trials]
-    units, several = list(model.states.values()), [row for row in rows if len(row.by) > 1]
-    for found, trial in zip(each, trials, strict=True):
-        noise = NOISE_ALONE * white_noise(trial.states)
-        for row in _bad(gaps(model, trial, several)):
+def _dead(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterator[Told]:
+    """Yield the velocities that show zero, or noise alone, in a row that is bad.
+
+    A wrong unit or sign would keep the shape of the motion.
+    """
+    units, each = list(model.states.values()), dict[int, dict[int, tuple[int, float, float]]]()
+    for k, trial in enumerate(trials):
+        found, noise = gaps(model, trial, rows), NOISE_ALONE * white_noise(trial.states)
+        for row in (one for one in _bad(found) if found[one].varying > BAD):  # no mere current
+            reach = float(np.nanmax(trial.states[:, row.i]) - np.nanmin(trial.states[:, row.i]))
             for j in (j for j in row.by if units[j].endswith("/s")):
-                x = trial.states[:, j]
-                if np.nanstd(x) <= noise[j] and abs(mean := float(np.nanmean(x))) <= noise[j]:
-                    found[j] = (row.i, mean, float(np.nanstd(trial.states[:, row.i])))
-    for j in sorted({j for one in each for j in one}):
-        some = tuple(k for k, one in enumerate(each) if j in one)
-        account = Account("dead", (j,))
-        yield Told(account, some, 0.0, whole=len(some) == len(trials), moved=each[some[0]][j])
+                mean, spread = (float(of(trial.states[:, j])) for of in (np.nanmean, np.nanstd))
+                if max(abs(mean), spread) <= noise[j]:
+                    each.setdefault(j, {})[k] = (row.i, mean, reach)
+    for j, moved in sorted(each.items()):
+        some = tuple(moved)
+        whole = len(some) == len(trials)
+        yield Told(Account("dead", (j,)), some, 0.0, whole=whole, moved=moved[some[0]])
 
 
 def contradicted(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded import places
-from grounded.frozen import Array, white_noise, wrapped
+from grounded.frozen import Array, wrapped
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial, stretches
@@ -28,8 +28,6 @@ NOISE = 0.3  # noise relative to the displacement over a stretch, above which a 
 SMALL = 1e-4  # of a rate, or of its largest derivative: treated as zero
 STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
 DEGREES = 180 / np.pi
-QUIET, SHAPE = 0.1, 0.5  # of a dead rate: its share of the motion, and correlation with it
-WINDOWS = 40  # windows of a piece over which a rate is sought dead
 
 
 @dataclass(frozen=True)
@@ -275,53 +273,6 @@ def away(model: Model, trials: Sequence[Trial], rows: Sequence[Row], plane: Turn
             m, s = (one[:, plane.i] + 1j * one[:, plane.j] for one in (moved, said))
             total += complex((m * s.conj()).sum())
     return float(np.angle(total))
-
-
-def dead(model: Model, trial: Trial, shown: Sequence[int]) -> dict[int, tuple[int, float, float]]:
-    """Return the velocities of a trial that show a constant, or noise alone, while all moves.
-
-    A wrong unit or sign would keep the correlation with the motion of the position.
-
-    Args:
-        model: however crude; used only for which state is the rate of which.
-        trial: with this model's states.
-        shown: indices of the states with a sensor.
-
-    Returns:
-        By velocity: its position, the velocity's mean, and how far the position moves.
-    """
-    found, sound = dict[int, tuple[int, float, float]](), set[int]()
-    for one in integrals(model):
-        angle = [model.angle_mask[one.i]]
-        turns = list(model.states.values())[one.i] == "rad"
-        for piece in pieces([trial], (one.i, one.j)) if {one.i, one.j} <= {*shown} else ():
-            if (k := len(piece) // WINDOWS) < 1 or not (one.exact or np.ptp(piece[:, 1]) == 0):
-                continue
-            moved = wrapped(np.diff(piece[:, :1], axis=0), angle)
-            if turns and np.abs(moved).max() > np.pi / 2:  # degrees, or too few samples a turn
-                continue
-            way = np.concatenate([[0.0], np.cumsum(moved[:, 0])])
-            said = np.concatenate([[0.0], np.cumsum(one.c * piece[:-1, 1] * trial.dt)])
-            a, b = (s[k:] - s[:-k] for s in (way, said))
-            noise = float(white_noise(way[:, None])[0])
-            if not (a.std() > 3 * noise and np.ptp(way) > 20 * noise):
-                continue
-            late = round(0.5 / trial.dt)
-            if b.std() > QUIET * a.std() or _alike(a, b, late) > SHAPE:
-                sound.add(one.j)
-            else:
-                found[one.j] = (one.i, float(piece[:, 1].mean()), float(np.ptp(way)))
-    return {j: told for j, told in found.items() if j not in sound}
-
-
-def _alike(a: Array, b: Array, most: int) -> float:
-    """Return the largest correlation of two signals, either delayed by up to `most` samples."""
-    best, most = 0.0, min(most, len(a) // 2)
-    for late in range(-most, most + 1):
-        x, y = (a[late:], b[: len(b) - late]) if late >= 0 else (a[:late], b[-late:])
-        if spread := float(x.std() * y.std()):
-            best = max(best, abs(float(((x - x.mean()) * (y - y.mean())).mean())) / spread)
-    return best
 
 
 def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> dict[int, list[int]]:
