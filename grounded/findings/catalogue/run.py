@@ -104,14 +104,6 @@ ENTRIES: dict[str, Entry] = {
         "returns at once, and run {ran} again",
         hides=OUTCOME,
     ),
-    "ahead": Entry(
-        "aside",
-        "its commands are what {ran} sends on states {age:size} newer than those in the log; the "
-        "plan allows for {effects} already",
-        "let its program act on the samples as logged or, if only the log is late, set delay_s in "
-        "[log] in place of these effects; and run {ran} again",
-        hides=OUTCOME,
-    ),
     # the robot
     "reversed": Entry(
         "aside",

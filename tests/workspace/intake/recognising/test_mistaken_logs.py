@@ -293,25 +293,3 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
         return
     found = w.ingest(path, candidate=plan.id)
     assert found.findings[0].code == "run.origin" and found.then.verb == "discard"
-
-
-@pytest.mark.parametrize("predicts", [True])
-def test_a_program_that_predicts_late_states_ahead_beside_their_adopted_delay_is_told(
-    w, tmp_path, predicts
-):
-    toml, dt = w.folder / "grounded.toml", w.task.dt
-    late = ", ".join(
-        f'{{name = "sensor_delay:{one}", d = {2 * dt}}}' for one in w.base_model.state_names
-    )
-    toml.write_text(toml.read_text().replace("[model]", f"[model]\neffects = [{late}]", 1))
-    w.forget()
-    plan = w.propose().candidate
-    runner = Runner(plan.policy)
-
-    def action(k, logged, now):
-        return runner.action(k * dt, now if predicts else logged)
-
-    found = driven_by(w, tmp_path / "run.csv", action, noise=1e-4, late=2)
-    told = of_code(found, "run.ahead")
-    assert len(told) == predicts == (found.then.verb == "discard")
-    assert all("sensor_delay:psi" in one.facts["effects"] for one in told)

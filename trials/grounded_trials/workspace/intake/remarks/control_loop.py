@@ -14,9 +14,6 @@ counts. By the commands alone the two are one; `what_is_late` asks the robot's m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from grounded.accounts.sent import (
@@ -30,7 +27,7 @@ from grounded.accounts.sent import (
     follows,
     latest,
 )
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
 from grounded.search.feedback.sample_age import sample_age
@@ -43,7 +40,6 @@ UNSENT = 5  # steps without a command that are fewer are sought where the run be
 LOST = 0.3  # share of the steps that tell which may be lost in a run
 EARLIER = 3  # runs to compare with
 SAME = 0.4  # relative difference of two ages or lags that are one
-LEADS = 0.3  # share of a state's error over the run: a smaller motion since the sample is not told
 
 
 def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
@@ -67,9 +63,7 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     some = stories(workspace.task, own, run, ran)
     if some and some[0].kind is Kind.PROGRAM:
         return some[0].finding
-    if ran is None or not ran.alike:
-        return _predicted_ahead(workspace, own, whole)
-    return _late(workspace, own, run, ran) or _predicted_ahead(workspace, own, whole)
+    return _late(workspace, own, run, ran) if ran is not None and ran.alike else None
 
 
 def _late(workspace: Folder, own: Candidate, run: Trial, ran: Following) -> Finding | None:
@@ -113,25 +107,6 @@ def _earlier(workspace: Folder, but: str, late: int | None = None) -> list[Trial
             if ran is not None and ran.alike and ran.late == (ran.late if late is None else late):
                 some.append(run)
     return some[::-1]
-
-
-def _predicted_ahead(workspace: Folder, own: Candidate, trial: Trial) -> Finding | None:
-    """Return that a run acted on states as new as an adopted delay makes them, or None."""
-    effects = _delays(workspace)
-    if not effects or own.sample_age:
-        return None
-    delay = float(np.median([one["d"] for one in effects]))
-    age = sample_age(workspace.task, own, [trial])
-    if not abs(age + delay) < SAME * delay:
-        return None
-    names = tuple(str(one["name"]) for one in effects)
-    return found("run.ahead", ran=own.id, age=Quantity(-age, "s"), effects=names)
-
-
-def _delays(workspace: Folder) -> list[Mapping[str, Any]]:
-    """Return the adopted delays of sensors."""
-    effects = workspace.config.model.effects
-    return [one for one in effects if str(one["name"]).startswith("sensor_delay:")]
 
 
 def steps_skipped(task: Task, own: Candidate, trial: Trial) -> Finding | None:
