@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.motion import HALF, HINT, HORIZONS, LEAST, LIKE, Ahead, Fit, basis
+from grounded.accounts.motion import HALF, HINT, HORIZONS, LEAST, LIKE, MARGIN, Ahead, Fit, basis
 from grounded.accounts.reported import names_of, tables
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
@@ -29,8 +29,6 @@ from grounded.places import integrals
 from grounded.trial import Trial
 
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
-CLEAR = 0.8  # [nats] by which later commands must lead in calibrated predictions
-SURELY = 1.6  # [nats] the same in fewer than half of the trials: all have one clock, mostly
 LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
 STARTS = 120  # samples to predict from
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
@@ -85,7 +83,7 @@ def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
     """
     each = {k: answers_early(model, one, shown) for k, one in enumerate(trials)}
     few = 2 * sum(early is not None for early in each.values()) < len(each)  # a swing that sticks
-    some = {k: e for k, e in each.items() if e and (not few or e.gain > SURELY)}
+    some = {k: e for k, e in each.items() if e and (not few or e.gain > 2 * MARGIN)}
     if some:
         early, known = next(iter(some.values())), _known(trials[min(some)], shown)
         raise UnusableTrials(trials, list(some), early.finding(model, known))
@@ -130,7 +128,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
         fits = {k: as_told(later(k)) for k in near}
         k = min(fits, key=lambda k: fits[k].score)
-        if fits[k].score > logged.still().score - CLEAR:
+        if fits[k].score > logged.still().score - MARGIN:
             return None  # the commands explain nothing
         # all that past and present commands can do
         slope = np.diff(trial.inputs, axis=0, prepend=trial.inputs[:1]) / trial.dt
@@ -141,7 +139,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
             key=lambda fit: fit.score,
         )
     parts = fits[k].rms / before.rms
-    if before.score - fits[k].score < CLEAR or parts.min() > HALF:
+    if before.score - fits[k].score < MARGIN or parts.min() > HALF:
         return None
     state = min(seen, key=lambda i: float(parts[i]))
     errors = float(before.rms[state]), float(fits[k].rms[state])

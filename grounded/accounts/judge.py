@@ -26,7 +26,16 @@ from grounded.accounts.kinematics import (
     kinematic_rows,
     turned,
 )
-from grounded.accounts.motion import HALF, HINT, LIKE, Ahead, Fit, horizon_of, plainly_missed
+from grounded.accounts.motion import (
+    HALF,
+    HINT,
+    LIKE,
+    MARGIN,
+    Ahead,
+    Fit,
+    horizon_of,
+    plainly_missed,
+)
 from grounded.accounts.table import Account, Term, Told, accounts, versions
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
@@ -39,8 +48,7 @@ ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
-NEAR, TIED = 2.5, 1.0  # [nats] within which accounts of rows are compared, and are told together
-CLEAR = 1.0  # [nats] by which an account must lead in calibrated predictions
+NEAR = 2.5  # [nats] within which accounts of rows are compared by the motion
 TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -245,7 +253,7 @@ def _best(
     others = tuple(
         one
         for one in near[1:]
-        if cost[one] < cost[near[0]] + TIED and not one.touched > near[0].touched
+        if cost[one] < cost[near[0]] + MARGIN and not one.touched > near[0].touched
     )
     return near[0], -least, others
 
@@ -404,7 +412,7 @@ def _by_motion(
         if len(fits) == most
     }
     best, *others = sorted(cost, key=lambda account: cost[account])
-    near = tuple(one for one in others if cost[one] < cost[best] + TIED and one.kind == best.kind)
+    near = tuple(one for one in others if cost[one] < cost[best] + MARGIN and one.kind == best.kind)
     before, after, ahead = next(iter(whole[best].values()))
     i = int(np.argmin(after.share / before.share))
     seen = (i, float(before.rms[i]), float(after.rms[i]), ahead)
@@ -493,12 +501,12 @@ def _compared(
     if (size > (np.log(LIKE) if not unit else abs(np.log(account.factor)) / 3)).any():
         return None  # the inputs act otherwise than in the model
     after = mended.best([ones], free=False) if unit else free
-    if mended.still().missed - after.missed < CLEAR * (0.5 if unit else 1.0):
+    if mended.still().missed - after.missed < MARGIN * (0.5 if unit else 1.0):
         return None  # commands explain nothing
     if unit:
         before = logged.best([ones], free=False)
     else:
         signs = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
         before = logged.best([ones, -ones, 0.0 * ones, *(signs if model.m > 1 else ())])
-    better = before.missed - after.missed > CLEAR + account.price
+    better = before.missed - after.missed > MARGIN + account.price
     return (before, after) if better and (after.share < HALF * before.share).any() else None

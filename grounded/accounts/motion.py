@@ -30,7 +30,9 @@ LEAST = 20  # fewest samples
 LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
-HINT, HALF = 0.4, 0.5  # [nats] of plain predictions that are looked at; share of one error
+MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin
+HINT = MARGIN / 2  # [nats] of plain predictions that are looked at
+HALF = 0.5  # share of one error
 LIKE = 4.0  # factor within which an input must act as in the model
 ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 

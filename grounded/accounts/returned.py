@@ -20,6 +20,7 @@ import numpy as np
 
 from grounded.accounts.inputs import limits_of, span
 from grounded.accounts.judge import contradicted
+from grounded.accounts.motion import MARGIN
 from grounded.accounts.predicted import Ran, apart, far
 from grounded.accounts.sent import (
     CLEAR,
@@ -47,8 +48,7 @@ from grounded.result import figure, number, with_unit
 from grounded.task import Task
 from grounded.trial import Trial
 
-LEADS = 0.7  # [nats] by which a story must lead as logged; a number that is no unit costs as much
-ALIKE = 3.0  # [nats] the same where the commands are alike as logged
+ALIKE = 3.0  # [nats] by which a story must lead where the commands are alike as logged
 MANY = 12  # rows that are compared in full
 OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
@@ -130,7 +130,7 @@ def scored(
 
 def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
     """Return the story that explains a log best; `as_logged` unless one leads it clearly."""
-    better = [one for one in some if one and one.left < as_logged.left - LEADS]
+    better = [one for one in some if one and one.left < as_logged.left - MARGIN]
     return min(better, key=lambda one: one.left, default=as_logged)
 
 
@@ -253,7 +253,7 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     plain = replace(plain, off=plain.off[: len(fit.off)])
     before, motion, first = _left(plain), apart(own, trial, row.steps), row.steps
     unit = row.of_log is None and not row.fitted  # a known one, or a sign
-    least = ALIKE if plain.alike else LEADS
+    least = ALIKE if plain.alike else MARGIN
 
     def gained(left: float, price: float) -> bool:
         return bool(np.log((before + FINE) / (left + FINE)) >= price)
@@ -261,7 +261,7 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     left, tells = _left(fit), evidence(plain, fit) > DECISIVE
     same = {"names": row.names, "by": row.by}
     if row.log is not None and fit.alike and (tells or unit) and fit.error < EXPLAINED:
-        price = row.log + (LEADS if unit else least)
+        price = row.log + (MARGIN if unit else least)
         if gained(left, price) and apart(own, run, first) <= motion:
             kind = Kind.UNIT if row.of_log is None else Kind.LOG
             yield scored(
@@ -337,8 +337,8 @@ def _by_motion(
         if not which or not rest or not gross or not {*names} <= {*logged}:
             continue
         run = multiplied(trial, names, by)
-        nearer = before - apart(own, run) > 2 * LEADS and far(own, run)[which].max() < 1
-        if not nearer or np.median(as_it_is[rest]) > LEADS:
+        nearer = before - apart(own, run) > 2 * MARGIN and far(own, run)[which].max() < 1
+        if not nearer or np.median(as_it_is[rest]) > MARGIN:
             continue
         fault = Account("sign", tuple(which), -1.0)
         if by == -1 and not contradicted(model, run, range(model.n), fault):
@@ -439,7 +439,7 @@ def _scales(task: Task, own: Ran, inputs: Array, logged: Sequence[str]) -> Itera
         yield Row(
             own.policy,
             log=one.price if {*group} - guessed else None,
-            program=LEADS * (1 - len(group) / model.n) if passed else None,
+            program=MARGIN * (1 - len(group) / model.n) if passed else None,
             names=group,
             by=by,
             told=told,
@@ -500,8 +500,8 @@ def _orders(model: Model, own: Ran, logged: Sequence[str]) -> Iterator[Row]:
             log = found("log.exchange", *pair, ran=own.id) if pair else None
             yield Row(
                 own.policy,
-                log=LEADS if pair and (some is sent or {*pair} <= {*logged}) else None,
-                program=LEADS * (1 - len(moved) / model.n) if some is right else None,
+                log=MARGIN if pair and (some is sent or {*pair} <= {*logged}) else None,
+                program=MARGIN * (1 - len(moved) / model.n) if some is right else None,
                 names=moved,
                 order=(*order, *sent) if some is right else (*right, *order),
                 told=found("run.passed", ran=own.id, passed=order, order=right),
@@ -521,15 +521,15 @@ def _times(own: Ran, *, unsent: bool, over: bool) -> Iterator[Row]:
     for unit, factor in TIMES.items():
         if factor < 1 or not unsent:
             told = found("run.passed", ran=ran, time=unit)
-            yield Row(_at_times(policy, factor), program=LEADS, told=told)
+            yield Row(_at_times(policy, factor), program=MARGIN, told=told)
     if over:
         told = found("run.passed", ran=ran, time="a clock")
-        yield Row(_at_times(policy, np.inf), program=LEADS, told=told)
+        yield Row(_at_times(policy, np.inf), program=MARGIN, told=told)
     told = found("run.passed", ran=ran, time="no unit: it stays 0")
-    yield Row(_at_times(policy, 0.0), program=LEADS, told=told)
+    yield Row(_at_times(policy, 0.0), program=MARGIN, told=told)
     if policy.gain is not None:
         told = found("run.unfed", ran=ran)
-        yield Row(replace(policy, gain=None, reference=None), program=LEADS, told=told)
+        yield Row(replace(policy, gain=None, reference=None), program=MARGIN, told=told)
 
 
 def _at_times(policy: Policy, factor: float) -> Policy:
@@ -573,7 +573,7 @@ def _fitted_scales(
                 continue
             by = -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
             if (group, round(float(np.log(abs(by))), 2), by > 0) not in tried:
-                yield Row(policy, log=LEADS, names=group, by=by, fitted=True)
+                yield Row(policy, log=MARGIN, names=group, by=by, fitted=True)
 
 
 def _solved(off: Callable[[Array, Array], Array], start: Array, small: float) -> list[float]:
@@ -643,7 +643,7 @@ def _origins(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Ite
             told = told.also(off=Quantity(abs(by), model.states[name]))
             told = told.also(tables=(f"[log.state.{name}]",))
             moved = by * (np.arange(model.n) == i)
-            yield Row(policy, log=LEADS, names=(name,), off=moved, of_log=told, told=told)
+            yield Row(policy, log=MARGIN, names=(name,), off=moved, of_log=told, told=told)
     joint = np.linalg.lstsq(gains, off, rcond=1e-6)[0]
     does = np.abs(gains * joint).max(axis=0) > SLIGHT * np.abs(off).max(initial=1e-12)
     if does.sum() >= 2:
@@ -651,7 +651,7 @@ def _origins(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Ite
         beside = tuple(f"{n} {with_unit(figure(x, 2), u)}" for (n, u), x, is_ in shares if is_)
         told = found("run.origin", ran=own.id, off=beside)
         yield Row(
-            policy, program=LEADS * int(does.sum()), off=np.where(does, joint, 0.0), told=told
+            policy, program=MARGIN * int(does.sum()), off=np.where(does, joint, 0.0), told=told
         )
 
 
@@ -675,7 +675,7 @@ def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
         share = float(SHARES[int(np.argmin(left))])
         lag = Quantity(share / (1 - share) * trial.dt, "s")
         told = found("run.smoothed", ran=own.id, states=group, share=share, lag=lag)
-        yield Row(policy, program=LEADS, names=group, share=share, told=told)
+        yield Row(policy, program=MARGIN, names=group, share=share, told=told)
 
 
 def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
@@ -732,7 +732,7 @@ def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
     best = min(range(max(0, best - stride), best + stride + 1), key=left)
     if not best:
         return
-    late, price = policy.dt * best, LEADS * (1 + best / policy.horizon)
+    late, price = policy.dt * best, MARGIN * (1 + best / policy.horizon)
     clock = found("run.clock", ran=own.id, step=best, seconds=late)
     begun = found("log.begun_late", ran=own.id, late=Quantity(late, "s"))
     yield Row(

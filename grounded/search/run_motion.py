@@ -18,15 +18,15 @@ from enum import Enum
 import numpy as np
 
 from grounded.accounts.commands import STARTS, Acts, how_inputs_act
-from grounded.accounts.motion import HALF, HORIZONS, Ahead
+from grounded.accounts.motion import HALF, HORIZONS, MARGIN, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 
 BEYOND = 6  # steps beyond the lag in question that are tried: a delay may be missing
-SURELY, MUCH = 2.0, 0.3  # [nats] by which a flipped sign must lead; share left of one state's error
-CLEAR = 0.2  # [nats] by which one explanation must predict the run better than the other
+MUCH = 0.3  # share left of one state's error if the sign of an input is flipped
+CLEAR = MARGIN / 4  # [nats] by which one explanation must predict the run better than the other
 NEAR = 0.35  # of the lag: how near the motion must be to what an explanation expects
 
 
@@ -58,7 +58,7 @@ def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding |
         j = int(np.argmax(nats))
         shares = np.where(turned[j] > HALF * ahead.moved, 1.0, turned[j] / plain)[own]
     i = int(np.argmin(shares))
-    if nats[j] < SURELY or shares[i] > MUCH:
+    if nats[j] < 2 * MARGIN or shares[i] > MUCH:
         return None
     state = planner.task.model.state_names[i]
     return found("run.reversed", trial.input_names[j], state=state, times=1 / float(shares[i]))

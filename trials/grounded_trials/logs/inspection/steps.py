@@ -20,8 +20,7 @@ from itertools import islice, permutations, product
 
 import numpy as np
 
-from grounded.accounts.judge import CLEAR
-from grounded.accounts.motion import HALF, Ahead
+from grounded.accounts.motion import HALF, MARGIN, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -176,7 +175,7 @@ def _ahead(
 def _apart_clearly(best: Array, other: Array) -> bool:
     """Check whether errors are clearly smaller, in total and for at least one state."""
     gained = other - best
-    return float(gained.sum()) > CLEAR and float(gained.max()) > -np.log(HALF)
+    return float(gained.sum()) > MARGIN and float(gained.max()) > -np.log(HALF)
 
 
 def _given(
