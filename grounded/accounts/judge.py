@@ -121,7 +121,8 @@ def _dead(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterato
     units, each = list(model.states.values()), dict[int, dict[int, tuple[int, float, float]]]()
     for k, trial in enumerate(trials):
         found, noise = gaps(model, trial, rows), NOISE_ALONE * white_noise(trial.states)
-        for row in (one for one in _bad(found) if found[one].varying > BAD):  # no mere current
+        # most of a motion is missing, and not by a mere current
+        for row in (r for r, gap in found.items() if gap.share > HALF and gap.varying > BAD):
             reach = float(np.nanmax(trial.states[:, row.i]) - np.nanmin(trial.states[:, row.i]))
             for j in (j for j in row.by if units[j].endswith("/s")):
                 mean, spread = (float(of(trial.states[:, j])) for of in (np.nanmean, np.nanstd))
