@@ -132,7 +132,7 @@ RUNS = {
     "short": (lambda s, u: (s[:21], u[:20]), ["20", "40"]),
     "nothing": (lambda s, u: (s[:1], u[:0]), ["0", "40"]),
     "nan": (lambda s, u: (lost(10, 41, s), u), ["x", "0.500 s"]),
-    "nan at once": (lambda s, u: (lost(0, 41, s), u), ["x", "0 s"]),
+    "nan at once": (lambda s, u: (lost(0, 41, s), u), ["x", "start"]),
     "input lost": (lambda s, u: (s, lost(7, 40, u)), ["force", "0.350 s"]),
     "gap": (
         lambda s, u: (np.where((np.arange(41) // 5 == 2)[:, None], np.nan, s), u),

@@ -35,7 +35,8 @@ def checked(workspace: Folder, trial: Trial, last_s: float = math.nan) -> Iterat
         yield found("log.gaps", filled.state, samples=filled.samples, longest=longest, at=at)
     if whole.finite_steps < whole.steps:
         name, step = _first_bad(whole)
-        yield found("file.vanished", name, ends=Quantity(step * trial.dt, "s"))
+        ends = Quantity(step * trial.dt, "s") if step else "its start"
+        yield found("file.vanished", name, ends=ends)
     if not trial.candidate:
         yield from _still(whole)
         yield from _beyond(workspace, whole)
