@@ -259,7 +259,11 @@ def shipped_task(system: str) -> Task:
     compiled = mujoco.load(one.path)
     body, factor = one.payload
     mass = float(compiled.body(body).mass[0])
-    given = {f"{body}.mass": (mass, 0.2 * mass, 5.0 * mass) if mass else (0.0, 0.0, 2.0 * factor)}
+    given = {
+        f"{body}.mass": (mass, 0.2 * mass, 2.0 * max(factor, 2.0) * mass)
+        if mass
+        else (0.0, 0.0, 2.0 * factor)
+    }
     model = mujoco.model(one.path, params=given, without="unmoved")
     names, part = model.state_names, one.dt * np.arange(one.steps + 1) / (0.7 * one.dt * one.steps)
     ends = [{name: at[k] for name, at in one.motion.items()} for k in (0, 1)]
