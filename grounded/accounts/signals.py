@@ -176,7 +176,7 @@ def _dropouts(s: Signal) -> Found | None:
         before, after = np.roll(x, 1), np.roll(x, -1)
         gone.append((x == value) & ((np.abs(x - before) > far) | (np.abs(x - after) > far)))
     share = _share(gone)
-    said = found("sensor.samples", s.name, low=value, share=share)
+    said = found("sensor.samples", s.name, low=f"{value:g}", share=share)
     return Finding(s.name, said, "dropout", share=share, corrected=True), s.without(gone)
 
 
@@ -282,7 +282,7 @@ def _clipped(s: Signal) -> Finding | None:
             stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
         share = samples / values.size
         if stays >= 3 and share > CLIPPED:
-            at = Quantity(float(limit), s.unit)
+            at = f"{limit:.4g} {s.unit}"
             said = found("sensor.limits", s.name, side=side, limit=at, share=share)
             return Finding(s.name, said, "saturated", share=share)
     return None

@@ -94,7 +94,7 @@ def objections(
     for what, values in parts.items():
         bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         if bad.any():
-            at = Quantity(int(np.argmax(bad)) * task.dt, "s")
+            at = f"{int(np.argmax(bad)) * task.dt:.3g} s"
             return (found("plan.none", name, what=what, at=at),)
     against = [_outside(task, candidate, strays, i) for i in range(task.model.n)]
     return tuple(one for one in (*against, too_strong(task, candidate)) if one)

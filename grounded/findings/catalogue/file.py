@@ -147,8 +147,8 @@ ENTRIES: dict[str, Entry] = {
     # times of a log's signals
     "gap": Entry(
         "refuse",
-        "'{about}' ({path}) is not known[[ at {at:.3f} s]][[, only from {first:.3f} s to "
-        "{last:.3f} s]][[ from {start:.3f} s to {end:.3f} s after the start, more than "
+        "'{about}' ({path}) is not known[[ at {at} s]][[, only from {first} s to {last} "
+        "s]][[ from {start} s to {end} s after the start, more than "
         "{limit:.3f} s]][[ in each control step of {dt:.3g} s: it comes every {every:.3g} s]]",
         "end the span before that, or set max_age_s[[dt? ; if its times are milliseconds, name "
         "the column t_ms]]",

@@ -36,7 +36,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "samples": Entry(
         "warn",
-        "[[degrees? is in degrees: ]][[jumps by a full turn {count:time}]][[drops to {low:g} for "
+        "[[degrees? is in degrees: ]][[jumps by a full turn {count:time}]][[drops to {low} for "
         "single samples]][[has a new value only every {every:.3g} s]]"
         "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]][[misses "
         "samples, up to {gap:.3g} s at a time]][[comes in steps of {step}, as large as its "

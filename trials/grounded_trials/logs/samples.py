@@ -205,15 +205,16 @@ class Samples:
         return 0.5 * min(self.interval, dt)
 
     def _outside(self, origin: int, at: int | None = None) -> GroundedError:
-        ends = {k: (self.t[i] - origin) * 1e-9 for k, i in (("first", 0), ("last", -1))}
-        when = float(ends["first"]) if at is None else (at - origin) * 1e-9
+        places = (("first", 0), ("last", -1))
+        ends: dict[str, Any] = {k: f"{(self.t[i] - origin) * 1e-9:.3f}" for k, i in places}
+        when = ends["first"] if at is None else f"{(at - origin) * 1e-9:.3f}"
         path = self.spec.path
         return GroundedError(found("file.gap", self.name, path=path, at=when, **ends))
 
     def _refuse(self, t0: int, t1: int, limit: float, origin: int) -> None:
         facts: dict[str, Any] = {
-            "start": (t0 - origin) * 1e-9,
-            "end": (t1 - origin) * 1e-9,
+            "start": f"{(t0 - origin) * 1e-9:.3f}",
+            "end": f"{(t1 - origin) * 1e-9:.3f}",
             "limit": limit,
         }
         raise GroundedError(found("file.gap", self.name, path=self.spec.path, **facts))
