@@ -121,8 +121,11 @@ def _dead(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterato
     units, each = list(model.states.values()), dict[int, dict[int, tuple[int, float, float]]]()
     for k, trial in enumerate(trials):
         found, noise = gaps(model, trial, rows), NOISE_ALONE * white_noise(trial.states)
-        # most of a motion is missing, and not by a mere current
+        # most of a motion is missing, and not by a mere current; a hull's speed sideways, one of
+        # several in the rate of a position, is often noise alone
         for row in (r for r, gap in found.items() if gap.share > HALF and gap.varying > BAD):
+            if len(row.by) > 1 and units[row.i] not in ("rad", "deg"):
+                continue
             reach = float(np.nanmax(trial.states[:, row.i]) - np.nanmin(trial.states[:, row.i]))
             for j in (j for j in row.by if units[j].endswith("/s")):
                 mean, spread = (float(of(trial.states[:, j])) for of in (np.nanmean, np.nanstd))
