@@ -201,7 +201,8 @@ ENTRIES: dict[str, Entry] = {
     # what is lost
     "cut": Entry(
         "warn",
-        "[[{about} ]]is cut off at [[line {line}]][[byte {byte}]][[ ({text})]]: what came after "
+        "[[{about} ]][[!about? the file ]]is cut off at [[line {line}]][[byte {byte}]][[ "
+        "({text})]]: what came after "
         "that is lost[[, only its index{index:1=}]]",
     ),
     "lost": Entry(
