@@ -204,10 +204,7 @@ def recognised(
         story = next(_of_motion(case, story), story)
     if story.kind is Kind.FELL and fell:
         return cut_short(read, *fell)
-    if story.kind is Kind.UNIT:
-        story = _in_unit(case, story)
-    elif story.finding and story.finding.code == "log.exchange" and story.kind is Kind.LOG:
-        story = _exchanged(case, story)
+    story = _where(case, story)
     if candidate is not None:
         return _doubted(case, read, story)
     raise _refusal(case, story)
@@ -283,6 +280,15 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
         longer = _lasting_s(log) - run if WHOLE * _lasting_s(log) > run else 0.0
         doubts.append(found("log.start_assumed", ran=ran, at=assumed, longer=longer))
     return replace(read.telling(*doubts), doubted=True)
+
+
+def _where(case: Case, story: Story) -> Story:
+    """Return a story of columns with where its fault lies: in the log, or on the robot."""
+    if story.kind is Kind.UNIT:
+        return _in_unit(case, story)
+    if story.finding and story.finding.code == "log.exchange" and story.kind is Kind.LOG:
+        return _exchanged(case, story)
+    return story
 
 
 def _in_unit(case: Case, story: Story) -> Story:
