@@ -40,6 +40,7 @@ def wrong(
             `high`, `choices`, `like` (an example), `of` (the object that it belongs to).
     """
     text = got or (None if given is None else f"{given!r:.60}")
+    expected = {"form": expected["like"]} if [*expected] == ["like"] else expected
     facts = {key: _text(value) for key, value in expected.items()}
     return refused("given.value", name, given=text, **facts)
 

@@ -90,7 +90,9 @@ def command(
         return show_json(compared.to_json()) if json_ else _models(compared)
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
-        raise wrong("--compare", got=" ".join(compare), like="t0001,t0002 t0003,t0004")
+        raise wrong(
+            "--compare", got=" ".join(compare), must="groups", like="t0001,t0002 t0003,t0004"
+        )
     if instruments:
         findings = workspace.preflight(trials)
         alone = unheld_in(workspace, trials)

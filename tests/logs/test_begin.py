@@ -360,7 +360,7 @@ def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
     moving = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=1")
     assert moving.code == 1 and "--to v=0" in moving.err
     nowhere = grounded("-C", w, "target", "line", "--to", "v=0")
-    assert nowhere.code == 1 and "--to x=" in nowhere.err
+    assert nowhere.code == 1 and "x=1.0" in nowhere.err
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):

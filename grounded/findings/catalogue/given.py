@@ -9,7 +9,8 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "{about} must be[[ {must:given=given,real=one real number,named=read by name,hinge=given, "
         "since no angle hangs under its weight,level=those of a level flight,inside=inside the "
-        "workspace,even=equally long,plant=a dict input -> seconds and a whole number,words=a "
+        "workspace,even=equally long,groups=two groups of different trials,"
+        "plant=a dict input -> seconds and a whole number,words=a "
         "program with the words for both files,number=a number,units=names with a unit each,"
         "free=another name: grounded writes this one,outside=outside the folder of the cases,"
         "unique=one file: give more digits of its hash,finite=finite,positive=a positive number,"
@@ -25,7 +26,8 @@ ENTRIES: dict[str, Entry] = {
         "(horizontal first) or three,bool=True or False,dict=a dict by name,ascending=in "
         "ascending order,name=a valid Python name,trial=the gr.Trial of the run,policy=read from "
         "the policy of the candidate (c.policy),call=a function of a candidate that returns the "
-        "Trial of its run,bounded=inside its bounds:}]][[ a {type}]][[ of shape {shape}]][[ from "
+        "Trial of its run,bounded=inside its bounds:}]][[ of the form {form}]][[ a {type}]]"
+        "[[ of shape {shape}]][[ from "
         "{low}]][[ to {high}]][[ below {below}]][[: {known}]][[, such as {like}]][[, not "
         "{given}]][[: did you mean '{near}'?]]",
         "[[{do:omit=omit the column if the state is free,turned=transpose it,column=make it a "

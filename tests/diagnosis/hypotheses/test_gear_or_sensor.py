@@ -73,4 +73,4 @@ def test_an_encoder_that_reads_short_is_named_and_a_gear_as_its_second_reading()
     assert found.effects == ("sensor_scale:stick",)
     assert found.ranking[0].values["k"] == pytest.approx(-0.06, abs=0.005)
     (one,) = [one for one in found.findings if one.code == "model.sensor"]
-    assert (one.facts["state"], one.facts["rate"]) == ("stick", "stick_rate")
+    assert one.about == ("stick",) and one.facts["rate"] == "stick_rate"

@@ -114,6 +114,6 @@ def test_of_a_long_log_the_stretches_that_move_most_are_asked():
     begin = data.step_at[:, 0]
     assert begin[0] == 0 and ((begin >= 1800) & (begin < 2400)).any()  # where the trial begins, too
     (one,) = [one for one in limits(data).findings if one.code == "model.share"]
-    assert (one.facts["used"], one.facts["all"]) == (5, 20)
+    assert (one.facts["used"], one.facts["total"]) == (5, 20)
     short = prepare(MODEL, [Trial(x[:201], u[:200], 0.02, *names) for _ in range(2)])
     assert short.skipped == 0 and short.steps == 400

