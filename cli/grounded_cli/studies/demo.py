@@ -109,12 +109,12 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
     """Print what was learned and diagnosed."""
     first, last = document["utilities"][0], document["utilities"][-1]
     gain = f"{percent(1 - last / first)} better after {count(document['trials'], 'trial')}"
-    show("\n" + field("learned", f"{number(first)}, {number(last)} now: {gain}"))
+    show("\n" + field("learned", f"{number(first)} at first, {number(last)} now: {gain}"))
     if document["optimum"] is not None:
         show(field("optimum", f"{number(document['optimum'])}, by the true model"))
     used, trials = document["diagnosed_trials"], document["trials"]
     if 0 < used < trials:
-        verdict = [*verdict, f"{used} of {trials} trials"]
+        verdict = [*verdict, f"Diagnosed: {used} of {trials} trials."]
     for k, line in enumerate(verdict):
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():

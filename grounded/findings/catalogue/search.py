@@ -83,8 +83,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "within_model": Entry(
         "note",
-        "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}, "
-        "which may be lost to what it lacks",
+        "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}",
         MODEL,
     ),
     "diagnose": Entry("note", MODEL),
