@@ -18,6 +18,7 @@ from markdown.inlinepatterns import SimpleTextInlineProcessor
 from mkdocs.structure.files import File, Files
 
 from grounded.findings import catalogue
+from grounded.findings.numbers import bare
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = {"grounded": ROOT, "grounded_trials": ROOT / "trials", "grounded_cli": ROOT / "cli"}
@@ -78,8 +79,8 @@ def findings() -> str:
         "# Findings",
         "Whatever a command tells is a finding: `findings` in its JSON document, with a code, a "
         "weight, what it is about and facts with units. Scripts read codes and facts; sentences "
-        "may change. `grounded explain CODE` prints an entry. Text in `[[ ]]` appears where its "
-        "facts are known.",
+        "may change. `grounded explain CODE` prints an entry. Text in brackets appears where its "
+        "facts, in `< >`, are known.",
     ]
     for area in catalogue.AREAS:
         module = import_module(f"{catalogue.__name__}.{area}")
@@ -89,7 +90,7 @@ def findings() -> str:
             "| code | weight | says | remedy |\n|---|---|---|---|",
         ]
         for code, one in catalogue.entries(area).items():
-            cells = [f"`{code}`", one.weight, one.short, one.remedy]
+            cells = [f"`{code}`", one.weight, bare(one.short), bare(one.remedy)]
             rows[-1] += "\n| " + " | ".join(cell.translate(PLAIN) for cell in cells) + " |"
         parts += rows
     return "\n\n".join(parts) + "\n"

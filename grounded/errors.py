@@ -69,9 +69,12 @@ def type_of(value: object) -> str:
 
 
 def alike(name: str, valid: Iterable[str]) -> str:
-    """Return the valid name closest to `name`; "" if none is close."""
+    """Return the valid name closest to `name`, or the only one that ends so; "" if none is."""
     from difflib import get_close_matches
 
+    ends = [known for known in valid if known.rpartition(":")[2] == name]
+    if len(ends) == 1:
+        return ends[0]
     lower = {known.lower(): known for known in reversed([*valid][:COMPARED])}
     close = get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
     return lower[close[0]] if close else ""

@@ -101,8 +101,8 @@ def number(value: float) -> str:
 
 
 def shown(unit: str) -> str:
-    """Return the unit as shown in a table: "" for "1", which would look like a digit."""
-    return "" if unit == "1" else unit
+    """Return the unit as shown: no "1" but above a stroke, since it would look like a digit."""
+    return "" if unit == "1" else re.sub(r"/1(?![\w.^])", "", unit)
 
 
 def begun(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from grounded.findings.catalogue import codes, entry_of
+from grounded.findings.numbers import bare
 from grounded.refusals import unknown
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, show, show_json
@@ -14,7 +15,7 @@ from grounded_cli.console.terminal import field, show, show_json
 @click.argument("code", required=False, default="")
 @as_json
 def command(code: str, json_: bool) -> None:
-    """Print what a finding's CODE means and what to do about it; without CODE, list all."""
+    """Print what a finding's CODE means and what to do about it; without CODE, the codes."""
     known = codes()
     if code and code not in known:
         raise unknown("code", code, known)
@@ -24,8 +25,9 @@ def command(code: str, json_: bool) -> None:
         return
     for one in chosen:
         entry = entry_of(one)
-        show(field(one, f"{entry.weight}: {entry.short}", width=max(len(one), 10)))
+        said = f": {bare(entry.short)}" if code else ""
+        show(field(one, f"{entry.weight}{said}", width=max(*map(len, chosen), 10)))
         if code and entry.remedy:
-            show(field("remedy", entry.remedy))
+            show(field("remedy", bare(entry.remedy)))
         if code and entry.hides:
             show(field("hides", ", ".join(entry.hides)))

@@ -11,7 +11,7 @@ A slot is `{name}` or `{name:how}`:
     {name:low=too low,high=too high}   the words for a value
     {name:.3g}, {name:g}   a number by Python's format
 
-`[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or 0 as a number.
+`[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or a count of 0.
 `[[name? ...]]` is kept where the fact `name` is none of these, `[[!name? ...]]` where it is one.
 """
 
@@ -62,6 +62,12 @@ def _alike(facts: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
     return told
 
 
+def bare(text: str) -> str:
+    """Return a text to be read without facts: its slots as <name>, its clauses in brackets."""
+    clauses = _CLAUSE.sub(lambda m: f"[{_IF.sub('', m[1], count=1).strip()}]", text)
+    return _SLOT.sub(lambda m: f"<{m[1]}>", clauses)
+
+
 def slots(text: str) -> set[str]:
     """Return the names of the slots that a text cannot do without."""
     return {name for name, _ in _SLOT.findall(_CLAUSE.sub("", text))}
@@ -97,4 +103,4 @@ def shaped(value: Any, how: str) -> str:
 
 def _known(value: Any) -> bool:
     number = getattr(value, "value", value)
-    return bool(number) and not (isinstance(number, float) and math.isnan(number))
+    return not math.isnan(number) if isinstance(number, float) else bool(number)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.checks import near, refused, wrong
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError, NextCommand, alike
 from grounded.findings import found
 from grounded_trials.plain_file import open_file
 
@@ -75,7 +75,9 @@ class Table:
         self._known.add(key)
         if key not in self._values:
             if default is _REQUIRED:
-                raise self.error(key, kind.__name__)
+                close = alike(key, self._values.keys() - self._known)
+                got = repr(close) if close else ""
+                raise wrong(self._full(key), got=got, must="given", where=self.file.name)
             return default
         self._taken.add(key)
         return self._checked(key, self._values[key], kind)

@@ -96,7 +96,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "no_workspace": Entry(
         "refuse",
-        "{about} is not a workspace, which has a grounded.toml",
+        "there is no {about}, which a workspace has",
         "name its folder, such as -C DIR (in Python Workspace(DIR))[[: {near}]]",
     ),
     "unreadable": Entry(
@@ -190,7 +190,7 @@ ENTRIES: dict[str, Entry] = {
     "odd_values": Entry(
         "warn",
         "{about}:[[ only {messages:message}]][[ only its first {first:number} are listed]]"
-        "[[ {lost} values are not finite numbers]][[ {bridged:value} bridged]]"
+        "[[ {lost:value} not finite]][[ {bridged:value} bridged]]"
         "[[ {stamps:stamp} out of order, repeated or 0]][[ held from a single sample{single:1=}]]"
         "[[, the largest gap is {gap}]]",
     ),

@@ -162,9 +162,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.look": Entry(
         "note",
-        "look at the recording of {trial} from {start:.3g} to {end:.3g} s: was the robot held or "
-        "pushed then?",
-        "if so, discard it and ingest its log without that part",
+        "look at the recording of {trial} from {start:.3g} to {end:.3g} s",
+        "if the robot was held or pushed then, discard it and ingest its log without that part",
     ),
     "next.repeat": Entry(
         "note",

@@ -276,7 +276,7 @@ ENTRIES: dict[str, Entry] = {
         "[[!state? by the model, no drive stays inside [safety] from [task] start]][[state? "
         "[safety] "
         "bounds no state, and no log shows where the robot may go]]",
-        "[[!state? widen [safety], start where there is room, or make it shorter (--seconds)]]"
+        "[[!state? start where there is room, make it shorter (--seconds), or widen [safety]]]"
         "[[enter where it may go, such as [safety] {state} = [-1.0, 1.0]]]",
     ),
     "drive_weak": Entry(
