@@ -156,12 +156,13 @@ def tell(
         findings: as `settle` orders them.
         about: what all are about, such as the name of a log.
         most: how many are told; the others are in the JSON document and with --details.
-        all_: tell them all, as --details does.
+        all_: tell them all, with their codes, as --details does.
     """
     most = len(findings) if all_ else most
     for one in findings[:most]:
         kind = "note" if one.weight is Weight.NOTE else "warning"
-        remark(kind, f"{about}: {one.sentence}" if about else one.sentence)
+        said = f"{one.sentence} [{one.code}]" if all_ else one.sentence
+        remark(kind, f"{about}: {said}" if about else said)
     if more := len(findings) - most if most < len(findings) else 0:
         remark("note", f"{more} more with --details")
 
