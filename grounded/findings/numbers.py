@@ -24,7 +24,7 @@ from typing import Any
 
 from grounded.result import figure, listed, measured, measured_alike, percent, with_error, with_unit
 
-_CLAUSE = re.compile(r"\[\[(.*?)\]\]", re.S)
+_CLAUSE = re.compile(r"\[\[(.*?)\]\](?!\])", re.S)
 _IF = re.compile(r"(!?)(\w+)\? ?")
 _SLOT = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 
