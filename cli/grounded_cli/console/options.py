@@ -24,7 +24,7 @@ def as_json(function: F) -> F:
 
 def details(function: F) -> F:
     """Add the option --details: tell every finding."""
-    return click.option("--details", is_flag=True, help="Tell all notes, with their codes.")(function)
+    return click.option("--details", is_flag=True, help="Tell all notes, with codes.")(function)
 
 
 def anyway(function: F) -> F:
