@@ -290,7 +290,7 @@ def perhaps_degrees(
     """Return a finding on each signal in rad by the model that spans turns: it may be in degrees.
 
     A command of more than a turn, unless a state comes close to it; a joint other than a wheel that
-    spans full turns, against the ROS conventions.
+    spans full turns, against the ROS conventions; an angle that a log would wrap.
 
     Args:
         guesses: of states and inputs, with the ranges of their numbers.
@@ -310,7 +310,7 @@ def perhaps_degrees(
             several = moved >= FOLLOWED * peak and not DEFLECTED.search(one.name.lower())
             odd = peak > 2 * math.pi and not several
         else:
-            plain = bool(joint) and not ROLLS.search(joint.lower())
+            plain = (bool(joint) and not ROLLS.search(joint.lower())) or one.name in model.angles
             odd = plain and high - low > FULL_TURNS and peak <= LARGEST
         if odd:
             ends, by = (Quantity(end, "rad") for end in (low, high)), UNITS["deg"][1]
