@@ -11,7 +11,7 @@ A slot is `{name}` or `{name:how}`:
     {name:low=too low,high=too high}   the words for a value
     {name:.3g}, {name:g}   a number by Python's format
 
-`[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or a count of 0.
+`[[ ... ]]` is left out where a fact that it names is missing, None, empty, NaN or 0 as a number.
 `[[name? ...]]` is kept where the fact `name` is none of these, `[[!name? ...]]` where it is one.
 """
 
@@ -103,4 +103,4 @@ def shaped(value: Any, how: str) -> str:
 
 def _known(value: Any) -> bool:
     number = getattr(value, "value", value)
-    return not math.isnan(number) if isinstance(number, float) else bool(number)
+    return bool(number) and not (isinstance(number, float) and math.isnan(number))

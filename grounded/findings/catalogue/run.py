@@ -209,7 +209,7 @@ ENTRIES: dict[str, Entry] = {
     # its errors
     "off_target": Entry(
         "note",
-        "{about}[[ {rms:size} rms, {most:size} at most (at {at:.4g} s)]][[also?,]]"
+        "{about}[[ {rms:size} rms, {most:size} at most (at {at} s)]][[also?,]]"
         "[[ {end:size} at the end]][[there?  none at the end]][[ at the end within its noise of "
         "{noise:size}]][[ (+- {std:size} by {runs:run})]]",
     ),

@@ -74,7 +74,7 @@ class OffTarget(Document):
         """The errors as `run.off_target`; an end on target, or within noise, says so."""
         size, told = partial(Quantity, unit=self.unit), dict[str, Any]()
         if np.isfinite(self.rms):
-            told |= {"rms": size(self.rms), "most": size(self.most), "at": self.at_s}
+            told |= {"rms": size(self.rms), "most": size(self.most), "at": f"{self.at_s:.4g}"}
         if np.isfinite(self.end):
             at_end = 0.0 if self.end < EXACT * self.most else self.end  # of a plan
             if at_end < self.noise:
