@@ -123,6 +123,10 @@ COMMANDS = [
     ("init", "--list"),
     ("recover", "{trial}", "-o", "{folder}/saved.mcap"),
     ("explain", "log.unit"),
+    ("diagnose", "--instruments"),
+    ("diagnose", "--compare", ".", "{folder}/model.py"),
+    ("init", "{folder}/more", "--blank", "--model", "{folder}/model.py"),
+    ("next", "{trial}"),
 ]
 
 
@@ -131,7 +135,18 @@ def test_every_key_is_documented(cart, tmp_path, words):
     folder = copied(cart, tmp_path / "w")
     trial = next((folder / "trials").glob("t0001*"))
     (log := tmp_path / "log.csv").write_text(LOG)
-    words = [word.format(folder=folder, trial=trial, log=log) for word in words]
+    fits(folder, [word.format(folder=folder, trial=trial, log=log) for word in words])
+
+
+def test_what_follows_an_adoption_is_documented(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    fits(folder, ["export", "--library", tmp_path / "actuator.yaml"])
+    fits(folder, ["adopt", "--undo"])
+
+
+def fits(folder, words):
+    """Check that a command's document is of its schema, and that the page names its keys."""
     done = grounded("-C", folder, *words, "--json")
     assert done.code == 0, done.err
     assert not unknown(words[0], done.json)
