@@ -1,6 +1,7 @@
 """Put faults into logs of robots, and see which story is told of how each log came about.
 
     python -m benchmarks.accounts [--seeds 0,1,2] [--robots car,arm] [--faults NAME,...] [--all]
+                                  [--honest 20] [--wrong 300] [--by-hand 32]
 
 Five robots (car, arm, drone, boat, rover) are simulated with other parameters than their crude
 model's, by seed mostly with an effect that it lacks, and with noise. Each fault is put into the log
@@ -17,11 +18,15 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import Any
 
 import numpy as np
 
-from grounded import Model, Param
+from grounded import Model, Param, Reward, Search, Task
 from grounded.frozen import Array
+from grounded.onboard import Runner
+from grounded.search.candidate import Candidate
 from grounded.trial import Trial
 
 DEGREES, RPM = 180 / np.pi, 30 / np.pi
@@ -217,40 +222,77 @@ def _rover() -> Robot:
 ROBOTS = {"car": _car, "arm": _arm, "drone": _drone, "boat": _boat, "rover": _rover}
 
 
+@dataclass(frozen=True)
+class Real:
+    """How a real robot differs from its crude model: parameters, an effect, delay and noise."""
+
+    robot: Robot
+    values: Array
+    size: float
+    late: int
+    noise: Array
+
+    @classmethod
+    def drawn(cls, robot: Robot, rng: np.random.Generator) -> Real:
+        """Return a robot drawn at random; mostly with an effect that its model lacks."""
+        model = robot.model
+        real = dict(zip(model.params, model.values, strict=True))
+        for name, one in model.params.items():
+            real[name] = float(np.clip(real[name] * np.exp(0.2 * rng.normal()), one.low, one.high))
+        values, size = np.array(list(real.values())), 0.4 * rng.random() * (rng.random() < 0.75)
+        late, noise = int(rng.integers(0, 3)), np.array(robot.noise) * np.exp(0.5 * rng.normal())
+        return cls(robot, values, size, 0 if robot.held else late, noise)
+
+    def run(
+        self,
+        asked: Callable[[int, Array], Array],
+        H: int,
+        rng: np.random.Generator,
+        *,
+        fed: bool = True,
+        age: int = 0,
+        alike: bool = False,
+        **named: Any,
+    ) -> Trial:
+        """Return the log of a run of H steps.
+
+        Args:
+            asked: the command at a step, of what is measured.
+            H: number of steps.
+            rng: source of the noise.
+            fed: whether commands depend on what is measured.
+            age: of the samples that the program acts on, in fifths of a step.
+            alike: whether the log has the noise of these samples.
+            named: further fields of the trial.
+        """
+        robot, n = self.robot, self.robot.model.n
+        fine, inputs, noise = [np.array(robot.start, float)], list[Array](), list[Array]()
+        for k in range(H):
+            noise.append(self.noise * rng.normal(size=n) if fed else np.zeros(n))
+            inputs.append(asked(k, fine[max(5 * k - age, 0)] + noise[-1]))
+            for _ in range(5):
+                a = inputs[max(k - self.late, 0)]
+                fine.append(_step(robot, fine[-1], a, self.values, self.size, robot.dt / 5))
+        own = self.noise * rng.normal(size=(H + 1, n))
+        logged = np.array(fine[::5]) + (np.vstack([noise, own[-1:]]) if alike else own)
+        names = (robot.model.state_names, robot.model.input_names)
+        return Trial(logged, np.array(inputs), robot.dt, *names, **named)
+
+
 def driven(robot: Robot, rng: np.random.Generator, count: int = 2) -> list[Trial]:
     """Return trials of the real robot, which differs from its crude model by seed."""
-    model = robot.model
-    real = dict(zip(model.params, model.values, strict=True))
-    for name, one in model.params.items():
-        real[name] = float(np.clip(real[name] * np.exp(0.2 * rng.normal()), one.low, one.high))
-    values, size = np.array(list(real.values())), 0.4 * rng.random() * (rng.random() < 0.75)
-    late, noise = int(rng.integers(0, 3)), np.array(robot.noise) * np.exp(0.5 * rng.normal())
-    if robot.held:
-        late = 0
-    trials = []
-    for _ in range(count):
-        H = round(rng.uniform(6, 12) / robot.dt)
-        wanted, x = _excited(robot, rng, H), np.array(robot.start, float)
-        states, inputs = [x], []
-        for k in range(H):
-            a = wanted[max(k - late, 0)]
-            if robot.held:
-                a = robot.held(x + noise * rng.normal(size=model.n), a)
-            for _ in range(5):
-                x = _step(robot, x, a, values, size, robot.dt / 5)
-            states.append(x)
-            inputs.append(a if robot.held else wanted[k])
-        logged = np.array(states) + noise * rng.normal(size=(H + 1, model.n))
-        trials.append(
-            Trial(
-                states=logged,
-                inputs=np.array(inputs),
-                dt=robot.dt,
-                state_names=model.state_names,
-                input_names=model.input_names,
-            )
-        )
-    return trials
+    real = Real.drawn(robot, rng)
+    return [by_hand(real, round(rng.uniform(6, 12) / robot.dt), rng) for _ in range(count)]
+
+
+def by_hand(real: Real, H: int, rng: np.random.Generator, **named: Any) -> Trial:
+    """Return the log of H steps of sines and steps, held by its feedback if the robot has one."""
+    wanted, held = _excited(real.robot, rng, H), real.robot.held
+
+    def asked(k: int, x: Array) -> Array:
+        return held(x, wanted[k]) if held else wanted[k]
+
+    return real.run(asked, H, rng, fed=held is not None, **named)
 
 
 def _step(robot: Robot, x: Array, a: Array, values: Array, size: float, dt: float) -> Array:
@@ -450,6 +492,100 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     yield Fault("drop-outs", "dropout", one(name), _set(trials, drops))
 
 
+# --- candidates -----------------------------------------------------------------------------------
+
+SECONDS, TRIALS = 4.0, 6  # of a manoeuvre, and of the search for it
+APART, CLOSE = 0.01, 0.05  # rms difference of two plans' commands, of their size: none, and little
+
+
+LOGS = {True: "samples acted on", False: "later samples"}
+
+
+def task_of(robot: Robot, rng: np.random.Generator) -> Task:
+    """Return the manoeuvre to follow what the crude model does when it is driven by hand."""
+    model, H = robot.model, round(SECONDS / robot.dt)
+    crude = Real(robot, model.values, 0.0, 0, np.zeros(model.n))
+    target = by_hand(crude, H, rng)
+    size = np.maximum(target.states.std(axis=0), 1e-3)
+    reach = np.ptp(target.inputs, axis=0)
+    place = np.array([not unit.endswith("/s") for unit in model.states.values()])
+    weights = np.where(place, 1.0, 0.1) / size**2
+    reward = Reward(weights, weights, 0.01 / reach**2, 0.1 / reach**2)
+    low, high = target.inputs.min(axis=0) - reach / 4, target.inputs.max(axis=0) + reach / 4
+    start, past = np.array(robot.start, float), target.inputs[0]
+    return Task(model, robot.dt, target.states, reward, start, past, low, high)
+
+
+def run_of(
+    real: Real, ran: Candidate, rng: np.random.Generator, said: str, *, exact: bool = True
+) -> Trial:
+    """Return the log of a candidate's run, which is said to be another's.
+
+    An exact log has the samples that the program acted on, another one later ones, with a noise of
+    their own.
+    """
+    act = Runner(ran.policy).action
+    return real.run(
+        lambda k, x: act(k * real.robot.dt, x),
+        ran.policy.horizon,
+        rng,
+        age=0 if exact else int(rng.integers(0, 8)),
+        alike=exact,
+        candidate=said,
+        start_inputs=ran.policy.past,
+    )
+
+
+def runs(
+    robot: Robot, rng: np.random.Generator, wrong: int, hand: int
+) -> Iterator[tuple[str, str]]:
+    """Yield the kind of a run that is said to be a candidate's, and what was told of it.
+
+    Args:
+        robot: the robot.
+        rng: source of what is drawn.
+        wrong: number of runs of another candidate.
+        hand: number of runs by hand.
+    """
+    from grounded.accounts.returned import suspicion
+
+    task, real = task_of(robot, rng), Real.drawn(robot, rng)
+    search = Search(task)
+    for _ in range(TRIALS):
+        if (one := search.ask()) is None:
+            break
+        search.tell(run_of(real, one, rng, one.id))
+    some = {one.id: one for one in search.candidates}
+
+    def told(trial: Trial, ran: str = "") -> str:
+        seen = suspicion(task, trial, some[trial.candidate], search.candidates)
+        if not seen.other:
+            return "refused" if seen.why else "taken"
+        return "named" if seen.other == ran else "another"
+
+    for one in some.values():
+        for exact, log in LOGS.items():
+            yield f"own candidate, {log}", told(run_of(real, one, rng, one.id, exact=exact))
+    far = {(a, b): _apart(a, b) for a, b in permutations(some.values(), 2)}
+    pairs = [pair for pair, off in far.items() if off > APART]
+    for k in rng.integers(0, len(pairs), wrong) if pairs else ():
+        (own, ran), exact = pairs[k], bool(rng.random() < 0.5)
+        near = "" if far[own, ran] > CLOSE else ", near"
+        trial = run_of(real, ran, rng, own.id, exact=exact)
+        yield f"another, {LOGS[exact]}{near}", told(trial, ran.id)
+    for _ in range(hand):
+        own = some[str(rng.choice([*some]))]
+        trial = by_hand(real, task.horizon, rng, candidate=own.id, start_inputs=task.past)
+        yield "by hand", told(trial)
+
+
+def _apart(a: Candidate, b: Candidate) -> float:
+    """Return the rms difference of two plans' commands, relative to their size."""
+    u, v = a.predicted_inputs, b.predicted_inputs
+    size = np.maximum(np.abs(u).max(axis=0), np.abs(v).max(axis=0)) + 1e-12
+    return float(np.sqrt((((u - v) / size) ** 2).mean()))
+
+
 # --- what was named -----------------------------------------------------------------------------
 
 KINDS = {
@@ -506,6 +642,8 @@ def main() -> None:
     parser.add_argument("--robots", default=",".join(ROBOTS))
     parser.add_argument("--faults", default="")
     parser.add_argument("--honest", type=int, default=20, help="honest runs of each robot")
+    parser.add_argument("--wrong", type=int, default=300, help="runs of another candidate, in all")
+    parser.add_argument("--by-hand", type=int, default=32, help="runs by hand, in all")
     parser.add_argument("--all", action="store_true")
     args = parser.parse_args()
     seeds, began = [int(s) for s in args.seeds.split(",")], time.process_time()
@@ -542,16 +680,37 @@ def main() -> None:
     )
     used = time.process_time() - began
     print(f"{cases} cases, {used / max(cases, 1):.2f} s CPU each")
-    refusals = told = runs = 0
+    refusals = told = logs = 0
     for which in args.robots.split(",") if args.honest else ():
         robot = ROBOTS[which]()
         for k in range(args.honest):
             rng = np.random.default_rng([seeds[0], 77, k, [*ROBOTS].index(which)])
             found, refused = named(robot.model, driven(robot, rng, 1 + k % 3))
-            runs, refusals, told = runs + 1, refusals + refused, told + bool(found)
+            logs, refusals, told = logs + 1, refusals + refused, told + bool(found)
             if found and args.all:
                 print("honest", which, k, "refused" * refused, found, flush=True)
-    print(f"honest: {refusals} of {runs} refused, a story told of {told}")
+    print(f"honest: {refusals} of {logs} refused, a story told of {told}")
+    _candidates(args, seeds)
+
+
+def _candidates(args: argparse.Namespace, seeds: Sequence[int]) -> None:
+    """Print what is told of runs that are said to be a candidate's."""
+    each = [(which, seed) for seed in seeds for which in args.robots.split(",")]
+    table, began = defaultdict[str, Counter[str]](Counter), time.process_time()
+    if not (args.wrong or args.by_hand):
+        return
+    for k, (which, seed) in enumerate(each):
+        rng = np.random.default_rng([seed, 55, [*ROBOTS].index(which)])
+        shares = (n // len(each) + (k < n % len(each)) for n in (args.wrong, args.by_hand))
+        for kind, told in runs(ROBOTS[which](), rng, *shares):
+            table[kind][told] += 1
+            if args.all:
+                print(f"{told:8}{which:6}{seed:3} {kind}", flush=True)
+    columns = ("taken", "named", "refused", "another")
+    print(f"\n{'run':34}" + "".join(f"{name:>9}" for name in columns))
+    for kind, row in sorted(table.items()):
+        print(f"{kind:34}" + "".join(f"{row[name]:9}" for name in columns))
+    print(f"{time.process_time() - began:.0f} s CPU")
 
 
 if __name__ == "__main__":
