@@ -21,8 +21,8 @@ import grounded.diagnosis.diagnose as diagnosing
 from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
 from grounded.challenge.score import share
 from grounded.diagnosis.validation import choose, gain
+from grounded.diagnosis.validation.choose import Comparison
 from grounded.diagnosis.validation.decide import Options, decide
-from grounded.diagnosis.validation.gain import Comparison
 
 CURVES = {
     (choose, "NATS"): (1.0, 2.0, 3.0, 5.0, 8.0),

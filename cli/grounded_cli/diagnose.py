@@ -150,8 +150,7 @@ def _models(found: Compared) -> None:
 
 def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
-    from grounded.diagnosis.tables import effect_table, error_table
-    from grounded.diagnosis.telling import FINDINGS, sentence, told
+    from grounded.diagnosis.telling import FINDINGS, effect_table, error_table, sentence, told
 
     said, kind = told(found), found.kind
     first, *others = [sentence(one) for one in said.lines]
@@ -178,7 +177,7 @@ def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> N
 
 def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
     """Print what is odd in the sensors and in the commands."""
-    from grounded.diagnosis.tables import instrument_lines
+    from grounded.diagnosis.telling import instrument_lines
 
     sent = [one for one in findings if one.signal in inputs]
     seen = [one for one in findings if one.signal not in inputs]

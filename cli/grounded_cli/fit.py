@@ -59,7 +59,7 @@ def command(
     Trials are predicted with values from the others; values that predict worse are never written.
     """
     workspace = open_workspace()
-    from grounded.diagnosis.tables import instrument_lines
+    from grounded.diagnosis.telling import instrument_lines
 
     names = names_in(params) or None
     if params is not None and names is None:

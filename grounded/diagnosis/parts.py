@@ -25,8 +25,8 @@ from grounded.diagnosis.error_report import (
     Remainder,
     RulerRow,
     Where,
+    objection,
 )
-from grounded.diagnosis.errors_told import objection
 from grounded.errors import NextCommand
 from grounded.findings import Finding
 from grounded.result import Document, figure, number, or_zero, seen, spread, with_unit

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.errors_told import changes
+from grounded.diagnosis.error_report import RulerRow, changes
 from grounded.diagnosis.parts import Diagnosed
-from grounded.diagnosis.tables import columns_told, larger
+from grounded.diagnosis.telling import columns_told, larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, percent, shown
 

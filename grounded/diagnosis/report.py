@@ -9,8 +9,7 @@ from typing import Any, Self
 
 from grounded.diagnosis.parts import Diagnosed
 from grounded.diagnosis.pictures import gap_figures
-from grounded.diagnosis.tables import instrument_lines
-from grounded.diagnosis.telling import LINES, told
+from grounded.diagnosis.telling import LINES, instrument_lines, told
 from grounded.figures.figure import Figure
 from grounded.result import html_table
 

@@ -15,7 +15,7 @@ import numpy as np
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.gain import Errors, Gain
+from grounded.diagnosis.validation.choose import Errors, Gain
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.errors import GroundedError
 from grounded.findings import found

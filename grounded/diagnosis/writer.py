@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import places
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
@@ -19,14 +20,17 @@ from grounded.diagnosis.error_report import (
     Remainder,
     RulerRow,
     Where,
+    excess,
     furthest,
+    objection,
+    open_noise,
 )
-from grounded.diagnosis.errors_told import excess, objection, open_noise
-from grounded.diagnosis.hypotheses.correction import correction
+from grounded.diagnosis.hypotheses.explored import no_limits
+from grounded.diagnosis.hypotheses.leftover import correction
+from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.next_step import next_step
 from grounded.diagnosis.parts import (
     Changed,
     Estimate,
@@ -34,14 +38,14 @@ from grounded.diagnosis.parts import (
     Ranked,
     Score,
     TrialGroup,
+    Unconfirmed,
     Verdict,
 )
-from grounded.diagnosis.remarks import remarks
+from grounded.diagnosis.remarks import next_step, remarks
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import Decision
+from grounded.diagnosis.validation.decide import Decision, Doubtful
 from grounded.diagnosis.validation.limits import Limits, identifiable
 from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.prediction_error import (
@@ -52,8 +56,9 @@ from grounded.diagnosis.validation.prediction_error import (
     horizon,
 )
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import acting_order, wrapping_order
+from grounded.effects import Effect, RateFamily, acting_order, wrapping_order
 from grounded.findings import Finding, found
+from grounded.frozen import Array
 from grounded.places import position
 from grounded.result import number
 from grounded.task import Task
@@ -312,3 +317,74 @@ def _in_action(h: Hypothesis, claimed: Sequence[str]) -> tuple[str, ...]:
     order, whole = acting_order(families), wrapping_order(families)
     names = [h.names[i] for i in (*order, *(i for i in whole if i not in order))]
     return tuple(n for n in dict.fromkeys((*names, *claimed)) if n in claimed)
+
+
+MENTIONED = 2
+MEMORY = 1e-2  # fraction of a memory state's spread that stands in for its noise, which is zero
+
+
+def unconfirmed(
+    claims: Claims,
+    doubtful: Sequence[Doubtful],
+    groups: Sequence[Sequence[str]] = (),
+) -> tuple[Unconfirmed, ...]:
+    """Return the likeliest effects that were dropped and that few trials show, without ties.
+
+    Args:
+        claims: the causes that are claimed.
+        doubtful: the likely effects that were dropped.
+        groups: effects that the data cannot tell apart.
+    """
+    if claims.known.no_cause:
+        return ()
+    tied = {name for group in groups for name in group}
+    left = [one for one in doubtful if one.name not in tied]
+    left = [one for one in left if one.name not in no_limits(claims.data, one.fit.hypothesis)]
+    found = [_seen(claims, one) for one in left]
+    return tuple([one for one in found if one is not None][:MENTIONED])
+
+
+def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
+    if not (few := one.one_group):
+        return None
+    data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
+    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
+    names = tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few])
+    i = one.fit.hypothesis.names.index(one.name)
+    anywhere = _anywhere(one.fit.hypothesis.effects[i])
+    regions = by_region(acts, claims.predictor, one.fit, 1, but=anywhere)
+    params = claims.estimates(one.fit)[i]
+    if not any(abs(e.value) > SURE * e.std for e in params.values()):
+        return None  # its size is unknown
+    return Unconfirmed(
+        one.name,
+        params,
+        one.nats,
+        names[0],
+        (few, data.count),
+        regions[0] if regions else None,
+        few > 1,
+        names,
+    )
+
+
+def _anywhere(effect: Effect) -> Sequence[str]:
+    """Return the coordinates on the ground if an effect acts alike at all places.
+
+    A motor's delay showed "where y < -3.95 m": only the drive by hand went there.
+    """
+    where = places.position(effect.site.model)
+    return () if len(where) < 2 or isinstance(effect.family, RateFamily) else where
+
+
+def acting(predictor: Predictor, fit: Fitted, name: str) -> Array:
+    """Return the squared change of each step by an effect, relative to the noise, (L, B)."""
+    data, h, x = predictor.data, fit.hypothesis, fit.track
+    less = h.minus(name)
+    moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
+    shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
+    log_q, log_r = fit.noise.log_q.copy(), fit.noise.log_r.copy()
+    for i in data.hidden:  # its noise is zero, by which nothing can be divided
+        log_q[i] = log_r[i] = 2 * np.log(MEMORY * data.scales.spread(data.model.state_names[i]))
+    square = moved**2 / np.exp(log_q) + shown[1:] ** 2 / np.exp(log_r)
+    return np.asarray(square.sum(axis=-1) * data.valid.T)

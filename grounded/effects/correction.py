@@ -3,7 +3,7 @@
     s' = model + sum_k w_k g_k(r) / sum_k g_k(r)   (s<-r)
 
 with Gaussian bells g_k at KNOTS points from lo to hi, constant beyond them. A diagnosis fits it to
-what no effect explains (`grounded.diagnosis.hypotheses.correction`). Once adopted, it is part of
+what no effect explains (`grounded.diagnosis.hypotheses.leftover`). Once adopted, it is part of
 the model like any effect.
 """
 

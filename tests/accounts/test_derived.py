@@ -13,7 +13,7 @@ from grounded.accounts.finding import (
     put_right,
 )
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.tables import instrument_lines
+from grounded.diagnosis.telling import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
 from grounded.findings import Quantity, found

@@ -5,7 +5,7 @@ import pytest
 
 from grounded import Trial
 from grounded.accounts.sound_trials import sound_trials as preflight
-from grounded.diagnosis.tables import instrument_lines
+from grounded.diagnosis.telling import instrument_lines
 from grounded.models.arm import model as arm
 
 DT, LATE, WHIRL = 0.02, 2, 10.0  # [s], steps, [N m]

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from grounded.diagnosis.error_report import Remainder, RulerRow, furthest
-from grounded.diagnosis.errors_told import (
+from grounded.diagnosis.error_report import (
+    Remainder,
+    RulerRow,
     excess,
+    furthest,
     lost_most,
     objection,
     telling,

@@ -10,8 +10,7 @@ from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
 from grounded.diagnosis.parts import Agreement, Changed, Estimate, Ranked, TrialValue, Verdict
 from grounded.diagnosis.remarks import remarks
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.tables import effect_table
-from grounded.diagnosis.telling import told
+from grounded.diagnosis.telling import effect_table, told
 from grounded.effects import Library
 from grounded.model import Model, Param
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facts import holding
-from grounded.diagnosis.validation.gain import Gain
+from grounded.diagnosis.validation.choose import Gain
 from grounded.errors import GroundedError
 from grounded.fit import fit, prediction_error
 from grounded.model import Model, Param

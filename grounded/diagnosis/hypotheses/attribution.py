@@ -23,8 +23,15 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
 )
-from grounded.diagnosis.hypotheses.tuning import sweep, tune
-from grounded.diagnosis.hypotheses.variations import HOPEFUL, TUNED, reordered, swapped, varied
+from grounded.diagnosis.hypotheses.variations import (
+    HOPEFUL,
+    TUNED,
+    reordered,
+    swapped,
+    sweep,
+    tune,
+    varied,
+)
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted

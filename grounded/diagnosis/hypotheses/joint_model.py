@@ -24,8 +24,7 @@ from grounded.diagnosis.hypotheses.search import (
     HypothesisSearch,
     Start,
 )
-from grounded.diagnosis.hypotheses.tuning import tune
-from grounded.diagnosis.hypotheses.variations import LATE, varied
+from grounded.diagnosis.hypotheses.variations import LATE, tune, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale

@@ -25,9 +25,14 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.averaged import averaged
-from grounded.diagnosis.validation.blame import Blame, moved_parameters
-from grounded.diagnosis.validation.by_priors import ByPriors, Key, by_priors
+from grounded.diagnosis.validation.by_priors import (
+    Blame,
+    ByPriors,
+    Key,
+    averaged,
+    by_priors,
+    moved_parameters,
+)
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.measured import ordered

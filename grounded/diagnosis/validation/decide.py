@@ -32,9 +32,8 @@ from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.parts import Likeness
-from grounded.diagnosis.validation.averaged import averaged
-from grounded.diagnosis.validation.choose import Choice, Option, Rule
-from grounded.diagnosis.validation.gain import Errors
+from grounded.diagnosis.validation.by_priors import averaged
+from grounded.diagnosis.validation.choose import Choice, Errors, Option, Rule
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
 from grounded.frozen import Array

@@ -31,7 +31,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.validation.ahead import at_steps, by_fold, missed, unseen
-from grounded.diagnosis.validation.gain import Comparison, Errors, Gain
+from grounded.diagnosis.validation.choose import Comparison, Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial

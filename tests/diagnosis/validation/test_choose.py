@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded.diagnosis.validation.choose import Option, Rule
-from grounded.diagnosis.validation.gain import Comparison, Errors
+from grounded.diagnosis.validation.choose import Comparison, Errors, Option, Rule
 
 TRIALS = 6
 COMPARE = Comparison([0], np.full((2, 1), 1e-6), np.arange(TRIALS))

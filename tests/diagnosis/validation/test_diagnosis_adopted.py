@@ -16,10 +16,10 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.decide import Doubtful, one_group
 from grounded.diagnosis.validation.limits import knowable, limits
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.writer import unconfirmed
 from grounded.effects import Library, LossFamily, RateFamily, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.documents import write_document

@@ -10,12 +10,12 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.parts import Unconfirmed
-from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.measured import credited, losses
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.writer import unconfirmed
 from grounded.effects import Library
 
 DT = 0.02

@@ -358,7 +358,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 
 def _new_repeats(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> tuple[str, ...]:
     """Return the runs of one candidate that tell the noise, if a diagnosis did not know it."""
-    from grounded.diagnosis.errors_told import open_noise
+    from grounded.diagnosis.error_report import open_noise
 
     if not open_noise(diagnosis.prediction_error):
         return ()

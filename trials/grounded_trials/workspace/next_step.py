@@ -336,7 +336,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 
 def left_open(found: Diagnosis) -> bool:
     """Return whether a diagnosis leaves something that noise is not known to explain."""
-    from grounded.diagnosis.errors_told import open_noise
+    from grounded.diagnosis.error_report import open_noise
 
     return found.kind != "none" or bool(open_noise(found.prediction_error))
 

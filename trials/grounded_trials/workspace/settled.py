@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from grounded.diagnosis.errors_told import telling
+from grounded.diagnosis.error_report import telling
 from grounded.diagnosis.parts import Estimate, Made
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.telling import Told, errors_line, open_line, sentence, told

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.diagnosis.pictures import credit_figure
-from grounded.diagnosis.tables import instrument_lines
-from grounded.diagnosis.telling import FINDINGS, sentence
+from grounded.diagnosis.telling import FINDINGS, instrument_lines, sentence
 from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset

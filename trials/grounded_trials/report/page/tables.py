@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.diagnosis.parts import Estimate, Ranked
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.tables import weighed_beside
+from grounded.diagnosis.telling import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.frozen import Array
