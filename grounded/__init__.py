@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from grounded.diagnosis.diagnose import diagnose
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.engine import Engine
     from grounded.errors import GroundedError, NextCommand
     from grounded.fit import fit
@@ -62,7 +62,7 @@ __all__ = [
 
 _HOMES = {
     "grounded.diagnosis.diagnose": ("diagnose",),
-    "grounded.diagnosis.report": ("Diagnosis",),
+    "grounded.diagnosis.parts": ("Diagnosis",),
     "grounded.engine": ("Engine",),
     "grounded.errors": ("GroundedError", "NextCommand"),
     "grounded.fit": ("fit",),

@@ -20,7 +20,7 @@ from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
 from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate

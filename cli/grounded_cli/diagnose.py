@@ -28,7 +28,7 @@ from grounded_trials.wording import figure, percent
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.engine import Engine
     from grounded_trials.workspace.home.rivals import Compared
 

@@ -40,7 +40,7 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.sound_data import MOST_STATES, sound_data
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, beside_lookalikes, decide

@@ -45,8 +45,7 @@ from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.parts import Estimate, Made
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Estimate, Made
 from grounded.effects import Effect, Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.effects.actuator import delay_again
 from grounded.effects.memory import shifted

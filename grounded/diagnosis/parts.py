@@ -1,14 +1,15 @@
 """What a diagnosis says: a tree of frozen values, which is also its JSON document.
 
 `to_json` gives the document of `diagnose --json`; `from_json` reads it back, including older
-versions. `report.Diagnosis` is the whole of it with its figures and its table for notebooks.
+versions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from typing import Any, Literal, Self
 
 from grounded.accounts.finding import Finding as Fault
@@ -27,14 +28,20 @@ from grounded.diagnosis.error_report import (
     Where,
     objection,
 )
+from grounded.diagnosis.pictures import gap_figures
+from grounded.diagnosis.telling import LINES, NEXT, instrument_lines, told
 from grounded.errors import NextCommand
+from grounded.figures.figure import Figure
 from grounded.findings import Finding
-from grounded.result import Document, figure, number, or_zero, seen, spread, with_unit
+from grounded.result import Document, figure, html_table, number, or_zero, seen, spread, with_unit
 
 Kind = Literal["effect", "several", "none", "unknown"]
 LARGE, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
+UNKNOWABLE = (  # codes of what the trials can't show
+    *("model.few", "model.still", "model.unmeasured", "model.share", "model.copy"),
+    *("model.joint_friction",),
+)
 UNKNOWN = 1e4  # times a value, at least of 1: standard deviation from which it is unknown
-NEXT = "gap.next."  # before the codes of next steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +242,8 @@ class Score(Document):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosed(Document):
-    """The result of a diagnosis, as in `diagnose --json`; shown by `Diagnosis`."""
+class Diagnosis(Document):
+    """The result of a diagnosis, as in `diagnose --json`."""
 
     verdict: Verdict
     where: Where = field(default_factory=Where)
@@ -389,6 +396,46 @@ class Diagnosed(Document):
         made = self.made or Made()
         now, then = _numbers(adopted, params), _numbers(made.adopted, made.params)
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
+
+    @classmethod
+    def from_json(cls, document: Any) -> Self:
+        """Read what `to_json` wrote; findings of other versions are left out."""
+        found = super().from_json(document)
+        kept = (one for one in found.findings if one.printable and one.code not in LINES)
+        return replace(found, findings=tuple(kept))
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return " ".join(told(self).texts(None))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of `diagnose --json`, with what its findings say in words."""
+        document, told_now = super().to_json(), (*told(self).lines, *self.findings)
+        document["verdict"]["sentence"] = self.sentence
+        document["findings"] = [one.to_json() for one in told_now]
+        document["next_trial"] = self.next_trial
+        document["unknowable"] = [one.sentence for one in told_now if one.code in UNKNOWABLE]
+        return document
+
+    def figures(self) -> Sequence[Figure]:
+        """Return figures: predictions before and after, the credit, where the gap is."""
+        return gap_figures(self)
+
+    def _repr_html_(self) -> str:
+        """Return what is told, with the sensors' faults and the table; the rest is folded."""
+        said = told(self)
+        parts = [f"<b>{escape(self.kind)}</b>", *(f"<p>{escape(t)}</p>" for t in said.texts())]
+        if sensors := instrument_lines(self.preflight):
+            items = "".join(f"<li>{escape(line)}</li>" for line in sensors)
+            parts.append(f"<b>Sensors</b><ul>{items}</ul>")
+        if said.rows:
+            parts.append(html_table(said.rows, said.header))
+        if said.next:
+            parts.append(f"<p><b>Next trial</b>: {escape(said.next)}</p>")
+        everything = super()._repr_html_()
+        parts.append(f"<details><summary>The whole document</summary>{everything}</details>")
+        return "".join(parts)
 
 
 def _numbers(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.diagnosis.error_report import RulerRow, changes
-from grounded.diagnosis.parts import Diagnosed
 from grounded.diagnosis.telling import columns_told, larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, percent, shown
+
+if TYPE_CHECKING:  # of which this is a part
+    from grounded.diagnosis.parts import Diagnosis
 
 MOST = 12  # bars
 STATES = 6  # whose error without each cause is drawn
@@ -26,7 +29,7 @@ ROLES = {  # of the columns of prediction errors
 }
 
 
-def gap_figures(diagnosis: Diagnosed) -> list[Figure]:
+def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
     """Return the figures of a diagnosis, most important first; none if no cause can be named."""
     if diagnosis.no_cause:
         return []
@@ -34,7 +37,7 @@ def gap_figures(diagnosis: Diagnosed) -> list[Figure]:
     return [figure for figure in found if figure is not None]
 
 
-def accuracy_figure(diagnosis: Diagnosed) -> Figure | None:
+def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     """Return the prediction errors without and with the diagnosis, in each state's unit."""
     errors = diagnosis.prediction_error
     if not errors:
@@ -98,7 +101,7 @@ def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ..
     return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
-def credit_figure(diagnosis: Diagnosed, states: int = STATES) -> Figure | None:
+def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
     """Return each cause's share of the gain, and the errors of some states without each cause.
 
     Args:
@@ -117,7 +120,7 @@ def credit_figure(diagnosis: Diagnosed, states: int = STATES) -> Figure | None:
     return Figure("credit", "What each is worth", "", found) if found else None
 
 
-def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
+def worth_of(name: str, error: RulerRow, diagnosis: Diagnosis) -> Bars:
     """Return the error of a state with all causes and all but each.
 
     If effects were adopted before, also that of the model without them.
@@ -136,7 +139,7 @@ def worth_of(name: str, error: RulerRow, diagnosis: Diagnosed) -> Bars:
     return Bars(f"{name}: error {error.horizon_s:.3g} s ahead", _in_unit(bars, unit))
 
 
-def where_figure(diagnosis: Diagnosed) -> Figure | None:
+def where_figure(diagnosis: Diagnosis) -> Figure | None:
     """Return the shares of the gap by channel, time and region, and the evidence for effects."""
     where = diagnosis.where
     by_channel = [

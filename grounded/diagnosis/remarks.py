@@ -18,12 +18,12 @@ from grounded.diagnosis.causes import (
 from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most, open_noise
 from grounded.diagnosis.levels import ALIKE, HALF, SAME, SURE
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.parts import Diagnosed, Estimate
+from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model, all_at_bounds
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Diagnosed
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.diagnosis.validation.claims import Claims
     from grounded.task import Task
     from grounded.trial import Trial
@@ -34,7 +34,7 @@ def quantity(e: Estimate) -> Quantity:
     return Quantity(e.value, e.unit, e.std)
 
 
-def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterator[Finding]:
+def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterator[Finding]:
     """Yield what a person should know beside the verdict, the errors and the gap.
 
     Args:
@@ -84,7 +84,7 @@ def remarks(d: Diagnosed, model: Model, adopted: Collection[str] = ()) -> Iterat
         yield found("gap.corrected", *(one.signal for one in odd))
 
 
-def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
+def _of_groups(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
     """What changed between two groups of trials, or where trials disagree."""
     for one in d.changed or ():
         own = one.effect.startswith("parameter:")
@@ -114,7 +114,7 @@ def _of_groups(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
         )
 
 
-def _of_errors(d: Diagnosed) -> Iterator[Finding]:
+def _of_errors(d: Diagnosis) -> Iterator[Finding]:
     """Errors that grow, and those that stay above the noise without a cause."""
     rows = d.prediction_error
     if lost := lost_most(rows):
@@ -133,7 +133,7 @@ def _when(row: RulerRow) -> dict[str, Any]:
     return {"whole": True} if row.whole_trial else {"ahead": row.horizon_s}
 
 
-def _of_values(d: Diagnosed, adopted: Collection[str]) -> Iterator[Finding]:
+def _of_values(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
     """What values rest on, stopped at, and may be zero."""
     rests: dict[tuple[str, ...], list[str]] = {}
     for name, on in d.conditions.items():
@@ -164,7 +164,7 @@ def _power_of_ten(ratio: float) -> bool:
     return power != 0 and abs(ratio / 10.0**power - 1) <= ALIKE
 
 
-def _of_model(d: Diagnosed, model: Model) -> Iterator[Finding]:
+def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
     """What the model's structure lets a claimed effect stand for."""
     from grounded import places
     from grounded.diagnosis.validation.limits import joints_without_input
@@ -181,7 +181,7 @@ def _of_model(d: Diagnosed, model: Model) -> Iterator[Finding]:
 
 
 def next_step(
-    d: Diagnosed,
+    d: Diagnosis,
     claims: Claims,
     doubt: Finding | None,
     off: str,
@@ -254,7 +254,7 @@ def _to_flip(row: object, ended: bool) -> bool:
 
 
 def _look(
-    d: Diagnosed, off: str, task: Task | None, trials: Sequence[Trial], step_only: bool
+    d: Diagnosis, off: str, task: Task | None, trials: Sequence[Trial], step_only: bool
 ) -> Finding:
     """Return what to run to investigate a leftover: first a repeat, then a new motion."""
     left = d.leftover[0] if d.leftover else None

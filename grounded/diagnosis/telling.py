@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import (
@@ -23,11 +23,14 @@ from grounded.diagnosis.error_report import (
     telling,
 )
 from grounded.diagnosis.levels import SHOWS
-from grounded.diagnosis.parts import NEXT, Diagnosed, Ranked
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import figure, measured, number, or_zero, percent, shown
 
+if TYPE_CHECKING:  # of which this is a part
+    from grounded.diagnosis.parts import Diagnosis, Ranked
+
+NEXT = "gap.next."  # before the codes of next steps
 LINES = frozenset(  # codes of the lines, which are made from the facts
     f"gap.{name}" for name in ("causes", "none", "unknown", "too_few", "errors", "left", "where")
 )
@@ -56,7 +59,7 @@ def sentence(one: Finding) -> str:
     return f"{text[:1].upper() if own else text[:1]}{text[1:]}."
 
 
-def told(diagnosis: Diagnosed, now: str = "with_effects", before: str = "crude") -> Told:
+def told(diagnosis: Diagnosis, now: str = "with_effects", before: str = "crude") -> Told:
     """Return what is told of a diagnosis.
 
     Args:
@@ -72,7 +75,7 @@ def told(diagnosis: Diagnosed, now: str = "with_effects", before: str = "crude")
     return Told(lines, rows, header, rest, diagnosis.next_trial)
 
 
-def cause_table(diagnosis: Diagnosed) -> tuple[tuple[Cells, ...], Cells]:
+def cause_table(diagnosis: Diagnosis) -> tuple[tuple[Cells, ...], Cells]:
     """Return rows and header of the causes, the largest first, each with what ties with it."""
     rows, own = list[Cells](), diagnosis.known_parameters
     for one in diagnosis.credit:
@@ -92,12 +95,12 @@ def cause_table(diagnosis: Diagnosed) -> tuple[tuple[Cells, ...], Cells]:
     return tuple(rows), ("cause", "value", "share")
 
 
-def _was(d: Diagnosed, name: str) -> str:
+def _was(d: Diagnosis, name: str) -> str:
     known = {} if d.made is None else d.made.nominal
     return f", was {number(known[name])}" if name in known else ""
 
 
-def _what(d: Diagnosed) -> Finding:
+def _what(d: Diagnosis) -> Finding:
     """The causes, or that there is none."""
     causes = d.verdict.causes or d.effects  # the latter: a document of an older version
     left = any(one.above for one in d.leftover)
@@ -118,7 +121,7 @@ def _what(d: Diagnosed) -> Finding:
     return found("gap.none", known=known and not excess(d.prediction_error), adopted=adopted)
 
 
-def errors_line(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
+def errors_line(d: Diagnosis, now: str, before: str) -> Iterator[Finding]:
     """How far predictions are off, and were."""
     if (row := telling(d.prediction_error)) is None:
         return
@@ -147,7 +150,7 @@ def errors_line(d: Diagnosed, now: str, before: str) -> Iterator[Finding]:
     )
 
 
-def open_line(d: Diagnosed) -> Iterator[Finding]:
+def open_line(d: Diagnosis) -> Iterator[Finding]:
     """What no known effect explains, or else where the gap is."""
     if d.leftover:
         left, others = d.leftover[0], len(d.leftover) - 1
@@ -201,7 +204,7 @@ COLUMNS = {
 }
 
 
-def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
+def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the held-out prediction errors, in the units of the states.
 
     Args:
@@ -228,7 +231,7 @@ def error_table(diagnosis: Diagnosed, *, whole_trials: bool = True) -> tuple[lis
     return rows, ("error (rms)", *columns.values(), "unit")
 
 
-def columns_told(diagnosis: Diagnosed) -> dict[str, str]:
+def columns_told(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the columns of `RulerRow` that are told, with their names."""
     rows, columns = diagnosis.prediction_error, dict(COLUMNS)
     if not any(row.outset for row in rows):
@@ -286,7 +289,7 @@ def instrument_lines(findings: Iterable[Fault]) -> list[str]:
     return lines
 
 
-def effect_table(diagnosis: Diagnosed) -> tuple[list[Cells], Cells]:
+def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     """Return (rows, header) of the effects that were compared, the claimed ones first.
 
     Evidence is what is lost without an effect that is claimed or tied; `alone` is what another one
@@ -304,7 +307,7 @@ def effect_table(diagnosis: Diagnosed) -> tuple[list[Cells], Cells]:
     return rows, ("effect (*: claimed)", "evidence [nats]", "alone [nats]", "value")
 
 
-def weighed_beside(diagnosis: Diagnosed) -> set[str]:
+def weighed_beside(diagnosis: Diagnosis) -> set[str]:
     """Return the effects whose evidence is what is lost without them: claimed or tied with these.
 
     That of the other ranked effects is what they gain alone.

@@ -33,6 +33,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import (
     Changed,
+    Diagnosis,
     Estimate,
     NoiseLevels,
     Ranked,
@@ -42,7 +43,6 @@ from grounded.diagnosis.parts import (
     Verdict,
 )
 from grounded.diagnosis.remarks import next_step, remarks
-from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, Doubtful

@@ -12,8 +12,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.parts import Estimate, Made, Ranked, Verdict
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Estimate, Made, Ranked, Verdict
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
 from grounded_trials.workspace.adoptable import joined

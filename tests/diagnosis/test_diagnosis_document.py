@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.result import Document

@@ -1,9 +1,8 @@
 """Figures of prediction errors."""
 
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.parts import Verdict
+from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.pictures import accuracy_figure
-from grounded.diagnosis.report import Diagnosis
 from grounded.figures.interactive import plotted
 
 

@@ -7,9 +7,16 @@ import pytest
 
 from grounded.diagnosis.causes import meaning
 from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
-from grounded.diagnosis.parts import Agreement, Changed, Estimate, Ranked, TrialValue, Verdict
+from grounded.diagnosis.parts import (
+    Agreement,
+    Changed,
+    Diagnosis,
+    Estimate,
+    Ranked,
+    TrialValue,
+    Verdict,
+)
 from grounded.diagnosis.remarks import remarks
-from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.telling import effect_table, told
 from grounded.effects import Library
 from grounded.model import Model, Param

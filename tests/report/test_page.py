@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded_trials.report.gathering import gather

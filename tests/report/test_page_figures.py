@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from grounded.diagnosis.error_report import Credit, RulerRow
-from grounded.diagnosis.parts import Verdict
+from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
-from grounded.diagnosis.report import Diagnosis
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     COLOURS,

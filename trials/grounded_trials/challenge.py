@@ -23,8 +23,7 @@ import numpy as np
 
 from grounded.challenge import Case, judge, of_crude, oracle, sealed, task_of
 from grounded.checks import refused, wrong
-from grounded.diagnosis.parts import Verdict
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded.experiments.jobs import Job, Progress, run_jobs

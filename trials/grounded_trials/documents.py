@@ -25,7 +25,7 @@ from typing import (
 )
 
 from grounded.accounts.finding import Finding as Fault
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
 from grounded_trials.workspace.off_target import OffTarget
 

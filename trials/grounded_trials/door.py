@@ -26,7 +26,7 @@ from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.findings import Finding

@@ -8,8 +8,7 @@ import pytest
 from grounded import GroundedError
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Correction, Curve
-from grounded.diagnosis.parts import Verdict
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.effects import Library, wrap
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document

@@ -9,7 +9,7 @@ import pytest
 
 from cli import grounded
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.validation.ruler import repeated
 from grounded.effects import Library
 from small_tasks import pushed_cart

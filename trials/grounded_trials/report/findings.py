@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from grounded.diagnosis.error_report import furthest
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.search.planner import Planner

@@ -21,8 +21,7 @@ from grounded_trials.workspace.last_diagnosis import made_from, newer_alone
 from grounded_trials.workspace.where_to_mend import in_time_now
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Estimate
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis, Estimate
     from grounded.search.planner import Planner
     from grounded_trials.workspace.folder import Folder
 

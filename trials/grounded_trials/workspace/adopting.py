@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from grounded.checks import refused
-from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, settle
 from grounded.findings import found as found_

@@ -12,7 +12,8 @@ import numpy as np
 
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.parts import NEXT, Estimate, Made, Ranked
+from grounded.diagnosis.parts import Estimate, Made, Ranked
+from grounded.diagnosis.telling import NEXT
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
@@ -25,7 +26,7 @@ from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.effects import Library
     from grounded.engine import Engine
     from grounded.frozen import Array

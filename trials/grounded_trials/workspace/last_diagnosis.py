@@ -36,8 +36,7 @@ from grounded_trials.workspace.identity import READ_BY, StoredTrial, sha256
 from grounded_trials.workspace.unknown_id import named_trials
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Made
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis, Made
     from grounded.fit import Fit
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -176,7 +175,7 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     path = folder / FILE
     try:
         document = read_document(path)
-        from grounded.diagnosis.report import Diagnosis  # slow, and seldom needed
+        from grounded.diagnosis.parts import Diagnosis  # slow, and seldom needed
 
         return Diagnosis.from_json(document)
     except FileNotFoundError:

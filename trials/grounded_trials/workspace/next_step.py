@@ -36,7 +36,7 @@ from grounded_trials.workspace.off_target import logged_target
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")

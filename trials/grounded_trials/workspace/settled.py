@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from grounded.diagnosis.error_report import telling
-from grounded.diagnosis.parts import Estimate, Made
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Estimate, Made
 from grounded.diagnosis.telling import Told, errors_line, open_line, sentence, told
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from grounded.diagnosis.parts import Estimate
+from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.telling import error_table
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.findings import Findings

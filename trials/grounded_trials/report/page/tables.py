@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.diagnosis.parts import Estimate, Ranked
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Estimate, Ranked
 from grounded.diagnosis.telling import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure

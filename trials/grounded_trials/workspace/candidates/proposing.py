@@ -49,7 +49,7 @@ from grounded_trials.workspace.placing import FromStarts, from_starts
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing

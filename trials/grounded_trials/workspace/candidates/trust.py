@@ -22,7 +22,7 @@ from grounded.task import Task
 from grounded_trials.workspace.off_target import reaches, weighed_groups
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.search.standing import Standing
     from grounded_trials.workspace.folder import Folder
     from grounded_trials.workspace.last_diagnosis import Since
