@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.checks import known, list_of, of_type, one_of, refused, wrong
+from grounded.diagnosis.diagnose import MOST_STATES, sound_data
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
     TO_THE_TOP,
@@ -32,7 +33,6 @@ from grounded.diagnosis.likelihood.polish import SAME as STILL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.sound_data import MOST_STATES, sound_data
 from grounded.diagnosis.validation.limits import counted_once, held
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library

@@ -6,13 +6,12 @@ effect may exist but can't be identified. It is not a candidate then, and a find
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
@@ -360,16 +359,6 @@ def _jointly(
     along = np.array(off) / priors
     size = float(along @ along)
     return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
-
-
-def with_measured_filters(model: Model, findings: Iterable[Fault]) -> Model:
-    """Return the model with the constants of adopted sensor filters held that sensors show alone.
-
-    The physics would shift them to fit what it lacks: 0.050 s, seen in the speed beside its
-    position, became 0.035 s.
-    """
-    seen = {f"sensor_lag_{one.signal}_tau" for one in findings if one.kind == "lag"}
-    return model.holding(seen & {*model.params})
 
 
 def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Model:
