@@ -16,7 +16,8 @@ under another noise. So each look-alike is put in its effect's place, starting f
 the shifts of the best fit, and fitted to convergence before ties are decided (`swap`). Twins still
 differ by some nats because of the time discretisation: half of a friction acts before a step and
 half after it, while a gain acts during the whole step. So two effects whose rates are equal at all
-states and inputs, and which predict equally well, tie whatever their evidence (`Claims.rivals`).
+states and inputs, and which predict equally well, tie whatever their evidence (`Claims.rivals`),
+and no trial is asked to tell them apart.
 
 **One clock.** If all sensors of the part that some inputs drive are delayed by d, y(t) = x(t - d),
 then x' = f(x, u) becomes y' = f(y, u(t - d)), which are the equations for commands delayed by d. No
@@ -39,11 +40,19 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
-from grounded.diagnosis.likelihood.linearise import base_columns, linearise
+from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.parts import Likeness
-from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily, one_friction
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    Library,
+    ParamFamily,
+    RateFamily,
+    SensorFamily,
+    one_friction,
+)
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model
@@ -104,30 +113,6 @@ def of_parameters(
         own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
         found += _likely(there, replace(null, hypothesis=h), effect, own)
     return tuple(found)
-
-
-def one_thing(predictor: Predictor, index: int, effect: Effect) -> bool:
-    """Check whether an effect is equivalent to a parameter of the model in any trial.
-
-    Tested at random points, every state and input drawn independently over its range: the slope of
-    a step in the effect must be a multiple of its slope in the parameter.
-    """
-    data, rng = predictor.data, np.random.default_rng(0)
-    if len(effect.free) != 1 or index not in calibrated(data):
-        return False
-    low, high = (f(data.filled, axis=0) for f in (np.min, np.max))
-    least, most = (f(data.commands, axis=(0, 1)) for f in (np.min, np.max))
-    apart = np.maximum(most - least, 1e-9)
-    commands = rng.uniform(least - apart, most + apart, data.commands.shape)
-    anywhere = replace(data, commands=commands)
-    track = rng.uniform(low, high, (len(data.time) + 1, data.time.shape[1], data.model.n))
-    h = replace(Hypothesis().plus(effect, {q.name: q.start for q in effect.free}), spread=1.0)
-    size = np.where(high > low, high - low, 1.0)[:, None]  # of one that is not logged: any
-    columns = linearise(Predictor(anywhere), h, track)[1] / size
-    own = columns[..., 1].ravel()
-    other = columns[..., 2 + int(np.flatnonzero(calibrated(data) == index)[0])].ravel()
-    power = float(own @ own) * float(other @ other)
-    return power > 0 and float(own @ other) ** 2 > (1 - IDENTICAL) * power
 
 
 def related(one: Effect, other: Effect) -> bool:
@@ -226,47 +211,51 @@ def moving(data: Data, h: Hypothesis) -> list[int]:
 def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int]) -> bool:
     """Check whether an effect equals another one combined with shifts of parameters (`moving`).
 
-    Tested at random points, every state and input drawn independently: the rate that the one adds
-    must be a linear combination of the other's and of the parameters' slopes. Only for effects with
-    one value and no memory, and not for simulators, whose instantaneous rates are not known.
+    Either may be a parameter of the model itself. Tested at random points, every state and input
+    drawn independently: the rate that the one adds must be a linear combination of the other's and
+    of the parameters' slopes. Only for effects with one value and no memory.
 
     What the parameters can do alone says nothing of the other effect: if one parameter scales each
     input and another one is each friction, any two of these effects would be one thing.
     """
-    data, h = predictor.data, Hypothesis()
-    if simulated(data.model) or not (_at_once(one) and _at_once(other)):
+    data = predictor.data
+    if not (_at_once(one) and _at_once(other)):
         return False
     rng = np.random.default_rng(0)
     low, high = (f(data.filled, axis=0) for f in (np.min, np.max))
     least, most = (f(data.commands, axis=(0, 1)) for f in (np.min, np.max))
     apart = np.maximum(most - least, 1e-9)
-    x = rng.uniform(low, high, (SAMPLES, data.model.n))
+    y = rng.uniform(low, high, (SAMPLES, data.model.n))
     u = rng.uniform(least - apart, most + apart, (SAMPLES, data.model.m))
     size = np.where(high > low, high - low, 1.0)  # of a state that is not logged: any
+    scale, names = param_scale(data.model), data.model.param_names
 
-    def slope(up: Hypothesis, down: Hypothesis) -> Array:
-        after, before = (_rate(predictor, end, x, u) for end in (up, down))
+    def slope(effect: Effect) -> Array:
+        (q,) = effect.free
+        side = SIDE
+        if isinstance(effect.family, ParamFamily):
+            side *= float(scale[names.index(effect.site.target)]) or 1.0
+        ends = (Hypothesis().plus(effect, {q.name: sign * side}) for sign in (1, -1))
+        after, before = (_rate(predictor, end, y, u) for end in ends)
         return np.asarray((after - before) / size).ravel()
 
-    columns = []
-    for effect in (one, other):
-        (q,) = effect.free
-        columns.append(slope(*(h.plus(effect, {q.name: s * SIDE}) for s in (1, -1))))
-    scale = param_scale(data.model)
-    for index in free:
-        moved = np.zeros(len(scale))
-        moved[index] = SIDE * scale[index]
-        columns.append(slope(replace(h, shift=moved), replace(h, shift=-moved)))
-    first, second, *shifts = columns
-    if any(_is_sum(effect, shifts) for effect in (first, second)):
+    own = {effect.site.target for effect in (one, other) if isinstance(effect.family, ParamFamily)}
+    moved = (names[k] for k in free if names[k] not in own)
+    shifts = [slope(Library().effect(f"parameter:{name}", data.model)) for name in moved]
+    first, second = slope(one), slope(other)
+    if not first.any() or not second.any():
         return False
-    return bool(first.any()) and _is_sum(first, [second, *shifts])
+    if _is_sum(first, [second]):
+        return True
+    return not any(_is_sum(s, shifts) for s in (first, second)) and _is_sum(
+        first, [second, *shifts]
+    )
 
 
 def _is_sum(own: Array, others: Sequence[Array]) -> bool:
     """Check whether a slope is a linear combination of others."""
     if not others:
-        return not own.any()
+        return False
     columns = np.stack(others, axis=-1)
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     left = own - columns @ np.linalg.lstsq(columns, own, rcond=1e-9)[0]
@@ -279,23 +268,27 @@ SAMPLES = 500  # random points at which two effects are compared
 def _at_once(effect: Effect) -> bool:
     """Check whether an effect has one value, no memory, and vanishes at zero."""
     family = effect.family
-    acts = isinstance(family, RateFamily | InputFamily) and not getattr(family, "parts", 0)
-    timed = getattr(family, "timed", False)
+    acts = isinstance(family, RateFamily | InputFamily | SensorFamily | ParamFamily)
+    timed = getattr(family, "parts", 0) or getattr(family, "timed", False)
     return acts and not timed and len(effect.free) == 1 and not effect.free[0].grid
 
 
-def _rate(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Array:
-    """Return the instantaneous rates of states x (N, n) under inputs u (N, m), effects included."""
+def _rate(predictor: Predictor, h: Hypothesis, y: Array, u: Array) -> Array:
+    """Return the instantaneous rates of logs y (N, n) under inputs u (N, m), effects included.
+
+    Those of a simulator, which has no instantaneous rates, are means over a step.
+    """
     given, names = u.copy(), predictor.data.model.input_names
     for effect, values in predictor.acting(h):
         assert isinstance(effect.family, InputFamily)
         for name in effect.site.targets:
             j = names.index(name)
             given[:, j] = effect.family.effect(u[:, j], 0.0, values)
-    dt = MOMENT * predictor.data.dt
+    x = y - predictor.standing(h, y)
+    dt = predictor.data.dt * (1.0 if simulated(predictor.data.model) else MOMENT)
     own = (predictor.step(x, given, predictor.params(h), dt) - x) / dt
-    time = np.zeros(len(x))
-    return own + predictor.added_rate(rates_of(h), x, given, time, predictor.named(own))
+    rate = own + predictor.added_rate(rates_of(h), x, given, np.zeros(len(x)), predictor.named(own))
+    return rate + (predictor.standing(h, x + dt * rate) - predictor.standing(h, x)) / dt
 
 
 # -- one clock

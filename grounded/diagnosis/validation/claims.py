@@ -15,7 +15,6 @@ from grounded.diagnosis.hypotheses.lookalike import (
     moving,
     of_parameters,
     one_clock,
-    one_thing,
     twins,
 )
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
@@ -38,7 +37,7 @@ from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.measured import ordered
 from grounded.diagnosis.validation.prediction_error import gap_of
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import Effect
+from grounded.effects import Effect, Library
 from grounded.frozen import Array
 
 LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
@@ -225,22 +224,12 @@ class Claims:
 
     def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
         """Return the groups that are equivalent in the model, which no trial can separate."""
-        effects = {e.name: e for e in self.search.candidates}
-        model, found = self.data.model, []
         late = {(one.effect, one.like) for one in self.one_clock}
-        for first, *others in groups:
-            if all((first, other) in late for other in others):
-                found.append((first, *others))
-                continue
-            name = first.removeprefix("parameter:")
-            if first in self.names and all(self._twins(first, other) for other in others):
-                found.append((first, *others))
-            if name == first or name not in model.param_names:
-                continue
-            index = model.param_names.index(name)
-            if all(o in effects and one_thing(self.predictor, index, effects[o]) for o in others):
-                found.append((first, *others))
-        return tuple(found)
+        return tuple(
+            (first, *others)
+            for first, *others in groups
+            if all((first, o) in late for o in others) or all(self._twins(first, o) for o in others)
+        )
 
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
         """Return up to two effects that tie with a claimed one beside all the others, with fits.
@@ -316,11 +305,16 @@ class Claims:
         """
         key = name, other
         if key not in self._same:
-            effects = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
+            every = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
+            one, two = (every.get(n) or self._parameter(n) for n in key)
             free = moving(self.data, self.best.hypothesis)
-            known = bool(free) and {name, other} <= effects.keys()
-            self._same[key] = known and twins(self.predictor, effects[name], effects[other], free)
+            self._same[key] = bool(one and two and twins(self.predictor, one, two, free))
         return self._same[key]
+
+    def _parameter(self, name: str) -> Effect | None:
+        """Return a parameter of the model as an effect; None if it is none."""
+        own = name.removeprefix("parameter:") in self.data.model.params
+        return Library().effect(name, self.data.model) if own else None
 
     def tied(self) -> dict[str, tuple[Fitted, float]]:
         """Return each rival's fit in place of a claimed effect, and its evidence there."""

@@ -86,6 +86,22 @@ def test_what_a_parameter_does_alone_makes_no_two_effects_one_thing():
         assert not twins(Predictor(data), one, other, free)
 
 
+@pytest.mark.parametrize(("law", "same"), [("linear", True), ("quadratic", False)])
+def test_a_gain_and_the_scale_of_a_sensor_are_one_thing_if_all_else_is_linear(law, same):
+    model = Model(
+        name="motor",
+        states={"w": "rad/s"},
+        inputs={"u": "V"},
+        params={"K": Param(2.0, "rad/s^2/V", 0.5, 8.0)},
+        derivative=lambda s, a, p: {"w": p.K * a.u - s.w * (np.abs(s.w) if law != "linear" else 1)},
+    )
+    rng = np.random.default_rng(0)
+    made = [Trial(rng.normal(size=(61, 1)), rng.normal(size=(60, 1)), DT, ("w",), ("u",))]
+    data = prepare(model, made)
+    a, b = (Library().effect(n, model, data.scales) for n in ("parameter:K", "sensor_scale:w"))
+    assert twins(Predictor(data), a, b, []) is twins(Predictor(data), b, a, [0]) is same
+
+
 @pytest.fixture(scope="module")
 def search():
     """The friction alone, beside the time constant."""
