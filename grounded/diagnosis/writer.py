@@ -25,9 +25,8 @@ from grounded.diagnosis.error_report import (
     objection,
     open_noise,
 )
-from grounded.diagnosis.hypotheses.explored import no_limits
+from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import correction
-from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -350,15 +349,16 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
     by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
     names = tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few])
-    i = one.fit.hypothesis.names.index(one.name)
-    anywhere = _anywhere(one.fit.hypothesis.effects[i])
+    h = one.fit.hypothesis
+    i = h.names.index(one.name)
+    anywhere = _anywhere(h.effects[i])
     regions = by_region(acts, claims.predictor, one.fit, 1, but=anywhere)
-    params = claims.estimates(one.fit)[i]
-    if not any(abs(e.value) > SURE * e.std for e in params.values()):
-        return None  # its size is unknown
+    each = claims.estimates(one.fit)
+    if one.name in sizeless(h, np.array([e.std for some in each for e in some.values()])):
+        return None
     return Unconfirmed(
         one.name,
-        params,
+        each[i],
         one.nats,
         names[0],
         (few, data.count),

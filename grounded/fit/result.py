@@ -17,7 +17,6 @@ from grounded.diagnosis.levels import LEAST, NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.choose import Gain
@@ -159,8 +158,7 @@ class Found:
     @cached_property
     def sure(self) -> tuple[Array, Array]:
         """The standard deviation and half-width of the interval of each unknown, (C,) each."""
-        search, folds = self.search, self.search.data.folds
-        found = standard_deviations(search.predictor, self.best, folds, search.tempering.factor)
+        found = self.search.sure(self.best)
         return self.scales * found[0], self.scales * found[1]
 
     @cached_property

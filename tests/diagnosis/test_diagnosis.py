@@ -12,7 +12,7 @@ from grounded.diagnosis.error_report import Credit, Remainder
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.parts import Ranked
-from grounded.diagnosis.validation.by_priors import fewest, still
+from grounded.diagnosis.validation.certainty import fewest, still
 from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.models.pendulum import model as pendulum
 from small_tasks import DT, plain_task, pushed_cart

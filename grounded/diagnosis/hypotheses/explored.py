@@ -26,15 +26,16 @@ from itertools import combinations
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
-from grounded.diagnosis.levels import NATS
+from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
+from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
-from grounded.effects.wrap import SURE
+from grounded.effects.wrap import SURE as USUAL
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array, median, white_noise
 
@@ -47,6 +48,7 @@ class FittedHypotheses:
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
         self._cancelling: dict[object, bool] = {}
+        self._sure: dict[int, tuple[Fitted, tuple[Array, Array]]] = {}
         self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
@@ -117,6 +119,14 @@ class FittedHypotheses:
         bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
         return max(bare, key=self.score)
 
+    def sure(self, fit: Fitted) -> tuple[Array, Array]:
+        """Return each unknown's standard deviation and half-width of its 95 % interval, (C,)."""
+        if id(fit) not in self._sure:
+            worth = self.tempering.factor
+            found = standard_deviations(self.predictor, fit, self.data.folds, worth)
+            self._sure[id(fit)] = fit, found
+        return self._sure[id(fit)][1]
+
     def calibrates(self) -> bool:
         """Check whether calibrating the parameters explains the data better than noise alone."""
         best = self.best_null()
@@ -145,6 +155,22 @@ class FittedHypotheses:
             single = [f for f in self.of_size(1) if parametric(f)]
             chosen = max([chosen, *single[:1]], key=self.score)
         return chosen
+
+
+def sizeless(h: Hypothesis, std: Array) -> list[str]:
+    """Return the effects of which no coefficient is known to differ from zero.
+
+    Of effects without coefficients, their times or thresholds are asked.
+
+    Args:
+        h: the effects with their values.
+        std: standard deviations of its free values, (C,) or more.
+    """
+    return [
+        name
+        for name, own in zip(h.names, h.sizes, strict=True)
+        if own and (np.abs(h.theta[own]) < SURE * std[own]).all()
+    ]
 
 
 def parametric(fit: Fitted) -> bool:
@@ -321,7 +347,7 @@ def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> fl
 
 def _of_change(effect: Effect, values: Mapping[str, float], steps: int) -> float:
     """Return the price of a change of an adopted effect, by the prior of its adopted values."""
-    sizes = {q.name: SURE * q.known for q in effect.free if q.known}
+    sizes = {q.name: USUAL * q.known for q in effect.free if q.known}
     pulls = sum(0.5 * (values.get(name, 0.0) / size) ** 2 for name, size in sizes.items())
     return pulls + 0.25 * len(effect.free) * math.log(max(steps, 2)) + 1.0
 

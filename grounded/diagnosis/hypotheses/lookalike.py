@@ -81,42 +81,10 @@ def lookalikes(
     return tuple(found)
 
 
-def of_parameters(
-    predictor: Predictor,
-    null: Fitted,
-    off: Sequence[int],
-    candidates: Sequence[Effect],
-) -> tuple[Likeness, ...]:
-    """Return the effects that act like the error of a calibrated parameter, best first.
-
-    Each parameter is taken separately, with the others at their calibrated values. For example, a
-    gain of an actuator is equivalent to the parameter that scales it.
-
-    Args:
-        predictor: evaluates hypotheses on the data.
-        null: the calibrated fit without effects.
-        off: indices of the parameters.
-        candidates: effects that may be look-alikes.
-    """
-    assert null.hypothesis.shift is not None
-    model, found = predictor.data.model, list[Likeness]()
-    for index in off:
-        name = f"parameter:{model.param_names[index]}"
-        effect = next((c for c in candidates if c.name == name), None)
-        if effect is None:
-            continue
-        others = null.hypothesis.shift.copy()
-        others[index] = 0.0
-        moved = dict(zip(model.param_names, model.values + others, strict=True))
-        there = Predictor(replace(predictor.data, model=model.with_values(moved)))
-        h = Hypothesis().plus(effect, {"d": float(null.hypothesis.shift[index])})
-        own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
-        found += _likely(there, replace(null, hypothesis=h), effect, own)
-    return tuple(found)
-
-
-def related(one: Effect, other: Effect) -> bool:
+def related(one: Effect | None, other: Effect) -> bool:
     """Check whether one of two families lists the other among its look-alikes."""
+    if one is None:
+        return False
     a, b = one.family, other.family
     return b.name in a.lookalikes or a.name in b.lookalikes
 

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.explored import no_limits, parametric
+from grounded.diagnosis.hypotheses.explored import no_limits, parametric, sizeless
 from grounded.diagnosis.hypotheses.lookalike import (
     moving,
-    of_parameters,
     one_clock,
+    related,
     twins,
 )
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
-from grounded.diagnosis.levels import NATS, SAME, SURE
+from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
-from grounded.diagnosis.likelihood.intervals import NORMAL, standard_deviations
+from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.by_priors import (
+from grounded.diagnosis.validation.certainty import (
     Blame,
     ByPriors,
     Key,
@@ -40,19 +41,9 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.frozen import Array
 
-LEAST_TOLD = 0.1  # standard deviations below which a strength is not listed
 RANKED = 12  # explanations that are listed
 
 Params = dict[str, Estimate]
-
-
-def has_size(effect: Effect, known: Mapping[str, Estimate], least: float = LEAST_TOLD) -> bool:
-    """Check whether the strength of an effect is known: its coefficients, or else thresholds.
-
-    It is if one of them differs from zero by `least` standard deviations.
-    """
-    strengths = [q.name for q in effect.free if not q.grid] or list(known)
-    return not all(abs(known[n].value) < least * known[n].std for n in strengths)
 
 
 def _restated(name: str, other: str, rest: set[str]) -> bool:
@@ -89,14 +80,9 @@ class Claims:
         self.base = search.score(decision.crude if parametric(best) else self.null)
         self.moved = self._known(moved_parameters(search, best, ruler))  # also beside effects
         self.blamed = self.moved if calibrating else ()
-        off = [blame.index for blame in self.blamed[:2]]
-        candidates = search.candidates
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         self.one_clock = one_clock(self.data.model, late, ruler.names, constant_inputs(self.data))
-        self.like_parameters = (
-            of_parameters(self.predictor, self.null, off, candidates) if off else ()
-        )
 
     def _known(self, off: Sequence[Blame]) -> tuple[Blame, ...]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.
@@ -137,7 +123,7 @@ class Claims:
             if f.hypothesis.names[0] not in {*listed, *tied}
             and math.isfinite(self.search.score(f))
             and not no_limits(self.data, f.hypothesis)
-            and has_size(f.hypothesis.effects[0], self.estimates(f)[0])
+            and not sizeless(f.hypothesis, self.search.sure(f)[0])
         )
         for f in islice(likely, max(RANKED - len(rows), 3)):
             rows.append(row(f, f.hypothesis.names[0], self.search.score(f) - self.base))
@@ -155,23 +141,21 @@ class Claims:
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Return the values of each effect with standard deviations and intervals."""
-        stds, halves = self._sure if fit is self.best else self._alone(fit)
-        found, at = [], 0
-        for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
-            some = {}
-            for q in effect.free:
-                v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
-                e = Estimate(v, s, (v - w, v + w), q.unit)
-                some[q.name] = e if e.known else Estimate(v, math.inf, None, q.unit)
-                at += 1
-            found.append(some)
-        return found
+        sure = np.array(self._sure if fit is self.best else self.search.sure(fit)).T.tolist()
+        each = iter(sure)
+        return [
+            {
+                q.name: _estimate(float(v[q.name]), s, w, q.unit)
+                for q, (s, w) in zip(e.free, islice(each, len(e.free)), strict=True)
+            }
+            for e, v in fit.hypothesis.pairs
+        ]
 
     @cached_property
     def _sure(self) -> tuple[Array, Array]:
         """Model-averaged standard deviations and half-widths of the claim's values."""
         keys = [(e.name, q.name) for e in self.best.hypothesis.effects for q in e.free]
-        return self._widened(averaged(self.search, self.best, self.ruler, self._alone), keys)
+        return self._widened(averaged(self.search, self.best, self.ruler), keys)
 
     @cached_property
     def by_priors(self) -> ByPriors:
@@ -190,10 +174,6 @@ class Claims:
             half[i] = max(half[i], NORMAL * self.by_priors.std.get(key, 0.0))
         return std, half
 
-    def _alone(self, fit: Fitted) -> tuple[Array, Array]:
-        b = self.search.tempering.factor
-        return standard_deviations(self.predictor, fit, self.data.folds, b)
-
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return groups of indistinguishable explanations, the claimed one first in each.
 
@@ -202,10 +182,11 @@ class Claims:
         effects that are equivalent or as likely alone.
         """
         found = []
-        for name in dict.fromkeys(one.effect for one in self.like_parameters):
-            same = [o for o in self.like_parameters if o.effect == name and o.share > SAME]
-            if same:
-                found.append((name, *(one.like for one in same[:2])))
+        for blame in self.blamed[:2]:
+            own = f"parameter:{self.data.model.param_names[blame.index]}"
+            related_ = (e.name for e in self.search.candidates if related(self._effect(own), e))
+            if same := [name for name in related_ if self._twins(own, name)]:
+                found.append((own, *same[:2]))
         said = {name for group in found for name in group}
         as_likely = [
             names[0]
@@ -305,16 +286,16 @@ class Claims:
         """
         key = name, other
         if key not in self._same:
-            every = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
-            one, two = (every.get(n) or self._parameter(n) for n in key)
+            one, two = map(self._effect, key)
             free = moving(self.data, self.best.hypothesis)
             self._same[key] = bool(one and two and twins(self.predictor, one, two, free))
         return self._same[key]
 
-    def _parameter(self, name: str) -> Effect | None:
-        """Return a parameter of the model as an effect; None if it is none."""
+    def _effect(self, name: str) -> Effect | None:
+        """Return a candidate, or a parameter of the model as an effect; None if it is neither."""
+        every = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
         own = name.removeprefix("parameter:") in self.data.model.params
-        return Library().effect(name, self.data.model) if own else None
+        return every.get(name) or (Library().effect(name, self.data.model) if own else None)
 
     def tied(self) -> dict[str, tuple[Fitted, float]]:
         """Return each rival's fit in place of a claimed effect, and its evidence there."""
@@ -332,7 +313,7 @@ class Claims:
         late = {
             (one.effect, one.like): Likeness(one.effect, one.like, 1.0) for one in self.one_clock
         }
-        found = {(one.effect, one.like): one for one in self.alike + self.like_parameters}
+        found = {(one.effect, one.like): one for one in self.alike}
         return tuple(one for key, one in (late | found | late).items() if key not in tied)
 
     def parameters(self) -> dict[str, Estimate]:
@@ -341,12 +322,20 @@ class Claims:
         if h.spread == 0 or h.shift is None:
             return {}
         which, scale, k = calibrated(self.data), param_scale(model), len(h.theta)
-        own = tuple(a[k:] * scale[which] for a in self._alone(self.best))
-        stds, halves = self._widened(own, [("", model.param_names[i]) for i in which])
+        own = tuple(a[k:] * scale[which] for a in self.search.sure(self.best))
+        keys = [("", model.param_names[i]) for i in which]
         found = {}
-        for index, std, half in zip(which, stds.tolist(), halves.tolist(), strict=True):
-            value = float(model.values[index] + h.shift[index])
-            name, interval = model.param_names[index], (value - half, value + half)
-            param = model.params[name]
-            found[name] = Estimate(value, std, interval, param.unit, param.stopped(value))
+        for i, (_, name), *sure in zip(which, keys, *self._widened(own, keys), strict=True):
+            param, value, (std, half) = model.params[name], model.values[i] + h.shift[i], sure
+            found[name] = replace(
+                _estimate(float(value), float(std), float(half), param.unit),
+                std=float(std),
+                stopped=param.stopped(float(value)),
+            )
         return found
+
+
+def _estimate(value: float, std: float, half: float, unit: str) -> Estimate:
+    """Return an estimate with its interval; its standard deviation is infinite if unknown."""
+    found = Estimate(value, std, (value - half, value + half), unit)
+    return found if found.known else Estimate(value, math.inf, None, unit)

@@ -23,16 +23,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.error_report import CALIBRATION
-from grounded.diagnosis.hypotheses.explored import no_limits
+from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, swap
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
-from grounded.diagnosis.likelihood.intervals import fisher, standard_deviations
+from grounded.diagnosis.likelihood.intervals import fisher
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.parts import Likeness
-from grounded.diagnosis.validation.by_priors import averaged
+from grounded.diagnosis.validation.certainty import averaged
 from grounded.diagnosis.validation.choose import Choice, Errors, Option, Rule
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
@@ -216,16 +216,11 @@ class Options:
             self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
         return self._known[own]
 
-    def alone(self, fit: Fitted) -> tuple[Array, Array]:
-        """Return the standard deviations and half-widths of a fit's values, by that fit alone."""
-        data, worth = self.search.data, self.search.tempering.factor
-        return standard_deviations(self.search.predictor, fit, data.folds, worth)
-
     def _vague(self, own: frozenset[str]) -> list[str]:
-        """Return the effects of a set that have no size by its own fit."""
+        """Return the effects of a set that have no size by its own fit; parameters have priors."""
         if own not in self._sizeless:
             fit = self.fits[own]
-            self._sizeless[own] = self._of_no_size(fit, self.alone(fit)[0])
+            self._sizeless[own] = self._no_size(fit, self.search.sure(fit)[0])
         return self._sizeless[own]
 
     def vague(self, option: Option) -> list[str]:
@@ -233,21 +228,10 @@ class Options:
         fit = self.fits[option.causes]
         if not fit.hypothesis.effects:
             return []
-        return self._of_no_size(fit, averaged(self.search, fit, self.ruler, self.alone)[0])
+        return self._no_size(fit, averaged(self.search, fit, self.ruler)[0])
 
-    def _of_no_size(self, fit: Fitted, std: Array) -> list[str]:
-        """Return the effects of which no coefficient is known to differ from zero.
-
-        Of effects without coefficients, their times or thresholds are asked. Parameters are exempt,
-        since they have priors.
-        """
-        h = fit.hypothesis
-        return [
-            effect.name
-            for effect, own in zip(h.effects, h.sizes, strict=True)
-            if own and not isinstance(effect.family, ParamFamily)
-            if (np.abs(h.theta[own]) < SURE * std[own]).all()
-        ]
+    def _no_size(self, fit: Fitted, std: Array) -> list[str]:
+        return [n for n in sizeless(fit.hypothesis, std) if n in equations(fit)]
 
     def less(self, option: Option, cause: str) -> Option | None:
         """Return a set without one cause, fitted from the values and the noise of the larger one.

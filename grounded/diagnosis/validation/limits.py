@@ -18,7 +18,7 @@ from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.by_priors import PART, information
+from grounded.diagnosis.validation.certainty import PART, information
 from grounded.effects import (
     Effect,
     InputFamily,

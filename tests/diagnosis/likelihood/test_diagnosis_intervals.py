@@ -12,7 +12,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
-from grounded.diagnosis.validation.by_priors import moved_parameters
+from grounded.diagnosis.validation.certainty import moved_parameters
 from grounded.effects import Library
 
 

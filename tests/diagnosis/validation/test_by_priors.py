@@ -8,7 +8,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.by_priors import by_priors
+from grounded.diagnosis.validation.certainty import by_priors
 from grounded.effects import Library, wrap
 
 DT = 0.05

@@ -17,7 +17,7 @@ would stay where they put it even if one of them were wrong by as many standard 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -135,28 +135,23 @@ def _joined(rest: Mapping[int, set[int]]) -> Sequence[list[int]]:
 
 MOST = 50.0  # most nats by which another fit counts as likelier
 
-Sure = tuple[Array, Array]
 
-
-def averaged(
-    search: FittedHypotheses, fit: Fitted, ruler: Ruler, of: Callable[[Fitted], Sure]
-) -> Sure:
+def averaged(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> tuple[Array, Array]:
     """Return averaged standard deviations and half-widths of 95 % intervals, (C,) each.
 
     Args:
         search: holds all fits of the same effects.
         fit: the claim.
         ruler: excludes fits that predict clearly worse.
-        of: returns both for a single fit.
     """
-    std, half = (np.array(a) for a in of(fit))
+    std, half = (np.array(a) for a in search.sure(fit))
     own, size = _values(fit.hypothesis), len(fit.hypothesis.theta)
     var, wide, whole = std[:size] ** 2, half[:size] ** 2, 1.0
     for other, weight in _rivals(search, fit, ruler):
         theirs = _values(other.hypothesis)
         rows = [theirs[key] for key in own]
         apart = other.hypothesis.theta[rows] - fit.hypothesis.theta
-        s, h = (a[rows] for a in of(other))
+        s, h = (a[rows] for a in search.sure(other))
         var, wide = var + weight * (s**2 + apart**2), wide + weight * (h**2 + (NORMAL * apart) ** 2)
         whole += weight
     std[:size] = np.maximum(std[:size], np.sqrt(var / whole))
