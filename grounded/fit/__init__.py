@@ -7,7 +7,7 @@ notion of what trials identify are those of `grounded.diagnosis`. Read `paramete
 
 from __future__ import annotations
 
-from grounded.fit.parameters import fit, prediction_error
+from grounded.fit.parameters import fit
 from grounded.fit.result import Fit, FittedValue, PredictionError
 
-__all__ = ["Fit", "FittedValue", "PredictionError", "fit", "prediction_error"]
+__all__ = ["Fit", "FittedValue", "PredictionError", "fit"]

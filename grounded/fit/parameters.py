@@ -38,8 +38,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
 from grounded.engine import Engine, running, steady
-from grounded.errors import GroundedError
-from grounded.fit.result import Fit, Found, PredictionError, errors_of, nothing, report
+from grounded.fit.result import Fit, Found, report
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -89,7 +88,7 @@ def fit(
     Raises:
         Interrupted: on Ctrl-C, with the values so far.
         GroundedError: for an unknown or constant parameter, trials that do not match the model, are
-            too short or unusable, or a model with too many states.
+            too short or unusable, or a model that is not finite there or has too many states.
     """
     of_type("model", model, Model, Task)
     logged = list_of([trials] if isinstance(trials, Trial) else trials, Trial, "trials")
@@ -124,31 +123,8 @@ def fit(
         running(engine, copied=not simulated(given)),
     ):
         result = _identified(data, delayed, tick)
-        if isinstance(result, GroundedError):
-            return nothing(given, data, asked, delayed, result)
         tick("predict")
         return report(given, asked, result, looked.findings, share.finding)
-
-
-def prediction_error(
-    model: Model | Task, trials: Sequence[Trial], *, hidden: Sequence[str] = ()
-) -> PredictionError:
-    """Return the open-loop prediction errors of a model on trials, as it is.
-
-    Args:
-        model: n states, m inputs; a `Task` also gives the latency.
-        trials: real trials.
-        hidden: states without a sensor whose start is known.
-
-    Raises:
-        GroundedError: if a trial does not match the model, or the model is not finite there.
-    """
-    with np.errstate(all="ignore"):
-        search = HypothesisSearch(sound_data(model, trials, hidden=hidden)[0], ())
-        found = search.refined([search.fresh(Hypothesis())], TO_THE_TOP)
-        if not found:
-            raise undefined(search.predictor)
-        return errors_of(Ruler(search.predictor), found[0])
 
 
 class Alone(HypothesisSearch):
@@ -159,9 +135,7 @@ class Alone(HypothesisSearch):
         return 0.0
 
 
-def _identified(
-    data: Data, delayed: Mapping[str, tuple[int, ...]], tick: Stages
-) -> Found | GroundedError:
+def _identified(data: Data, delayed: Mapping[str, tuple[int, ...]], tick: Stages) -> Found:
     """Search, holding one after the other what the trials do not identify."""
     given = data.model
     while True:
@@ -169,7 +143,7 @@ def _identified(
         search = Alone(data, late, tick)
         found = _searched(search, late, tick)
         if found is None:
-            return undefined(search.predictor)
+            raise undefined(search.predictor)
         model = held(search.predictor, found, less_noise=1.0)
         if model is not data.model:
             data = replace(data, model=model)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -14,7 +14,6 @@ from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.levels import LEAST, NATS
-from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -22,8 +21,7 @@ from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.choose import Gain
 from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.errors import GroundedError
-from grounded.findings import Finding, Weight
+from grounded.findings import Finding
 from grounded.findings import found as finding
 from grounded.frozen import Array
 from grounded.model import Model
@@ -70,8 +68,8 @@ class Fit(Result):
     params: Mapping[str, FittedValue]
     model: Model  # the model with the fitted values
     latency: Array  # (m,) [s]
-    loglik: float  # minus infinity if nothing was fitted
-    status: str  # converged, still rising or diverged
+    loglik: float
+    status: str  # converged or still rising
     samples: int
     nats: float = 0.0  # log evidence over the values as given
     before: PredictionError | None = None  # of held-out trials; None if none could be held out
@@ -80,7 +78,6 @@ class Fit(Result):
     loss: Gain | None = None
     preflight: tuple[Fault, ...] = ()  # findings about the sensors
     findings: tuple[Finding, ...] = ()  # how it ended, and what the values rest on
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)  # (k, k)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
@@ -212,24 +209,25 @@ def report(
         share: which part of the trials was used; None for all.
     """
     search, best, data = found.search, found.best, found.search.data
-    params, (std, half) = dict[str, FittedValue](), found.sure
+    params = dict[str, FittedValue]()
+    sure = list(zip(*found.sure, strict=True))
     for name in asked:
         param, start = model.params[name], model.params[name].value
         (low, high), k = param.reach, found.at.get(name)
         if k is None:
             params[name] = FittedValue(start, np.inf, low, high, param.unit, False, start)
             continue
-        value, e, w = found.values[name], float(std[k]), float(half[k])
+        value, (e, w) = found.values[name], map(float, sure[k])
         low, high, given = max(low, value - w), min(high, value + w), (*found.told[name].given,)
         params[name] = FittedValue(value, e, low, high, param.unit, True, start, given)
     latency = data.latency.copy()
     for k, (name, inputs) in enumerate(found.delayed.items()):
         q, start = best.hypothesis.effects[k].free[0], float(data.latency[inputs[0]])
-        value, e, w = start + float(best.hypothesis.theta[k]), float(std[k]), float(half[k])
-        sure = e <= UNKNOWN * (q.high - q.low) / np.sqrt(12)
-        low = max(value - w, 0.0) if sure else 0.0
-        high = value + w if sure else start + q.high
-        params[name] = FittedValue(value, e if sure else np.inf, low, high, "s", bool(sure), start)
+        value, (e, w) = start + float(best.hypothesis.theta[k]), map(float, sure[k])
+        ends = max(value - w, 0.0), value + w
+        known = e <= UNKNOWN * (q.high - q.low) / np.sqrt(12)
+        e, ends = (e, ends) if known else (np.inf, (0.0, start + q.high))
+        params[name] = FittedValue(value, e, *ends, "s", known, start)
         latency[list(inputs)] = value
     # held-out errors by the ruler of the diagnosis
     more: dict[str, Any] = {}
@@ -238,12 +236,6 @@ def report(
         ruler.beside(found.crude)
         more |= {"before": errors_of(ruler, found.crude), "after": errors_of(ruler, best)}
         more |= {"gain": ruler.gain(found.crude, best), "loss": ruler.gain(best, found.crude)}
-    covariance, at = np.zeros((len(params), len(params))), [found.at.get(name) for name in params]
-    rows = [k for k, i in enumerate(at) if i is not None]
-    picked = [i for i in at if i is not None]
-    covariance[np.ix_(rows, rows)] = (best.covariance * np.outer(found.scales, found.scales))[
-        np.ix_(picked, picked)
-    ]
     status = "converged" if best.settled else "still rising"
     made = Fit(
         params=params,
@@ -254,33 +246,10 @@ def report(
         samples=int(data.seen[1:].sum()),
         nats=np.inf if found.crude is None else search.score(best) - search.score(found.crude),
         preflight=tuple(findings),
-        covariance=covariance,
         **more,
     )
     told = (*_said(made), *([share] if share else []))
     return replace(made, findings=told)
-
-
-def nothing(
-    model: Model,
-    data: Data,
-    asked: Sequence[str],
-    delayed: Mapping[str, tuple[int, ...]],
-    why: GroundedError,
-) -> Fit:
-    """Return the `Fit` of a search that could not begin: all values as they were."""
-    params = {}
-    for name in asked:
-        p = model.params[name]
-        params[name] = FittedValue(p.value, np.inf, *p.reach, p.unit, False, p.value)
-    for name, inputs in delayed.items():
-        start = float(data.latency[inputs[0]])
-        params[name] = FittedValue(start, np.inf, 0.0, np.inf, "s", False, start)
-    said, samples = (
-        finding("model.fitted", why=str(why), weight=Weight.WARN),
-        int(data.seen[1:].sum()),
-    )
-    return Fit(params, model, data.latency, -np.inf, "diverged", samples, findings=(said,))
 
 
 def _said(found: Fit) -> Iterator[Finding]:

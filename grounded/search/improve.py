@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.checks import list_of, of_type, refused
+from grounded.errors import GroundedError
 from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded.search.candidate import BY_STEP, Candidate, Tried
@@ -176,7 +177,10 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
         )
         for t in whole
     ]
-    found = fit(task, lifted, hidden=memory)
+    try:
+        found = fit(task, lifted, hidden=memory)
+    except GroundedError:  # the model is not finite there, or no trial is long enough
+        return task.model
     return task.model if found.worse else found.model
 
 

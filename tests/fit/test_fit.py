@@ -10,7 +10,7 @@ import pytest
 from facts import holding
 from grounded.diagnosis.validation.choose import Gain
 from grounded.errors import GroundedError
-from grounded.fit import fit, prediction_error
+from grounded.fit import fit
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -130,24 +130,16 @@ def test_a_constant_input_identifies_no_gain_and_no_delay_of_it():
         assert any(name in one.about for one in found.findings if one.code == "model.not_told")
 
 
-def test_prediction_error_falls_to_the_noise_for_the_true_model():
-    trials = simulated(SPRING, 8, ((1e-5, 1e-5), (0.01, 0.05)))
-    error = prediction_error(SPRING, trials)
-    assert np.allclose(error.ahead, (0.01, 0.05), rtol=0.2) and error.horizon_s == 1.0
-    assert np.allclose(error.one_step, (0.01, 0.05), rtol=0.2) and error.windows > 100
-    wrong = prediction_error(SPRING.with_values({"k": 8.0}), trials)
-    assert (wrong.ahead > 3 * error.ahead).all()
-
-
-def test_a_model_that_runs_away_is_a_status():
+def test_a_model_that_runs_away_is_refused():
     model = Model(
         states=dict(SPRING.states),
         inputs=dict(SPRING.inputs),
         params={"k": Param(4.0, "1", std=1.0)},
         derivative=lambda s, a, p: {"x": s.v, "v": a.force * 1e300 * np.exp(1e3 * p.k)},
     )
-    found = fit(model, simulated(SPRING, 9, NOISE, B=1))
-    assert not found.params["k"].identified and not found.helps and not found.worse
+    with pytest.raises(GroundedError) as refused:
+        fit(model, simulated(SPRING, 9, NOISE, B=1))
+    assert refused.value.finding.code == "model.not_finite"
 
 
 def test_misuse_says_what_to_do():

@@ -63,7 +63,6 @@ ENTRIES: dict[str, Entry] = {
     "fitted": Entry(
         "note",
         "[[{settled:yes=converged,no=still rising}, from {samples:sample}]]"
-        "[[nothing was fitted: {why}]]"
         "[[no_better? ; the values before are as likely, or predict held-out trials as well]]",
     ),
     "fit_worse": Entry(

@@ -118,8 +118,6 @@ def fit_in(
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
     fitted = partial(fitted, rows_s=rows * bool(late), interpolated_s=early)
-    if apply and not np.isfinite(found.loglik):
-        raise GroundedError(found.findings[0], then=after_fit(workspace))
     if apply and found.worse:
         raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
