@@ -27,7 +27,7 @@ from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.prediction_error import gap_of, horizon
+from grounded.diagnosis.validation.prediction_error import carried, gap_of
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.frozen import Array
@@ -121,11 +121,10 @@ def oracle(
         each[effect.name] = whole - below
     names = tuple(sorted(known))
     best = next(f for f in search.of_size(len(known)) if tuple(sorted(f.hypothesis.names)) == names)
-    where = horizon(search.predictor, best, 1.0)
-    gap = gap_of(search.predictor, best, where)
     none = search.score(search.best_null())
     rivals = [fitted([len(known) + i]) - none for i in range(len(others))]
     ruler = Ruler(search.predictor)
+    gap = gap_of(ruler, best, carried(ruler, best))
     rms = ruler.errors(best).rms[len(ruler.steps) - 1, ruler.shown]
     errors = dict(zip(ruler.names, map(float, rms), strict=True))
     return Oracle(whole - none, gap, each, max(rivals, default=-np.inf), errors)

@@ -30,7 +30,7 @@ from grounded.accounts.finding import SENSOR_DELAY, Preflight, late_as_positions
 from grounded.accounts.finding import Finding as Fault
 from grounded.accounts.lag import whole_steps
 from grounded.accounts.sound_trials import sound_trials
-from grounded.checks import list_of, of_type, positive, refused, whole_number
+from grounded.checks import list_of, of_type, refused, whole_number
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -76,7 +76,6 @@ class DiagnosisOptions:
         library: the families that may be blamed.
         max_effects: largest number of effects at once, 1 to 12, all of which are searched while
             likely effects remain; None: 3, and one more at a time while that pays.
-        horizon: how far ahead the gap is measured [s].
         hidden: names of states without a sensor, such as the memory of adopted effects.
         but: names of effects that are not blamed, such as adopted ones, whose values are now
             parameters of the model.
@@ -89,12 +88,11 @@ class DiagnosisOptions:
             errors of its model, so that later diagnoses use the same scale as the first.
 
     Raises:
-        GroundedError: if `library`, `max_effects` or `horizon` has another type or is out of range.
+        GroundedError: if `library` or `max_effects` has another type or is out of range.
     """
 
     library: Library = field(default_factory=Library)
     max_effects: int | None = None
-    horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
     one_message: tuple[str, ...] = ()
@@ -106,7 +104,6 @@ class DiagnosisOptions:
         of_type("library", self.library, Library)
         if self.max_effects is not None:
             whole_number("max_effects", self.max_effects, 1, MOST_EFFECTS)
-        positive("horizon", self.horizon)
 
 
 @steady()
@@ -124,7 +121,7 @@ def diagnose(
     Args:
         subject: the task (its latency counts as modelled) or a model.
         trials: real runs with one time step, under any policy.
-        options: library, number of effects, horizon.
+        options: library, number of effects.
         compare: a second group of trials. Both groups are diagnosed together, and `changed` lists
             the values that differ between them.
         engine: workers that fit hypotheses; the result does not depend on their number.
@@ -183,7 +180,6 @@ def diagnose(
             ruler,
             sound.limits,
             (*options.but, *options.delays),
-            options.horizon,
             loop.most,
             tick,
             subject if isinstance(subject, Task) else None,

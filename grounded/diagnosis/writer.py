@@ -51,8 +51,6 @@ from grounded.diagnosis.validation.prediction_error import (
     by_region,
     by_time,
     explained,
-    gap_of,
-    horizon,
 )
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, RateFamily, acting_order, wrapping_order
@@ -76,7 +74,6 @@ class Writer:
         ruler: Ruler,
         known: Limits,
         adopted: Collection[str],
-        ahead: float,
         most: int,
         tick: Callable[[str], None],
         task: Task | None,
@@ -87,7 +84,7 @@ class Writer:
         preflight: Sequence[Fault] = (),
     ) -> None:
         self.decision, self.ruler, self.known = decision, ruler, known
-        self.adopted, self.ahead = adopted, ahead
+        self.adopted = adopted
         self.most, self.tick, self.task, self.trials = most, tick, task, trials
         self.preflight = tuple(preflight)
         self.search, self.best = decision.search, decision.fit
@@ -101,14 +98,12 @@ class Writer:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
         data, predictor = self.data, self.predictor
         self.tick("gap")
-        where = horizon(predictor, self.best, self.ahead)
-        before = gap_of(predictor, self.decision.crude, where)
         gain = explained(predictor, Hypothesis(), self.best)
         if self.left:
             i = data.model.state_names.index(self.left[0].channel)
             gain = gain.copy()
             gain[..., i] += self.left[0].improvement
-        ranking = self.claims.ranking(where, before)
+        ranking = self.claims.ranking(self.measured)
         groups = self.claims.groups()
         same = self.claims.equivalent(groups)
         alike = self.claims.nearly(groups)
@@ -156,10 +151,10 @@ class Writer:
             equivalent=same,
             lookalikes=alike,
             gap=Gap(
-                horizon_s=where.steps * data.dt,
+                horizon_s=self.ruler.steps[-1] * data.dt,
                 unit="noise-normalised rms",
-                before=before,
-                after=gap_of(predictor, self.best, where),
+                before=measured.gap(self.decision.crude),
+                after=measured.gap(self.best),
                 floor=1.0,
                 held_out=self.ruler.held_out,
             ),

@@ -33,7 +33,6 @@ def test_wrong_options_of_a_search(given, facts):
         ({"max_effects": 13}, ("max_effects", "1", "12", "13")),
         ({"max_effects": 0}, ("max_effects", "1", "12", "0")),
         ({"max_effects": "1"}, ("max_effects", "'1'")),
-        ({"horizon": -1.0}, ("horizon", "-1.0")),
         ({"library": ["delay"]}, ("library", "list")),
     ],
 )

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
-from typing import Any
 
 import numpy as np
 
@@ -35,8 +34,7 @@ from grounded.diagnosis.validation.certainty import (
 )
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
-from grounded.diagnosis.validation.measured import ordered
-from grounded.diagnosis.validation.prediction_error import gap_of
+from grounded.diagnosis.validation.measured import Measured, ordered
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.frozen import Array
@@ -99,7 +97,7 @@ class Claims:
             return tuple(off)
         return tuple(one for one in off if sizes[one.index] > SURE)
 
-    def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
+    def ranking(self, measured: Measured) -> tuple[Ranked, ...]:
         """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
 
         def row(fit: Fitted, name: str, evidence: float, of: Params | None = None) -> Ranked:
@@ -107,11 +105,11 @@ class Claims:
             index = h.names.index(name) if of is None else -1
             params = self.estimates(fit)[index] if of is None else of
             fixed = h.effects[index].fixed if of is None else {}
-            gap = after if fit is self.best else gap_of(self.predictor, fit, where)
+            gap = measured.gap(fit)
             shrinkage = 1 - gap / before if before > 0 else 0.0
             return Ranked(name, params, fixed, evidence, gap, shrinkage, claimed)
 
-        after = gap_of(self.predictor, self.best, where)
+        before = measured.gap(measured.decision.crude)
         rows = [row(self.best, n, self.lost[n]) for n in ordered(self.credit, self.names)]
         rows += [row(self.best, *one) for one in self.off()]
         listed = {one.effect for one in rows}

@@ -27,9 +27,8 @@ from grounded.diagnosis.hypotheses.leftover import Leftover, whiteness
 from grounded.diagnosis.levels import ABOVE, CHANCE, FAR, HALF, MANY, WILD
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.validation.ahead import unseen
 from grounded.diagnosis.validation.decide import Decision, plain
-from grounded.diagnosis.validation.prediction_error import by_region, horizon
+from grounded.diagnosis.validation.prediction_error import by_region, carried, gap_of
 from grounded.diagnosis.validation.ruler import Ruler, repeated
 from grounded.frozen import Array
 from grounded.trial import Trial
@@ -61,6 +60,7 @@ class Measured:
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
         self.is_white = not self.left and min(told, default=0.0) * len(told) > CHANCE
+        self.carried = carried(ruler, self.best)
         self.floor, self.source = self.noise_floor()  # sets `unsure`, std of its log, (K, 1)
         self.at_most = self.source == "short horizon" and not self.is_white
 
@@ -101,13 +101,13 @@ class Measured:
             source = AT_MOST
         off = [self.data.model.state_names.index(left.channel) for left in self.left]
         if scatter is None:
-            found, source = self.carried(self.best), "short horizon"
+            found, source = self.carried.copy(), "short horizon"
             if off:
-                found[:, off] = self.carried(plain(self.search, self.best))[:, off]
+                found[:, off] = carried(self.ruler, plain(self.search, self.best))[:, off]
         else:
             found, self.unsure = scatter[0], scatter[1][:, None]
             if off:  # both are bounds then, and the smaller one holds
-                own = self.carried(plain(self.search, self.best))[:, off]
+                own = carried(self.ruler, plain(self.search, self.best))[:, off]
                 less, place = own < found[:, off], [self.ruler.shown.index(i) for i in off]
                 found[:, off] = np.where(less, own, found[:, off])
                 self.unsure = np.repeat(self.unsure, len(self.units), axis=1)
@@ -139,16 +139,9 @@ class Measured:
         found = whiteness(self.best, seen)
         return {n: found[str(i)] for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
-    def carried(self, fit: Fitted) -> Array:
-        """Return the one-step noise propagated to each horizon, (K, n); NaN for whole trials."""
-        first, of = unseen(self.predictor, fit.hypothesis), {}
-        for steps in {*self.ruler.steps, *first.tolist()}:
-            w = horizon(self.predictor, fit, steps * self.data.dt)
-            seen = self.data.seen[w.at + w.steps, w.run] > 0
-            of[steps] = root_mean_square(np.where(seen, w.spread, np.nan))
-        each = [np.maximum(steps, first) for steps in self.ruler.steps]
-        rows = [[of[int(k)][i] for i, k in enumerate(at)] for at in each]
-        return np.array([*rows, np.full(len(first), np.nan)])
+    def gap(self, fit: Fitted) -> float:
+        """Return the gap that a fit leaves, relative to the noise of the decision."""
+        return gap_of(self.ruler, fit, self.carried)
 
     def prediction_error(self) -> tuple[RulerRow, ...]:
         """Return the table of prediction errors at 0.1, 0.5, 1 s and over the whole trial."""
@@ -295,13 +288,6 @@ class Measured:
         regions = by_region(size, self.predictor, self.best, 1)
         region = regions[0] if regions else None
         return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
-
-
-def root_mean_square(error: Any) -> Any:
-    """Return the rms along the first axis, NaN for a state that was never measured."""
-    count = np.isfinite(error).sum(axis=0)
-    total = np.nansum(error**2, axis=0)
-    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
 def losses(ruler: Ruler, decision: Decision) -> dict[str, float]:

@@ -1,7 +1,6 @@
 """Where the gap is: prediction errors relative to noise, by channel, time and region.
 
-Predictions start at the filtered state and run open loop with the recorded commands. Their errors
-after a second are divided by the standard deviation that noise alone would cause (the filter's
+The errors of the ruler's longest horizon are divided by what noise alone would cause (the filter's
 covariance, propagated): 1.0 is the floor, anything above it could be explained. The gain of the
 best hypothesis, or of a flexible regression, is broken down by channel, by time and by region. A
 region is a half-space of one state or input with a large share of the gain in little of the time.
@@ -11,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,54 +23,52 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ahead import by_fold, missed
+from grounded.diagnosis.validation.ahead import unseen
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.filter import kalman
 from grounded.frozen import Array
 
 MOST_STARTS = 400
 
 
-@dataclass(frozen=True, eq=False)
-class Horizon:
-    """Predictions over one horizon: their starts, and the errors that noise alone causes.
+def carried(ruler: Ruler, fit: Fitted) -> Array:
+    """Return the rms error of noise alone by horizon, (K, n); NaN for whole trials.
 
-    at: (M,) step within the run; run: (M,); spread: (M, n) standard deviation from noise alone.
+    The one-step noise is propagated by the model. No log is predicted before it shows anything new
+    (`unseen`).
     """
-
-    steps: int
-    at: Any
-    run: Any
-    spread: Array
-
-
-def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
-    """Choose starting points in all runs and compute the noise floor of their predictions.
-
-    Args:
-        predictor: evaluates hypotheses on the data.
-        fit: the best hypothesis, whose noise gives the floor.
-        seconds: the horizon; shorter if the runs are.
-    """
-    data = predictor.data
-    B = len(data.valid)
-    lengths = data.valid.sum(axis=1).astype(int)
-    longest = max(int(np.median(lengths)) - 2, 1)
-    steps = max(1, round(min(seconds / data.dt, longest)))
-    pairs = [(t, b) for b in range(B) for t in range(data.begin[b], lengths[b] - steps + 1)]
-    if not pairs:
-        steps = max(1, int(lengths.max()) - 2)
-        pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)] or [(0, 0)]
-    stride = max(1, len(pairs) // MOST_STARTS)
-    at, run = np.array(pairs[::stride]).T
-    return Horizon(steps, at, run, _spread(predictor, fit, at, run, steps))
+    first = unseen(ruler.predictor, fit.hypothesis)
+    ahead = {*ruler.steps, *first.tolist()}
+    of = {steps: _noise_ahead(ruler.predictor, fit, steps) for steps in ahead}
+    each = [np.maximum(steps, first) for steps in ruler.steps]
+    rows = [[of[int(k)][i] for i, k in enumerate(at)] for at in each]
+    return np.array([*rows, np.full(len(first), np.nan)])
 
 
-def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) -> Array:
-    """Return the standard deviation of the log from noise alone, `steps` ahead of (M,), (M, n).
+def gap_of(ruler: Ruler, fit: Fitted, noise: Array) -> float:
+    """Return the held-out gap that a fit leaves at the longest horizon, relative to `carried`."""
+    shown, last = ruler.shown, len(ruler.steps) - 1
+    return float(np.sqrt(np.nanmean((ruler.errors(fit).rms / noise)[last, shown] ** 2)))
+
+
+def _noise_ahead(predictor: Predictor, fit: Fitted, steps: int) -> Array:
+    """Return the rms error of the log from noise alone some steps ahead, by state (n,).
 
     Outliers are included, because the errors compared with it contain them.
     """
-    data, fit = predictor.data, replace(fit, noise=fit.noise.plain)
+    # moments of all runs; a shorter horizon if no run is as long
+    data = predictor.data
+    lengths = data.valid.sum(axis=1).astype(int)
+    steps = max(1, min(steps, int(np.median(lengths)) - 2))
+    pairs = [(t, b) for b, end in enumerate(lengths) for t in range(data.begin[b], end - steps + 1)]
+    if not pairs:
+        steps = max(1, int(lengths.max()) - 2)
+        pairs = [(t, b) for b, end in enumerate(lengths) for t in range(1, end - steps + 1)]
+    pairs = pairs or [(0, 0)]
+    at, run = np.array(pairs[:: max(1, len(pairs) // MOST_STARTS)]).T
+
+    # the filter's covariance there, and ahead
+    fit = replace(fit, noise=fit.noise.plain)
     noise = fit.noise
     (L, B), n = data.time.shape, data.model.n
     g, delays = filter_of(predictor, fit, covariances=True), delays_of(fit.hypothesis, data)
@@ -93,28 +90,10 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
     variance = np.einsum("bii->bi", P[:, :n, :n]).copy()
     for i, of_late in found.items():
         variance[:, i] = of_late
-    return np.asarray(np.sqrt(variance + R[at + steps, run]))
-
-
-def errors(predictor: Predictor, fit: Fitted, where: Horizon) -> Array:
-    """Return the errors of each fold of the trials with values from the others, (M, n).
-
-    They are measurements minus predictions at the horizon; NaN where not measured.
-    """
-    each, of_run = by_fold(predictor.data, fit)
-    at, run = where.at, where.run
-    off = missed(predictor, each, of_run[run], fit.states, at, run, where.steps)
-    return np.asarray(off[-1])
-
-
-def gap_of(predictor: Predictor, fit: Fitted, where: Horizon) -> float:
-    """Return the held-out gap that a fit leaves, from its own filtered states."""
-    return normalised(errors(predictor, fit, where), where)
-
-
-def normalised(error: Array, where: Horizon) -> float:
-    """Return the rms of errors relative to those from noise alone."""
-    return float(np.sqrt(np.nanmean((error / where.spread) ** 2)))
+    variance += R[at + steps, run]
+    count = (seen := data.seen[at + steps, run] > 0).sum(axis=0)
+    mean = np.where(seen, variance, 0.0).sum(axis=0) / np.maximum(count, 1)
+    return np.where(count > 0, np.sqrt(mean), np.nan)
 
 
 def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:

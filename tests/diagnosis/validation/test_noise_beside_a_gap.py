@@ -35,7 +35,7 @@ def measuring(left):
         flexible={},
         units={"x": "m", "u": "m/s"},
         ruler=ruler,
-        carried=lambda fit: CARRIED.copy(),
+        carried=CARRIED,
         sensors=lambda: np.zeros(2),
     )
 
@@ -44,6 +44,7 @@ def measuring(left):
 def test_the_smaller_bound_is_the_noise_of_a_state_with_a_gap(monkeypatch, left):
     """Repeats that begin apart scatter by what the model misses in each as well."""
     monkeypatch.setattr(measured, "repeated", lambda *_: [[0, 1]])
+    monkeypatch.setattr(measured, "carried", lambda *_: CARRIED.copy())
     monkeypatch.setattr(measured, "plain", lambda *_: None)
     found = measuring(left)
     floor, source = Measured.noise_floor(found)
