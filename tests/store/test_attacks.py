@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from benchmarks.attacks import ATTACKS
+from benchmarks.attack import ATTACKS
 
 
 @pytest.mark.slow

@@ -203,32 +203,3 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "Python objects": lambda: _with(past=_claims("(1,)", "|O")),
     "30,000 parts": _many_parts,
 }
-
-
-def mutated(rng: random.Random) -> bytes:
-    """Return an exported policy with one or two arrays replaced."""
-    kinds = ("f8", "f4", "i1", "c16", "U3", "?", "M8[s]", "f8")
-    fields = arrays(2, 1, rng, feedback=rng.random() < 0.7)
-    for _ in range(rng.randint(1, 2)):
-        name = rng.choice(sorted(fields))
-        was, how = np.asarray(fields[name]), rng.randrange(5)
-        if how == 0:
-            shape = tuple(rng.randint(0, 3) for _ in range(rng.randint(0, 3)))
-            fields[name] = np.zeros(shape, rng.choice(kinds))
-        elif how == 1 and was.dtype.kind == "f" and was.size:
-            odd = np.array(was, float)
-            odd.flat[rng.randrange(odd.size)] = rng.choice((np.nan, np.inf, -np.inf, 1e308, 5e-324))
-            fields[name] = odd
-        elif how == 2:
-            fields[name] = _claims(
-                "(%d, %d)" % (rng.randrange(-1, 10**12), rng.randint(0, 9)),
-                rng.choice(("<f8", "|O", "<U9", "|V99", ">i4", "<c16", "|b1")),
-            )
-        elif how == 3:
-            del fields[name]
-        else:
-            fields[name] = np.repeat(was.reshape(-1)[:1], rng.choice((0, 1, 2, 999)))
-    data = bytearray(_with(**fields))
-    if rng.random() < 0.3:
-        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    return bytes(data)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
-
-from workspaces import MODEL, REAL
-
 DEEDS = {
     "prints": 'print("printed")',
     "writes to stdout": 'import os; os.write(1, b"written\\n")',
@@ -51,10 +47,3 @@ def _opaque(text: str, deed: str) -> str:
 
 
 PLACES = {"import": _at_import, "call": _at_call, "black box": _opaque}
-KINDS = [  # (what, files of the workspace, whether commands may succeed)
-    (f"{file} {deed} at {place}", {file: PLACES[place](text, code)}, number < HARMLESS)
-    for (file, text), place, (number, (deed, code)) in product(
-        (("model", MODEL), ("real", REAL)), PLACES, enumerate(DEEDS.items())
-    )
-]
-COMMANDS = (("propose",), ("run",), ("status",))
