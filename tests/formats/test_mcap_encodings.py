@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,7 +14,6 @@ import pytest
 from facts import holding
 from grounded_trials.formats.bad import BadMessage, BadPath, BadSchema
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
-from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import (
     Array,
@@ -29,8 +27,7 @@ from grounded_trials.formats.messages import (
 )
 from grounded_trials.formats.path_walk import bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
-from grounded_trials.formats.schemas import parse_protobuf, parse_ros
-from pace import slowness
+from grounded_trials.formats.schemas import parse_idl, parse_protobuf, parse_ros
 from path_reference import follow
 
 Root = Callable[[bytes, Any, Any], Node]
@@ -213,25 +210,24 @@ IDL = """
 module robot { module msg {
   const unsigned long SIZE = 3;
   typedef double triple[SIZE];
-  typedef sequence<triple, 4> triples;
   enum Gear { REVERSE, NEUTRAL, FORWARD };
   module State_Constants { const string<9> NAME = "a;b"; };
   struct Empty { uint8 structure_needs_at_least_one_member; };
   @verbatim (language="comment", text= "a (long) text" "in parts")
-  struct State : robot::msg::Base {
+  struct State {
+    long first;
     @key @unit(value="m/s")
     double speed;
-    octet flags, more[2][2];
+    octet flags, more[4];
     Gear gear;
     Empty none;
     unsigned long long count; long long offset; unsigned short u; short s;
     string<22> name;
     sequence<Vector3> points;
-    triples rows;
+    triple row;
     boolean ok; /* the
     last */
   };
-  struct Base { long first; };
 }; };
 ================================================================================
 IDL: robot/msg/Vector3
@@ -244,9 +240,8 @@ def test_idl_definitions_are_the_same_types_as_ros_ones() -> None:
     texts = {
         "x/msg/T0": "int32 first\nfloat64 speed\nuint8 flags\nuint8[4] more\nuint32 gear\n"
         "E none\nuint64 count\nint64 offset\nuint16 u\nint16 s\nstring name\nV[] points\n"
-        "R[] rows\nbool ok\n",
+        "float64[3] row\nbool ok\n",
         "x/msg/E": "",
-        "x/msg/R": "float64[3] v\n",
         "x/msg/V": "float64 x\nfloat64 y\nfloat32 z\n",
     }
     store = typesys.get_typestore(typesys.Stores.EMPTY)
@@ -260,14 +255,21 @@ def test_idl_definitions_are_the_same_types_as_ros_ones() -> None:
     objects = [random_value(ros, rng, make) for _ in range(20)]
     messages = [bytes(store.serialize_cdr(o, "x/msg/T0")) for o in objects]
     idl = parse_idl(IDL, "robot/msg/State")
-    for path in ("first", "speed", "gear", "count", "offset", "u", "s", "ok", "points[:].z"):
+    for path in (
+        "first",
+        "speed",
+        "gear",
+        "count",
+        "offset",
+        "u",
+        "s",
+        "ok",
+        "points[:].z",
+        "row[2]",
+    ):
         wanted = found(messages, ros, partial(decode, cdr_messages, ros), f"/t.{path}")
         mine = found(messages, idl, partial(decode, cdr_messages, idl), f"/t.{path}")
         assert mine == wanted and any(wanted), path
-    for of_ros, of_idl in (("rows[:].v[2]", "rows[:][2]"), ("more[2]", "more[1][0]")):
-        wanted = found(messages, ros, partial(decode, cdr_messages, ros), f"/t.{of_ros}")
-        mine = found(messages, idl, partial(decode, cdr_messages, idl), f"/t.{of_idl}")
-        assert mine == wanted and any(wanted), of_idl
 
 
 def test_idl_definitions_that_can_not_be_read() -> None:
@@ -275,6 +277,9 @@ def test_idl_definitions_that_can_not_be_read() -> None:
         ("module a { union U switch(long) { case 1: long x; }; };", "union"),
         ("struct M { Missing a; };", "Missing"),
         ("struct M { M a; };", "nested"),
+        ("struct M { sequence<sequence<double>> a; };", "sequence"),
+        ("struct M : B { double a; };", "struct M"),
+        ("struct M { double a[2][2]; };", r"\]\["),
         ("struct M { @optional double a; };", "@optional"),
         ("struct M { double a[999999999]; };", "999999999"),
         ("struct M { long double a; };", "long"),
@@ -284,29 +289,6 @@ def test_idl_definitions_that_can_not_be_read() -> None:
     ):
         with pytest.raises(BadSchema, match=says):
             parse_idl(bad, "M")
-
-
-MEGABYTE = 10**6
-HOSTILE = {
-    "texts that do not end": '"\\\\' * (MEGABYTE // 2),
-    "comments that do not end": "/*a" * (MEGABYTE // 3),
-    "nothing but line ends": "\n" * MEGABYTE,
-    "a separator and line ends": "===\n" + "\n" * MEGABYTE,
-    "sequences in sequences": "struct M {" + "sequence<" * (MEGABYTE // 9),
-    "arrays of arrays": "struct M {double a" + "[9]" * (MEGABYTE // 3) + ";};",
-    "modules in modules": "module a {" * (MEGABYTE // 10),
-    "constants by constants": "const long A0=1;"
-    + "".join(f"const long A{i}=A{i - 1};" for i in range(1, 30_000))
-    + "struct M {double a[A29999];};",
-}
-
-
-@pytest.mark.parametrize("what", HOSTILE)
-def test_a_hostile_idl_definition_takes_no_longer_than_it_is_long(what: str) -> None:
-    start = time.process_time()
-    with pytest.raises(BadSchema):
-        parse_idl(HOSTILE[what], "M")
-    assert time.process_time() - start < 10 * slowness()
 
 
 @pytest.mark.parametrize("seed", range(50))

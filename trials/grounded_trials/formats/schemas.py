@@ -1,4 +1,4 @@
-"""Parse definitions of message types (protobuf, ros1msg, ros2msg; IDL is in `idl_schema`).
+"""Parse definitions of message types: protobuf, ros1msg, ros2msg, ros2idl, omgidl.
 
 A protobuf definition is a FileDescriptorSet, itself encoded in protobuf, which Google's library
 reads. Those that grounded writes are recognised without it, since importing it takes longer than
@@ -9,9 +9,11 @@ each after a line of '=' and a line "MSG: package/Type". A line is "type name [d
 "type NAME=value" for a constant, which is not sent. Service events ("..._Event") are defined as
 the service's request and response with '---' between them; the message has an info and both.
 
-The parsers of rosbags (0.11.9) are not used: they refuse service events, Windows line ends,
-constants in lower case, and IDL with several files, base types or nested arrays. They take 20 to 40
-times as long, and more than 20 s for 25 nested sequences, a text of 230 bytes.
+The parser of rosbags (0.11.9) for ROS definitions is not used: it refuses service events, Windows
+line ends and constants in lower case, and takes 20 to 40 times as long. That for IDL is. With
+ros2idl several files follow each other, each after a line of '=' and a line "IDL: package/Type".
+What it would pass over without a word is refused here: optional members, base types, unions, maps;
+so are lists in lists, with which it takes seconds for a line.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from grounded_trials.formats.bad import BadSchema
-from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.messages import (
@@ -154,6 +155,79 @@ def _default(kind: Type, text: str) -> float:
         return float(text)
     except ValueError:  # an enum's name; its number would need the enum's definition
         return 0.0
+
+
+_IDL_FILE = re.compile(r"^={3,}[^\S\n]*\nIDL:[^\n]*$", re.MULTILINE)
+_UNREAD = re.compile(
+    r'//[^\n]*|/\*.*?(?:\*/|\Z)|"(?:[^"\\\n]|\\.)*"', re.DOTALL
+)  # comments and texts
+_NOT_PLAIN = re.compile(
+    r"@(?:optional|mutable)|\b(?:union|map|bitset|bitmask|any|interface|valuetype|long double)\b"
+    r"|\bstruct\s+\w+\s*:|(?:sequence\s*<\s*){2}|\]\s*\[|(?:\bmodule\s+\w+\s*\{\s*){16}"
+)
+_DIRECTIVE = re.compile(r"^[^\S\n]*#[^\n]*$", re.MULTILINE)
+_ENUM = re.compile(r"\benum\s+(\w+)")
+IDL_LIMIT = 2**18  # characters of an IDL definition
+
+
+def parse_idl(text: str, name: str) -> Struct:
+    """Return the message type `name` (with / or :: between its parts) of an IDL text.
+
+    Raises:
+        BadSchema: if the text is damaged, or uses an unsupported feature.
+    """
+    from rosbags.typesys import TypesysError, get_types_from_idl
+
+    text = _DIRECTIVE.sub("", text)
+    bare = _UNREAD.sub(" ", text[:IDL_LIMIT])
+    if len(text) > IDL_LIMIT or (refused := _NOT_PLAIN.search(bare)):
+        at = refused[0] if len(text) <= IDL_LIMIT and refused else f"{len(text)} characters"
+        raise BadSchema("decode", what="definition", why="refused", at=at[:40])
+    structs: dict[str, Any] = {}
+    try:
+        for part in _IDL_FILE.split(text):
+            structs |= get_types_from_idl(part) if part.strip() else {}
+    except (TypesysError, RecursionError, AssertionError, ValueError, LookupError) as error:
+        at = " ".join(str(error).split())[:80]
+        raise BadSchema("decode", what="definition", why="damaged", at=at) from None
+    types = _IdlTypes(structs, {*_ENUM.findall(bare)})
+    return types.struct(name.replace("::", "/"), 0)
+
+
+class _IdlTypes:
+    """Builds each message type of rosbags' descriptions once; an enum is a number."""
+
+    def __init__(self, structs: dict[str, Any], enums: set[str]) -> None:
+        self.structs, self.enums = structs, enums
+        self.built: dict[str, Struct] = {}
+
+    def struct(self, name: str, depth: int) -> Struct:
+        if name not in self.built:
+            if depth > DEPTH_LIMIT or name not in self.structs:
+                why = "nested" if name in self.structs else "lacks"
+                raise BadSchema("decode", what="definition", why=why, at=name[:80])
+            fields = [Field(key, self.type(one, depth)) for key, one in self.structs[name][1]]
+            # ROS gives a struct without members a dummy member of one byte.
+            fields = [f for f in fields if f.name != "structure_needs_at_least_one_member"]
+            self.built[name] = Struct(name, tuple(fields))
+        return self.built[name]
+
+    def type(self, described: Any, depth: int) -> Type:
+        kind, inner = described[0].name, described[1]
+        if kind in ("ARRAY", "SEQUENCE"):
+            item, count = inner
+            if not 0 <= count <= COUNT_LIMIT:
+                raise BadSchema("decode", what="definition", why="long", at=str(count)[:20])
+            return Array(self.type(item, depth), count if kind == "ARRAY" else None)
+        if kind == "BASE":
+            named = NUMBERS | {"octet": Number("u1"), "byte": Number("u1")}
+            texts = {"string": Text(1), "wstring": Text(0)}
+            if (found := (named | texts).get(inner[0])) is None:
+                raise BadSchema("decode", what="definition", why="refused", at=inner[0])
+            return found
+        if inner not in self.structs and inner.rpartition("/")[2] in self.enums:
+            return Number("u4")
+        return self.struct(inner, depth + 1)
 
 
 _FIELD = re.compile(
