@@ -89,9 +89,11 @@ def pair(seed: int) -> tuple[str, str]:
         found = [
             w.compare(*(folder / f"{n}.yaml" for n in both)) for both in (order, ["right", "near"])
         ]
-        for one in found[0].numbers:
-            print(f"  {one.name}: {' / '.join(one.values)}, better: {Path(one.better).stem or '-'}")
-    return Path(found[0].better).stem or "undecided", Path(found[1].better).stem or "undecided"
+        for name, one in found[0].numbers.items():
+            values = " / ".join(one.values or ())
+            print(f"  {name}: {values}, better: {Path(one.better or '-').stem}")
+    first, second = (Path(one.better or "undecided").stem for one in found)
+    return first, second
 
 
 def main() -> None:

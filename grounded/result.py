@@ -157,6 +157,9 @@ def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
     return with_unit(text, unit)
 
 
+UNSAID: Mapping[str, Any] = {"key": ""}  # metadata of a field that is not written to JSON
+
+
 class Result:
     """Base class of results (frozen dataclasses with `repr=False`), with display in notebooks."""
 
@@ -198,7 +201,7 @@ def document(**values: Any) -> dict[str, Any]:
     return {key: plain(value) for key, value in values.items()}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Document(Result):
     """Base class of frozen dataclasses that are written to JSON field by field and read back.
 

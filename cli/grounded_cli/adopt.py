@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from grounded_trials import Workspace
-    from grounded_trials.workspace.adopting import Rewritten
+    from grounded_trials.workspace.adoption import Moved
 
 DIGITS = 4  # of a parameter, at least
 
@@ -63,7 +63,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     show(f"\n{next_line(done.then)}")
 
 
-def _rewritten(changes: Sequence[Rewritten]) -> None:
+def _rewritten(changes: Sequence[Moved]) -> None:
     """List quantities of effects that stay in the model, with their old and new values."""
     width = max(LABEL, *(len(one.called) for one in changes))
     for new in changes:

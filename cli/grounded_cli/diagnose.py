@@ -119,7 +119,8 @@ def command(
         show_json(found.to_json())
     else:
         _show(found, workspace.base_model.inputs, details=details)
-        show("\n" + field("next trial", found.next_trial))
+        before = found.then is not None and found.then.verb in ("adopt", "fit", "discard")
+        show("\n" + field("then" if before else "next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent
             from grounded_trials.workspace.candidates.trust import extent_of
@@ -139,13 +140,16 @@ def _models(found: Compared) -> None:
     for one in others:
         show(field("open", one.sentence))
     rows = [
-        (name, *(figure(e) for e in both), found.channels[name] or "undecided")
-        for name, both in found.errors.items()
+        (name, *map(figure, one.errors or ()), one.better or "undecided")
+        for name, one in found.where.items()
     ]
-    show("\n" + table(rows, (f"rms {found.ahead_s:g} s ahead", *found.labels, "better")))
+    show("\n" + table(rows, (f"rms {found.ahead_s:g} s ahead", *found.models, "better")))
     if found.numbers:
-        told = [(one.name, *one.values, one.better or "undecided") for one in found.numbers]
-        show("\n" + table(told, ("number", *found.labels, "better")))
+        told = [
+            (name, *(one.values or ()), one.better or "undecided")
+            for name, one in found.numbers.items()
+        ]
+        show("\n" + table(told, ("number", *found.models, "better")))
 
 
 def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:

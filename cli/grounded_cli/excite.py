@@ -28,23 +28,20 @@ def command(seconds: float | None, json_: bool) -> None:
     if json_:
         show_json(made.to_json())
         return
-    drive = made.drive
-    long = drive.policy.horizon * drive.policy.dt
-    slow, quick = (cycles / long for cycles in drive.cycles)
-    held = ", with feedback" if drive.policy.gain is not None else ""
-    show(f"Run {made.candidate.id}: {made.file}")
-    what = (
-        f"{long:g} s, {drive.pattern} of {slow:.2g} to {quick:.2g} Hz, {drive.size:.0%} of limits"
-    )
-    show(field("what", what + held, "  "))
-    for name, values in zip(drive.run.state_names, drive.run.states.T, strict=True):
-        unit = made.candidate.units.get(name)
+    slow, quick = made.frequencies_hz
+    held = ", with feedback" * made.feedback
+    show(f"Run {made.candidate}: {made.file}")
+    what = f"{made.seconds:g} s, {made.pattern} of {slow:.2g} to {quick:.2g} Hz"
+    show(field("what", f"{what}, {made.size:.0%} of limits{held}", "  "))
+    run, units = made.drive.run, workspace.base_model.states
+    for name, values in zip(run.state_names, run.states.T, strict=True):
+        unit = units.get(name)
         if unit is not None:
             span = f"{number(values.min())} to {number(values.max())}"
             show(field(name, with_unit(span, unit), "  "))
     rows = [
-        [name, with_unit(number(prior.value), prior.unit), number(prior.std), number(after)]
-        for name, (prior, after) in made.known.items()
+        [name, with_unit(number(p["value"]), p["unit"]), number(p["std"]), number(p["std_after"])]
+        for name, p in made.parameters.items()
     ]
     show("\n" + table(rows, ["parameter", "value", "+- now", "+- after"]))
     show(f"\n{next_line(made.then)}")

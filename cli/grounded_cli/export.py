@@ -84,7 +84,7 @@ def command(
     if form is not None and named in FORMATS and named != form:
         raise misuse(f"-o {output}", f"--format {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
-    tell((*done.overridden, *done.findings), all_=True)
+    tell(done.findings, all_=True)
     if json_:
         show_json(done.to_json())
     else:
@@ -92,8 +92,8 @@ def command(
         if done.runner is not None:
             show(field("runner", str(done.runner)))
             then = NextCommand("next", ("LOG", *done.named))
-            tell([found("search.to_robot", done.candidate, ended=done.ended)], all_=True)
-            show(next_line(NextCommand("report", ("--html",)) if done.ended else then))
+            tell([found("search.to_robot", done.candidate, ended=done.search_ended)], all_=True)
+            show(next_line(NextCommand("report", ("--html",)) if done.search_ended else then))
 
 
 def _model(output: str | None, json_: bool) -> None:
@@ -103,14 +103,17 @@ def _model(output: str | None, json_: bool) -> None:
     if json_:
         return show_json(done.to_json())
     show(f"the model is written to {', '.join(map(str, (done.file, *done.others)))}")
-    rows = [(one.name, f"{one.was:g}", one.now.text) for one in done.values]
+    rows = [(name, f"{one.was:g}", one.text) for name, one in done.values.items()]
     show("\n" + table(rows, ("", "was", "now")) if rows else "  unchanged")
 
 
 def _library(file: str, actuator: str | None, json_: bool) -> None:
     """Write an actuator, and tell what is known of it."""
+    from grounded.diagnosis.parts import Estimate
+
     done = open_workspace().export_actuator(file, actuator)
     if json_:
         return show_json(done.to_json())
     show(f"{done.actuator} is written to {done.file}\n")
-    show(table([(key, one.text) for key, one in done.values.items()], ("number", "value")))
+    values = ((key, Estimate(**one).text) for key, one in done.values.items())
+    show(table([*values], ("number", "value")))

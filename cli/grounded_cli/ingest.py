@@ -118,7 +118,8 @@ def following(log: str, candidate: str | None, details: bool, json_: bool) -> No
     show("")
     tell_proposed(done.proposed, last=done.exported is None)
     if done.exported is not None:
-        show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
+        files = filter(None, (done.exported.file, done.exported.runner))
+        show(field("files", ", ".join(map(str, files)), "  "))
         then = next_line(NextCommand("next", ("LOG",)))
         tell([found("search.to_robot", done.exported.candidate)], all_=True)
         show(then)

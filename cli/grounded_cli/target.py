@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from grounded.result import listed
 from grounded_cli.console.options import as_json, misuse, values_by_name
@@ -16,6 +17,16 @@ from grounded_trials.wording import extent, with_unit
 
 if TYPE_CHECKING:
     from grounded_trials.starting.drawing import Drawn
+
+
+PATHS = ("line", "circle", "figure-8")
+OF_SHAPES = {  # the shapes that an option is for
+    **dict.fromkeys(("size", "speed", "accel", "hold"), PATHS),
+    **dict.fromkeys(("lateral", "laps"), PATHS[1:]),
+    "seconds": ("line", "step", "swing-up"),
+    "to": (*PATHS, "step", "swing-up"),
+    "at_rest": PATHS[:1],
+}
 
 
 @click.command("target")
@@ -88,12 +99,15 @@ def command(
     from grounded_trials.starting.drawing import Manoeuvre
     from grounded_trials.starting.shapes import Drive
 
+    context = click.get_current_context()
+    for name in OF_SHAPES:
+        given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+        if given and shape not in OF_SHAPES[name]:
+            raise misuse(" | ".join(OF_SHAPES[name]), f"--{name.removeprefix('at_')}", how="first")
     paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
     drive = Drive(size=size, lateral=lateral, laps=laps, hold=hold, **paces)
     if shape == "line" and seconds is not None and len(paces) > 1:
         raise misuse("--seconds", "--speed with --accel")
-    if at_rest and shape != "line":
-        raise misuse("line", "--rest", how="first")
     asked = Manoeuvre(shape, drive, values_by_name(to, "--to"), seconds, paces, at_rest)
     drawn = open_workspace().draw(asked)
     if json_:

@@ -205,6 +205,7 @@ class Made(Document):
     named: tuple[str, ...] = ()  # trials named by the user, if not all were used
     compared: tuple[str, ...] = ()  # the second group
     without: tuple[str, ...] = ()  # families that were excluded
+    model: str = field(metadata=BRIEF, default="")  # fingerprint of the model and its limits
     rows_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.row_s`; 0: of no such table
     interpolated_s: float = field(metadata=BRIEF, default=0.0)  # see `Gridded.interpolated_s`
 

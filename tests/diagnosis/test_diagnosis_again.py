@@ -15,7 +15,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Diagnosis, Estimate, Made, Ranked, Verdict
 from grounded.effects import Library
 from grounded.effects.actuator import delay_again
-from grounded_trials.workspace.adoptable import joined
+from grounded_trials.workspace.adoption import joined
 from small_tasks import plain_task
 
 

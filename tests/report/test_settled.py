@@ -12,7 +12,7 @@ from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import parameter_table
-from grounded_trials.workspace.adopting import tied_when_adopted
+from grounded_trials.workspace.adoption import tied_when_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import set_in_model
 from reported import DIAGNOSIS, cart, copied, diagnosed
@@ -90,6 +90,11 @@ ADOPTIONS = {  # a diagnosis, what is then known only jointly, and what stays be
     "all": ({}, [], {}),
     "a parameter that the trials do not tell": (
         {"identifiable": [{"parameter": "mass", "verdict": "not identifiable"}]},
+        [],
+        {"mass": 1.4},
+    ),
+    "a parameter that its bound has cut": (
+        {"parameters": {"mass": {"value": 1.4, "std": 0.5, "unit": "kg", "stopped": "bound"}}},
         [],
         {"mass": 1.4},
     ),

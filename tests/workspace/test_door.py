@@ -42,7 +42,7 @@ def test_a_session_from_an_example_to_a_report(tmp_path):
     first = w.propose()
     assert first.then == NextCommand("run") and first.candidate.id == "c0001"
     ran = w.run()
-    assert ran.then == NextCommand("ingest", (str(ran.trial_file),))
+    assert ran.then == NextCommand("ingest", (str(ran.trial_file),)) == w.status().then
     found = w.ingest(ran.trial_file)
     assert (found.trial, found.verdict, found.then) == ("t0001", "first", NextCommand("propose"))
     seen = []

@@ -25,6 +25,9 @@ def test_from_a_bare_model_to_fitted_values(tmp_path):
     assert grounded("-C", w, "ingest", ran["trial_file"]).code == 0
     fitted = grounded("-C", w, "fit", "--json").json["params"]
     assert fitted["mass"]["value"] == pytest.approx(1.4, rel=0.2)  # its latency is not in the model
+    assert grounded("-C", w, "fit", "--apply").code == 0  # what is known better is begun with
+    again = grounded("-C", w, "excite", "--seconds", "5", "--json").json["parameters"]["mass"]
+    assert again["std"] < 0.1 * made["parameters"]["mass"]["std"]
     csv = grounded("-C", w, "export", made["candidate"], "-o", tmp_path / "drive.csv")
     assert csv.code == 0 and (tmp_path / "drive.csv").read_text().count("\n") > 100
 

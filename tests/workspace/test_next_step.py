@@ -17,11 +17,11 @@ from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.wording import placed, rendered
 from grounded_trials.workspace import fitting
-from grounded_trials.workspace.adoptable import diagnosed_again
+from grounded_trials.workspace.adoption import diagnosed_again
 from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
+from grounded_trials.workspace.last_diagnosis import model_print, read_diagnosis
 from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
 from grounded_trials.workspace.user_files.config import set_in_model
 from recorded import LOGGED, record
@@ -161,18 +161,6 @@ def test_what_follows_a_diagnosis_of_an_ended_search(w, case):
     assert following(w.folder) == then
 
 
-def test_what_is_listed_as_alike_was_not_fitted_and_another_diagnosis_fits_it(w):
-    like = {"effect": "viscous_friction:v", "share": 0.954}
-    for name, then in (
-        ("input_gain:force", NextCommand("diagnose", ("--without", "viscous_friction"))),
-        ("viscous_friction:x", NextCommand("adopt", ("viscous_friction:v",))),
-    ):
-        diagnosed(w.folder, lookalikes=[like | {"like": name}])
-        with pytest.raises(GroundedError, match=r"viscous_friction:v") as refused:
-            w.adopt(name)
-        assert refused.value.then == then
-
-
 # before and during a search
 
 
@@ -256,6 +244,28 @@ def test_trials_that_came_after_a_diagnosis_make_it_old(w):
         assert following(w.folder) == then
         found = gather(Folder(w.folder)).since
         assert (found.used, found.newer) == (seen, count - seen)
+
+
+def test_another_model_or_other_limits_make_a_diagnosis_old(w):
+    made = taken_in(*range(1, len(w.trials()) + 1)) | {"model": model_print(Folder(w.folder))}
+    diagnosed(w.folder, diagnosed=made)
+    config, model = w.config.file, w.folder / "model.py"
+    for file, old, new, changed in (
+        (config, "[-5.0, 5.0]", "[-4.0, 4.0]", True),
+        (config, "[task]", "[task]\nstart = { x = 0.1 }", False),
+        (
+            model,
+            "def dynamics(s, a, p):",
+            "def dynamics(s, a, p):\n    s = {**s, 'v': 2 * s['v']}",
+            True,
+        ),
+    ):
+        text = file.read_text()
+        assert old in text
+        file.write_text(text.replace(old, new))
+        found = gather(Folder(w.folder)).since
+        assert found.changed == bool(found.findings) == changed
+        file.write_text(text)
 
 
 @pytest.mark.parametrize("made_of_all", [False])

@@ -47,8 +47,8 @@ def test_the_right_model_is_trusted_and_its_numbers(cart, tmp_path):
     wrong = yaml(tmp_path, "wrong", mass=1.1, drag="{value: 0.9, std: 0.1}")
     found = cart.compare(wrong, right)
     assert found.better == str(right)
-    assert found.channels == {"x": str(right), "v": str(right)}
-    assert {one.name: one.better for one in found.numbers} == dict.fromkeys(
+    assert {n: one.better for n, one in found.where.items()} == {"x": str(right), "v": str(right)}
+    assert {name: one.better for name, one in found.numbers.items()} == dict.fromkeys(
         ("mass", "drag"), str(right)
     )
     assert cart.compare(right, wrong).better == str(right)
@@ -59,7 +59,7 @@ def test_what_the_trials_can_not_decide(cart, tmp_path):
     other = yaml(tmp_path, "other", mass=1.4, drag=0.5004)
     found = cart.compare(one, other)
     assert not found.better
-    assert {n.name: n.better for n in found.numbers} == {"drag": ""}
+    assert {n: one.better for n, one in found.numbers.items()} == {"drag": None}
     assert [f.code for f in found.findings] == ["gap.undecided"] * 2
 
 
@@ -125,13 +125,13 @@ def test_two_mjcf_files_of_which_one_has_a_delay(tmp_path):
     right = str(tmp_path / "one.xml")
     found = w.compare(right, tmp_path / "other.xml")
     assert found.better == right
-    better = {one.name: one.better for one in found.numbers}
+    better = {name: one.better for name, one in found.numbers.items()}
     assert better == {"latency:motor": right, "hinge_damping": right}
-    assert w.compare(".", tmp_path / "other.xml").better == ""
+    assert w.compare(".", tmp_path / "other.xml").better is None
 
 
 def test_fitted_values_are_taken_home_with_their_spread(cart, tmp_path):
     cart.fit(apply=True)
     done = Workspace(cart.folder).export_model(tmp_path / "found.py")
-    values = {one.name: one.now for one in done.values}
+    values = done.values
     assert abs(values["mass"].value - 1.4) < 4 * values["mass"].std < 0.1

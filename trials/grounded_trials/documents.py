@@ -27,7 +27,18 @@ from typing import (
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
+from grounded_trials.workspace.adoption import Adopted, Undone
+from grounded_trials.workspace.candidates.exporting import Exported
+from grounded_trials.workspace.candidates.running import Ran
+from grounded_trials.workspace.discarding import SetAside
+from grounded_trials.workspace.exciting import Excited
+from grounded_trials.workspace.folder import Lost
+from grounded_trials.workspace.home.library import Shelved
+from grounded_trials.workspace.home.rivals import Compared
+from grounded_trials.workspace.home.taking_home import TakenHome
 from grounded_trials.workspace.off_target import OffTarget
+from grounded_trials.workspace.placing import FromStarts
+from grounded_trials.workspace.verifying import Verified
 
 By = Mapping[str, float]
 
@@ -104,14 +115,6 @@ class StatusJson(TypedDict):
     discarded: dict[str, str]
 
 
-class FromStartsJson(TypedDict):
-    """What the starts of the runs are worth."""
-
-    utility_change: float
-    std: float
-    runs: int
-
-
 class ProposeJson(TypedDict):
     """`propose`."""
 
@@ -131,7 +134,7 @@ class ProposeJson(TypedDict):
     noise_cost: float | None
     off_target: list[OffTarget]
     sample_age_s: float | None
-    from_usual_starts: FromStartsJson | None
+    from_usual_starts: FromStarts | None
 
 
 class IngestedJson(TypedDict):
@@ -205,13 +208,6 @@ class VerdictJson(TypedDict):
     sentence: str
 
 
-class LostJson(TypedDict):
-    """A file that is damaged."""
-
-    file: str
-    reason: str
-
-
 class AdoptedJson(TypedDict):
     """What was adopted."""
 
@@ -229,7 +225,7 @@ class ReportJson(TypedDict):
     sentence: str
     ending: str | None
     optimum: float | None
-    lost: list[LostJson]
+    lost: list[Lost]
     next: str
     model_policy: MeasuresJson | None
     best: MeasuresJson | None
@@ -252,48 +248,6 @@ class InspectJson(TypedDict):
     findings: list[Finding]
     damage: str
     log_table: str
-
-
-class AdoptJson(TypedDict):
-    """`adopt`."""
-
-    effects: list[dict[str, Any]]
-    params: By
-    claimed: bool
-    beside: list[str]
-    jointly: list[str]
-    along: list[str]
-    left: By
-    findings: list[Finding]
-
-
-class DiscardJson(TypedDict):
-    """`discard`, `restore`."""
-
-    trials: list[str]
-    unchanged: list[str]
-    discarded: dict[str, str]
-    findings: list[Finding]
-
-
-class ExportJson(TypedDict):
-    """`export`."""
-
-    file: str
-    candidate: str
-    format: str
-    search_ended: bool
-    runner: NotRequired[str]
-    findings: list[Finding]
-
-
-class UndoneJson(TypedDict):
-    """`adopt --undo`."""
-
-    undone: list[str]
-    effects: list[dict[str, Any]]
-    params: By
-    findings: list[Finding]
 
 
 class SignalJson(TypedDict):
@@ -352,7 +306,7 @@ class NextJson(TypedDict):
 
     trials: list[IngestedJson]
     propose: ProposeJson | None
-    export: ExportJson | None
+    export: Exported | None
     removed: list[str]
     findings: list[Finding]
 
@@ -389,19 +343,6 @@ class ExplainJson(TypedDict):
     findings: dict[str, EntryJson]
 
 
-class ComparedJson(TypedDict):
-    """`diagnose --compare` of two models."""
-
-    models: list[str]
-    better: str | None
-    gain: Quantity
-    ahead_s: float
-    where: dict[str, dict[str, Any]]
-    numbers: dict[str, dict[str, Any]]
-    trials: list[str]
-    findings: list[Finding]
-
-
 class InstrumentsJson(TypedDict):
     """`diagnose --instruments`."""
 
@@ -409,63 +350,13 @@ class InstrumentsJson(TypedDict):
     unheld: list[str]
 
 
-class ActuatorJson(TypedDict):
-    """`export --library`."""
-
-    file: str
-    actuator: str
-    values: dict[str, dict[str, Any]]
-    findings: list[Finding]
-
-
-class TakenHomeJson(TypedDict):
-    """`export --model`."""
-
-    file: str
-    source: str
-    date: str
-    values: dict[str, dict[str, Any]]
-    others: list[str]
-    findings: list[Finding]
-
-
-class ExciteJson(TypedDict):
-    """`excite`."""
-
-    candidate: str
-    file: str
-    seconds: float
-    pattern: str
-    frequencies_hz: list[float]
-    size: float
-    feedback: bool
-    parameters: dict[str, dict[str, Any]]
-    findings: list[Finding]
-
-
-class VerifyJson(TypedDict):
-    """`verify`."""
-
-    checked: int
-    damaged: list[LostJson]
-    findings: list[Finding]
-
-
-class RunJson(TypedDict):
-    """`run`."""
-
-    trial_file: str
-    candidate: str
-    findings: list[Finding]
-
-
 DOCUMENTS: dict[str, Any] = {
-    "adopt": AdoptJson | UndoneJson,
-    "diagnose": Diagnosis | ComparedJson | InstrumentsJson,
-    "discard": DiscardJson,
-    "excite": ExciteJson,
+    "adopt": Adopted | Undone,
+    "diagnose": Diagnosis | Compared | InstrumentsJson,
+    "discard": SetAside,
+    "excite": Excited,
     "explain": ExplainJson,
-    "export": ExportJson | TakenHomeJson | ActuatorJson,
+    "export": Exported | TakenHome | Shelved,
     "fit": FitJson,
     "ingest": IngestJson,
     "init": BegunJson | CreatedJson | ExamplesJson,
@@ -475,11 +366,11 @@ DOCUMENTS: dict[str, Any] = {
     "propose": ProposeJson,
     "recover": RecoverJson,
     "report": ReportJson,
-    "restore": DiscardJson,
-    "run": RunJson,
+    "restore": SetAside,
+    "run": Ran,
     "status": StatusJson,
     "target": TargetJson,
-    "verify": VerifyJson,
+    "verify": Verified,
 }
 _AS = {Finding: FindingJson, Quantity: QuantityJson}  # types that are written in another form
 _MORE: dict[str, dict[str, Any]] = {  # what a document has beside its fields

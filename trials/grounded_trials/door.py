@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.starting.drawing import Drawn, Manoeuvre
-    from grounded_trials.workspace.adopting import Adopted, Undone
+    from grounded_trials.workspace.adoption import Adopted, Undone
     from grounded_trials.workspace.candidates.exporting import Exported
     from grounded_trials.workspace.candidates.proposing import Proposed, Status
     from grounded_trials.workspace.candidates.running import Ran
@@ -359,7 +359,7 @@ class Workspace(Folder):
             effects: `family:target` names of effects that were claimed together, or of one effect.
             parameters: also take over the model parameters that were calibrated together with them.
         """
-        from grounded_trials.workspace.adopting import adopt_effects
+        from grounded_trials.workspace.adoption import adopt_effects
 
         done = adopt_effects(self.forget(), effects, parameters=parameters)
         self.forget()
@@ -367,7 +367,7 @@ class Workspace(Folder):
 
     def undo_adoption(self) -> Undone:
         """Undo the last `adopt`: restore the effects and params of grounded.toml."""
-        from grounded_trials.workspace.adopting import undo_adoption
+        from grounded_trials.workspace.adoption import undo_adoption
 
         done = undo_adoption(self.forget())
         self.forget()

@@ -118,11 +118,10 @@ ENTRIES: dict[str, Entry] = {
     # what can't be adopted, or undone
     "not_adoptable": Entry(
         "refuse",
-        "{about} can't be adopted: {why:adopted=it stands in [model] effects already,alike=it has "
-        "no values of its own: it only looks like,rival=it was fitted instead of what is claimed, "
-        "not with it,worse=it does not predict trials better that it was not fitted to,together="
-        "it was fitted together with,unvalued=the diagnosis lacks its value}[[ {effect}]][[, of "
-        "whose signal it reproduces {share:%}]]",
+        "{about} can't be adopted: {why:adopted=it stands in [model] effects already,rival=it "
+        "was fitted instead of what is claimed, not with it,worse=it does not predict trials "
+        "better that it was not fitted to,together=it was fitted together with,unvalued=the "
+        "diagnosis lacks its value}[[ {effect}]]",
         "{why:rival=adopt the claimed, or one alone,worse=run more trials and diagnose again,"
         "together=adopt them together}",
     ),

@@ -23,9 +23,9 @@ from grounded.diagnosis.writer import unconfirmed
 from grounded.effects import Library, LossFamily, RateFamily, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.documents import write_document
+from grounded_trials.workspace.adoption import to_adopt
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from grounded_trials.workspace.next_step import to_adopt
 from small_tasks import DT, pushed_cart
 
 LAG = 0.12

@@ -27,6 +27,7 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
+from grounded_trials.workspace.adoption import Better, Settled, lines_since, told_since
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import outlook
@@ -40,11 +41,9 @@ from grounded_trials.workspace.off_target import (
     tracking_error,
     weighed_groups,
 )
-from grounded_trials.workspace.settled import Settled, lines_since, told_since
 
 if TYPE_CHECKING:
     from grounded.diagnosis.telling import Told
-    from grounded_trials.workspace.adoptable import Better
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements

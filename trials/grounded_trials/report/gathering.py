@@ -25,7 +25,7 @@ from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.documents import read_document
-from grounded_trials.workspace.adoptable import Better, better_model
+from grounded_trials.workspace.adoption import Better, better_model, settled_in
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.proposing import uncounted, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -38,7 +38,6 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
 )
 from grounded_trials.workspace.next_step import next_command
-from grounded_trials.workspace.settled import settled_in
 
 MOST = 200  # number of runs that are read: the latest, and those of compared candidates
 LOGS = 50  # number of logs that are read, the latest

@@ -18,9 +18,15 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
 from grounded.share import Share
-from grounded_trials.workspace.adopting import equivalent_when_adopted, tied_when_adopted
+from grounded_trials.workspace.adoption import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, diagnosable, made_from, write_diagnosis
+from grounded_trials.workspace.last_diagnosis import (
+    chosen,
+    diagnosable,
+    made_from,
+    model_print,
+    write_diagnosis,
+)
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
@@ -59,7 +65,7 @@ def diagnose_in(
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
-    from grounded_trials.workspace.adoptable import diagnosed_again
+    from grounded_trials.workspace.adoption import diagnosed_again
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
@@ -93,6 +99,7 @@ def diagnose_in(
         named=tuple(trial.id for trial in used) if trials or compare else (),
         compared=tuple(compare),
         without=tuple(without),
+        model=model_print(workspace),
         rows_s=rows,
         interpolated_s=early,
     )

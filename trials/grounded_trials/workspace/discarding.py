@@ -6,42 +6,38 @@ the search says what is next, usually to run its candidate again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.findings import Finding
+from grounded.result import UNSAID, Document
 from grounded.trial import interpolate_gaps
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import again, read_otherwise
 from grounded_trials.workspace.unknown_id import unknown_trial
+from grounded_trials.workspace.where_to_mend import again, read_otherwise
 
 STATUS = NextCommand("status")
 
 
-@dataclass(frozen=True, repr=False)
-class SetAside(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class SetAside(Document):
     """The result of `discard` and `restore`: the named trials, and all that are set aside."""
 
     trials: tuple[str, ...]
-    discarded: dict[str, str]  # t0004 -> why
-    unchanged: tuple[str, ...] = ()  # those of `trials` that were in this state before
-    then: NextCommand = STATUS
-    run: str = ""  # the candidate to run before `then`, "" if that is not for its log
+    unchanged: tuple[str, ...]  # those of `trials` that were in this state before
+    discarded: Mapping[str, str]  # t0004 -> why
+    findings: tuple[Finding, ...] = ()
+    then: NextCommand = field(metadata=UNSAID, default=STATUS)
+    run: str = field(metadata=UNSAID, default="")  # the candidate to run before `then`, if any
 
     def summary(self) -> str:
         """Return all trials that are set aside."""
         return f"set aside: {', '.join(self.discarded) or 'none'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `discard --json` and `restore --json`."""
-        named = {"trials": list(self.trials), "unchanged": list(self.unchanged)}
-        return named | {"discarded": self.discarded, "findings": []}
 
 
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
@@ -62,7 +58,7 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
         trial = one.path.stem if copied else one.digest
         workspace.notes.add({"note": note, "trial": trial, "why": why})
     workspace.forget_trials()
-    return SetAside(tuple(one.id for one in found), workspace.discarded(), tuple(same))
+    return SetAside(tuple(one.id for one in found), tuple(same), workspace.discarded())
 
 
 def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:

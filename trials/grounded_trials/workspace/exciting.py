@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ from grounded.checks import wrong
 from grounded.diagnosis.design import Drive, design, uncertain
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
-from grounded.result import Result
+from grounded.model import Model
+from grounded.result import UNSAID, Document
 from grounded.search.candidate import Candidate
 from grounded.search.scatter import sensor_noise
 from grounded.task import MAX_HORIZON, Task
+from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.diagnosing import near
@@ -27,50 +29,39 @@ LENGTHS = (5.0, 10.0, 20.0, 40.0)  # [s] that are tried until no parameter stays
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Excited(Result):
+class Excited(Document):
     """The result of `excite`: a drive, and what its log will tell.
 
     Args:
         candidate: the drive as a candidate, which `run`, `export` and `ingest` take.
         file: its file.
-        drive: how it was made.
-        known: of each uncertain parameter, its value with the +- of the prior, and the +- that a
-            fit of the drive's log leaves at best.
+        seconds: its duration.
+        pattern: "multisine" or "staircase".
+        frequencies_hz: the slowest and the quickest of it.
+        size: the share of the inputs' range that it uses.
+        feedback: whether states are fed back.
+        parameters: of each uncertain parameter, its value with the +- that is known, and the +-
+            that a fit of the drive's log leaves at best.
         findings: what to know before it runs.
+        drive: how it was made.
         then: the command to type next.
     """
 
-    candidate: Candidate
+    candidate: str
     file: Path
-    drive: Drive
-    known: Mapping[str, tuple[Quantity, float]]
+    seconds: float
+    pattern: str
+    frequencies_hz: tuple[float, float]
+    size: float
+    feedback: bool
+    parameters: Mapping[str, Mapping[str, Any]]
     findings: tuple[Finding, ...]
-    then: NextCommand
+    drive: Drive = field(metadata=UNSAID)
+    then: NextCommand = field(metadata=UNSAID)
 
     def summary(self) -> str:
         """Return the candidate and its file."""
-        return f"{self.candidate.id}: {self.file}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `excite --json`."""
-        drive = self.drive
-        long = drive.policy.horizon * drive.policy.dt
-        return {
-            "candidate": self.candidate.id,
-            "file": str(self.file),
-            "seconds": long,
-            "pattern": drive.pattern,
-            "frequencies_hz": [
-                one / (drive.policy.horizon * drive.policy.dt) for one in drive.cycles
-            ],
-            "size": drive.size,
-            "feedback": drive.policy.gain is not None,
-            "parameters": {
-                name: {**prior.to_json(), "std_after": after}
-                for name, (prior, after) in self.known.items()
-            },
-            "findings": [one.to_json() for one in self.findings],
-        }
+        return f"{self.candidate}: {self.file}"
 
 
 def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
@@ -105,21 +96,31 @@ def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
         raise GroundedError(found("plan.no_drive"))
     told = [found("plan.drive_weak", *drive.weak)] if drive.weak else []
     candidate = _stored(workspace, drive)
-    params = task.model.params
-    known = {
-        name: (Quantity(one.value, one.unit, one.spread), share * one.spread)
-        for name, share in drive.left.items()
-        for one in (params[name],)
-    }
-    then = to_run(workspace, candidate.id, candidate.id)
+    slow, quick = drive.cycles
+    long = drive.policy.horizon * drive.policy.dt
+    params = ((one, share, task.model.params[one]) for one, share in drive.left.items())
     return Excited(
-        candidate, workspace.candidate_path(candidate.id), drive, known, tuple(told), then
+        candidate=candidate.id,
+        file=workspace.candidate_path(candidate.id),
+        seconds=long,
+        pattern=drive.pattern,
+        frequencies_hz=(slow / long, quick / long),
+        size=drive.size,
+        feedback=drive.policy.gain is not None,
+        parameters={
+            name: {**Quantity(p.value, p.unit, p.spread).to_json(), "std_after": share * p.spread}
+            for name, share, p in params
+        },
+        findings=tuple(told),
+        drive=drive,
+        then=to_run(workspace, candidate.id, candidate.id),
     )
 
 
 def _bounded(workspace: Folder) -> Task:
     """Return the task at rest, its states bounded by [safety] or by where logs have been."""
-    planner, task = workspace.planner, workspace.planner.plan
+    planner = workspace.planner
+    task = planner.plan.with_model(_as_known(workspace, planner.plan.model))
     if not uncertain(task):
         raise GroundedError(found("given.constant", str(workspace.config.model.file)))
     ends = zip(task.model.input_names, task.low, task.high, strict=True)
@@ -133,6 +134,17 @@ def _bounded(workspace: Folder) -> Task:
         raise GroundedError(found("plan.no_drive", state=task.model.state_names[0]))
     stands = resting(task, np.zeros(task.model.n, bool), planner.loose)
     return task if stands is None else replace(task, past=stands[task.model.n :])
+
+
+def _as_known(workspace: Folder, model: Model) -> Model:
+    """Return a model whose parameters are as uncertain as fits and adoptions have left them."""
+    known = known_values(workspace)
+    told = {
+        name: replace(one, std=known[name].std)
+        for name, one in model.params.items()
+        if one.uncertain and name in known and 0 < known[name].std < one.spread
+    }
+    return replace(model, params={**model.params, **told})
 
 
 def _stored(workspace: Folder, drive: Drive) -> Candidate:

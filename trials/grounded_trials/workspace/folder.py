@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Self
 from grounded.checks import known, refused
 from grounded.errors import GroundedError
 from grounded.model import Model
+from grounded.result import Document
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -54,8 +55,8 @@ MANY = 200  # from this number of trials on, an index is used
 _ID = re.compile(r"c\d{4,}")
 
 
-@dataclass(frozen=True)
-class Lost:
+@dataclass(frozen=True, eq=False)
+class Lost(Document):
     """A file that is missing or damaged, with the reason."""
 
     file: str

@@ -6,17 +6,12 @@ untrusted source, so no text in them is trusted.
 
 `Since` describes what changed after a diagnosis: newer trials, adopted effects, other parameters. A
 verdict refers to the model and the trials of its time; effects adopted since are no longer missing.
-A trial keeps its numbers when [log] is changed. So what a diagnosis found in it may be due to what
-was corrected there since (`changed_since`): its log has to be ingested again first.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,135 +20,20 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
+from grounded.search.planner import model_fingerprint
 from grounded.share import Share, share_of
-from grounded_trials.logs.log_files import digest_of, log_files
-from grounded_trials.logs.log_table import LogMapping
 from grounded_trials.plain_file import unreadable
 from grounded_trials.store.documents import read_document, write_document
-from grounded_trials.store.store import hash_file, made_folder
+from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import READ_BY, StoredTrial, sha256
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.where_to_mend import changed_since
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis, Made
     from grounded.fit import Fit
     from grounded.trial import Trial
-    from grounded_trials.workspace.folder import Folder
-
-PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # keys of a signal that is read unchanged
-
-
-def read_by(mapping: LogMapping) -> dict[str, str]:
-    """Return the metadata of a trial with how [log] reads each signal, without keys as in PLAIN."""
-    found = {}
-    for name, spec in {**mapping.states, **mapping.inputs}.items():
-        keys = {key: float(getattr(spec, key)) for key in PLAIN}
-        found[name] = {"path": spec.path} | {k: v for k, v in keys.items() if v != PLAIN[k]}
-    return {READ_BY: json.dumps(found)}
-
-
-def paths_of(meta: Mapping[str, str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns from which [log] read some signals of a trial; () if it does not say."""
-    try:
-        before = json.loads(meta[READ_BY])
-        return tuple(str(before[name]["path"]) for name in names)
-    except (KeyError, ValueError, TypeError, RecursionError):
-        return ()
-
-
-def read_otherwise(
-    meta: Mapping[str, str], mapping: LogMapping | None, corrected: Collection[tuple[str, str]] = ()
-) -> tuple[str, ...]:
-    """Return the signals of a trial that [log] reads in another way now.
-
-    Args:
-        meta: the trial's metadata, which is not trusted.
-        mapping: the present [log].
-        corrected: signals with a key of theirs that may differ.
-    """
-    if mapping is None or READ_BY not in meta:
-        return ()
-    try:
-        before = {str(name): dict(keys) for name, keys in json.loads(meta[READ_BY]).items()}
-        was = {n: {k: float(own.get(k, v)) for k, v in PLAIN.items()} for n, own in before.items()}
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return ()
-    found = []
-    for name, spec in {**mapping.states, **mapping.inputs}.items():
-        if name not in before:
-            continue
-        elsewhere = before[name].get("path", spec.path) != spec.path
-        keys = [key for key in PLAIN if (name, key) not in corrected]
-        if elsewhere or not all(np.isclose(was[name][key], getattr(spec, key)) for key in keys):
-            found.append(name)
-    return tuple(found)
-
-
-def changed_since(
-    workspace: Folder, diagnosis: Diagnosis, usable: Collection[str]
-) -> tuple[str, ...]:
-    """Return the signals that [log] reads otherwise than it did for a diagnosis, else ().
-
-    What the diagnosis corrected itself may have been written into [log] since. Once there is a
-    trial that was read by the present [log], the others were left as they are on purpose.
-    """
-    made = diagnosis.made
-    if made is None or not workspace.config.log.names():
-        return ()
-    mapping = workspace.log_mapping
-    corrected = {
-        (name, key)
-        for one in diagnosis.preflight
-        for name in one.signal.split("+")
-        for key in PLAIN
-        if key in one.log
-    }
-    if any(one.kind == "delay" and one.log for one in diagnosis.preflight):  # maybe of another
-        corrected |= {(name, "delay_s") for name in workspace.base_model.state_names}
-    found: tuple[str, ...] = ()
-    for one in workspace.whole_trials():
-        if one.stored.id in usable and READ_BY in one.meta:
-            found = read_otherwise(one.meta, mapping, corrected)
-            if not found:
-                return ()
-    return found
-
-
-def again(
-    workspace: Folder, meta: Mapping[str, str], candidate: str, *, waits: bool = False
-) -> NextCommand:
-    """Return the command that ingests a trial's log again.
-
-    If its candidate waits for a trial, it needs no name: it is recognised, or the log is refused.
-    """
-    what = ("--candidate", candidate) if candidate else ("--data",)
-    return NextCommand("ingest", (_log_of(workspace, meta), *(what if not waits else ())))
-
-
-def last_again(workspace: Folder, trials: Sequence[StoredTrial]) -> NextCommand | None:
-    """Return the command that ingests the last foreign log among some trials again."""
-    foreign = [one for one in trials if "source" in one.meta]
-    if not foreign:
-        return None
-    return again(workspace, foreign[-1].meta, foreign[-1].trial.candidate)
-
-
-def hashed(files: Sequence[Path]) -> str:
-    """Return the SHA-256 of a log's file, or of the hashes if it has several files."""
-    hashes = [hash_file(file) if file.is_file() else digest_of(file) for file in files]
-    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
-
-
-def _log_of(workspace: Folder, meta: Mapping[str, str]) -> str:
-    """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
-    name, home = Path(meta["source"]).name, workspace.folder.resolve()
-    for folder in (Path.cwd(), home, home.parent):
-        with suppress(GroundedError, OSError, ValueError):  # its name may be none
-            if hashed(log_files(folder / name)) == meta.get("source_sha256"):
-                return os.path.relpath(folder / name)
-    return "LOG"
-
 
 FILE = "diagnosis.json"  # in reports/, as FIT
 FIT = "fit.json"
@@ -315,6 +195,14 @@ class Since:
         return "; ".join(one.sentence for one in self.findings)
 
 
+def model_print(workspace: Folder) -> str:
+    """Return a fingerprint of the planning model and of its [limits], wherever runs start."""
+    task = workspace.planner.plan
+    apart = replace(task, start=np.zeros(task.model.n), past=np.zeros(task.model.m))
+    ends = repr((task.low.tolist(), task.high.tolist())).encode()
+    return sha256(model_fingerprint(apart).encode() + ends)[:16]
+
+
 def usable_ids(workspace: Folder) -> list[str]:
     """Return the ids of the trials that a diagnosis can use, in order of arrival.
 
@@ -342,13 +230,14 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
     named = (str(e["name"]) for e in model.effects)
     adopted += tuple(n for n in named if n not in before and n not in diagnosis.effects)
     same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
+    same = same and params in (None, dict(model.params))
     return Since(
         used=sum(name in seen for name in usable),
         usable=len(usable),
         newer=len(usable) - 1 - last if seen else 0,
         adopted=adopted,
         missing=missing if adopted else (),
-        changed=not same or params not in (None, dict(model.params)),
+        changed=not same or made.model not in ("", model_print(workspace)),
         reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
         repeats=_new_repeats(workspace, diagnosis, usable),

@@ -13,7 +13,12 @@ from grounded.findings import found as said
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase
-from grounded_trials.workspace.candidates.exporting import Exported, export_candidate, void_exports
+from grounded_trials.workspace.candidates.exporting import (
+    Exported,
+    export_candidate,
+    exported_as,
+    void_exports,
+)
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
@@ -92,7 +97,8 @@ def _odd_before(workspace: Folder) -> bool:
 def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:
     """Ingest a log, propose, and export for the robot, see `Workspace.next`.
 
-    Nothing is proposed from a log that should be discarded.
+    Nothing is proposed from a log that should be discarded. The next candidate is exported as the
+    one that the log ran was: in C there is no use for an npz.
     """
     try:
         taken = ingest_log(workspace, log, candidate)
@@ -105,8 +111,9 @@ def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool
         return NextRun(taken, None, None)
     proposed, exported = propose_in(workspace), None
     if proposed.candidate is not None:
-        name, form = proposed.candidate.id, "npz" if runner else "json"
-        file = workspace.folder / f"{name}.{form}"
+        name, form = proposed.candidate.id, exported_as(workspace, taken.candidate or "")
+        runner = runner and form in ("", "npz")
+        file = workspace.folder / f"{name}.{form or ('npz' if runner else 'json')}"
         exported = export_candidate(workspace, name, form, file, runner=runner)
     name = "" if proposed.candidate is None else proposed.candidate.id
     removed = void_exports(workspace, name)

@@ -9,40 +9,27 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, found
-from grounded.model import all_at_bounds
+from grounded.findings import found
 from grounded.search.standing import LOST, Ending, Phase, Standing
-from grounded_trials.wording import rendered
-from grounded_trials.workspace.adoptable import declined, late_open
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
-    changed_since,
-    fitted_in_vain,
-    last_again,
-    made_from,
-    newer_alone,
-    read_diagnosis,
     readable_diagnosis,
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.off_target import logged_target
+from grounded_trials.workspace.target_state import PROPOSE, TARGET, to_plan, undrawn
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
 
-PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
-TARGET = NextCommand("target", ("SHAPE",))
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 
@@ -129,6 +116,11 @@ class Situation:
         return self.diagnosis is not None and bool(self.diagnosis.no_cause)
 
     @property
+    def nothing_to_plan(self) -> bool:
+        """The trials can't identify any cause, and no manoeuvre was drawn yet."""
+        return self.nothing_known and undrawn(self.workspace)
+
+    @property
     def diagnosed(self) -> bool:
         """There is a diagnosis."""
         return self.diagnosis is not None
@@ -140,6 +132,8 @@ class Situation:
         """The command that acts on the claims of the diagnosis, if it is of this model."""
         if self.diagnosis is None or self.since.changed:
             return None
+        from grounded_trials.workspace.adoption import to_adopt  # slow, and seldom needed
+
         return to_adopt(self.workspace, self.diagnosis)
 
     @property
@@ -151,6 +145,13 @@ class Situation:
     def ingest(self) -> NextCommand:
         """The log that the workspace was made from."""
         return NextCommand("ingest", ("--data", not_ingested(self.workspace)))
+
+    @property
+    def record(self) -> NextCommand:
+        """The drive that tells the uncertain parameters; any other log if there are none."""
+        params = self.workspace.base_model.params.values()
+        uncertain = any(one.uncertain for one in params)
+        return NextCommand("excite") if uncertain else NextCommand("ingest", ("--data", "LOG"))
 
     @property
     def asked(self) -> NextCommand | None:
@@ -175,6 +176,7 @@ NEXT: tuple[tuple[tuple[Phase, ...], str, str], ...] = (
     (ANY, "search_asks", "asked"),
     (ANY, "never_diagnosed", "diagnose"),
     ((Phase.PROPOSE,), "diagnosis_is_old", "diagnose"),
+    ((Phase.PROPOSE,), "nothing_to_plan", "record"),
     ((Phase.PROPOSE,), "always", "propose"),
     (ENDED, "not_settled", "diagnose"),
     (ENDED, "again_tells", "run"),
@@ -202,28 +204,6 @@ def outlook(now: Standing, then: NextCommand) -> Standing:
     if then.verb == "fit" or (then.verb == "adopt" and not goes_on):
         return now.with_finding(found("search.adopt_first", then=then, fit=then.verb == "fit"))
     return now
-
-
-def to_plan(workspace: Folder) -> NextCommand:
-    """Return `propose`, or `target` if no candidate was made and no manoeuvre was drawn yet."""
-    with suppress(GroundedError):  # `propose` reports an unreadable target
-        return TARGET if undrawn(workspace) else PROPOSE
-    return PROPOSE
-
-
-def undrawn(workspace: Folder) -> bool:
-    """Return whether no candidate was made and target.csv is still what `init --from` wrote.
-
-    That is the run in the log, or, if the log could not be sampled, zeros for the first state only,
-    with a start at zero.
-    """
-    task = workspace.config.task
-    if not task.target or workspace.candidate_ids():
-        return False
-    first, *others = np.asarray(workspace.task.target, float).T
-    if first.any() or not all(np.isnan(column).all() for column in others):
-        return bool(logged_target(workspace))
-    return not task.start.get(workspace.base_model.state_names[0])
 
 
 def not_ingested(workspace: Folder) -> str:
@@ -286,8 +266,7 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
     """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
-    Data beside a search whose candidate waits leave that next: the log of a run that went wrong was
-    kept as data, and a diagnosis was next, with the robot on the water.
+    Data beside a search whose candidate waits leave that next.
 
     Args:
         workspace: the workspace that has stored the log.
@@ -303,13 +282,12 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
             if ran and (now := standing_in(workspace)).phase == "await-trial":
                 return another_trial(workspace, now)
         return DIAGNOSE
-    if _none_stood(now) and (found := read_diagnosis(workspace.reports)) is not None:
-        return next_command(workspace, now, found, usable_ids(workspace))
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not now.doubt
-    if goes_on:
+    if goes_on and not _none_stood(now):
         return PROPOSE
-    usable = usable_ids(workspace)
-    return next_command(workspace, now, readable_diagnosis(workspace.reports), usable)
+    return next_command(
+        workspace, now, readable_diagnosis(workspace.reports), usable_ids(workspace)
+    )
 
 
 def _none_stood(now: Standing) -> bool:
@@ -319,6 +297,9 @@ def _none_stood(now: Standing) -> bool:
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
     """Return the command after a diagnosis: adopt claims, run another trial, or read the report."""
+    from grounded_trials.workspace.adoption import to_adopt
+
+    usable = usable_ids(workspace)
     if not found.no_cause:
         if (follow := to_adopt(workspace, found)) is not None:
             return follow
@@ -327,11 +308,9 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
         settled = found.kind in ("none", "unknown") or found.contested  # nothing to adopt
         if not settled or not workspace.config.task.target:
             return REPORT
-    now = _standing_ahead(workspace)
-    if found.no_cause:
-        then = another_trial(workspace, now)
-        return to_plan(workspace) if then == PROPOSE else then
-    return next_command(workspace, now, found, usable_ids(workspace))
+        return next_command(workspace, _standing_ahead(workspace), found, usable)
+    here = Situation(workspace, _standing_ahead(workspace), found, usable)
+    return here.record if here.nothing_to_plan else here.run
 
 
 def left_open(found: Diagnosis) -> bool:
@@ -356,81 +335,7 @@ def after_fit(workspace: Folder) -> NextCommand:
     """
     if (found := readable_diagnosis(workspace.reports)) is None:
         return DIAGNOSE
-    now = _standing_ahead(workspace)
-    since = since_diagnosis(workspace, found, usable_ids(workspace))
-    if since.changed or since.newer:
+    here = Situation(workspace, _standing_ahead(workspace), found, usable_ids(workspace))
+    if here.since.changed or here.since.newer:
         return DIAGNOSE
-    return next_command(workspace, now, found, usable_ids(workspace))
-
-
-def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
-    """Return the command that acts on the claims of a diagnosis, or None if there is none.
-
-    Filters and delays of sensors are adopted too if states are fed back: feedback gains designed
-    without them make the robot oscillate. Nothing is adopted if [log] reads the trials in another
-    way now, or if they were all set aside: then their log is ingested again.
-    """
-    if (first := _to_read_again(workspace, diagnosis)) is not None:
-        return first
-    from grounded.diagnosis.causes import sign_only
-    from grounded.diagnosis.error_report import gain
-
-    new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
-    if diagnosis.changed:  # values of two robots together fit neither
-        return newer_alone(diagnosis)
-    undone = {*declined(workspace)}  # effects the user has undone are not suggested again
-    late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
-    claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
-    if not claimed or {*new} <= undone or _like_a_load(workspace, new):
-        return NextCommand("adopt", late) if late else None
-    params = workspace.base_model.params
-    known = {n: e.value for n, e in diagnosis.parameters.items() if n in params}
-    if all_at_bounds(params, {n: known[n] for n in diagnosis.verdict.parameters if n in known}):
-        return DIAGNOSE  # after widening their bounds, as the diagnosis says
-    if any(row.effect in new and sign_only(row.effect, row.params) for row in diagnosis.ranking):
-        return DIAGNOSE  # after flipping the sign, as the diagnosis says
-    own = {f"parameter:{name}" for name in params}
-    if own.issuperset(new):
-        made = made_from(diagnosis)
-        some = (*made.named, *made.compared)
-        alone = not workspace.config.model.effects  # else found beside effects, to be adopted so
-        if alone and not fitted_in_vain(workspace, some):  # only parameters: fit all together
-            return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
-        if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
-            return NextCommand("adopt", late) if late else None
-    return NextCommand("adopt", (*new, *late))
-
-
-def _to_read_again(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
-    """Return the command to type before the claims of a diagnosis are adopted, or None."""
-    seen, trials = {*made_from(diagnosis).trials}, workspace.whole_trials()
-    here = {one.stored.id for one in trials}
-    if seen and seen.isdisjoint(here):
-        aside = (one for one in workspace.aside_trials() if one.stored.id in seen)
-        return DIAGNOSE if here else last_again(workspace, [*aside])
-    changed = changed_since(workspace, diagnosis, here)
-    return last_again(workspace, trials) if changed else None
-
-
-def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | None:
-    """Return what the last diagnosis found that the model lacks, with the command, if anything.
-
-    Nothing is said of a diagnosis of another model, or if its effects were adopted and undone.
-    """
-    if diagnosis is None or since_diagnosis(workspace, diagnosis, usable_ids(workspace)).changed:
-        return None
-    then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
-    if then is None or then.verb not in ("adopt", "fit") or not clauses:
-        return None
-    command = rendered(then, workspace.address)
-    more = len(clauses) - 1
-    return found("plan.lacks", then=then, cause=clauses[0], more=more, command=command)
-
-
-def _like_a_load(workspace: Folder, effects: Sequence[str]) -> bool:
-    """Return whether the effects stand in for a load, for which the model lacks a parameter."""
-    if len(effects) < 2:  # avoids the import
-        return False
-    from grounded.effects.joint import like_a_load
-
-    return like_a_load(workspace.planner.plan.model, effects)
+    return next_command(workspace, here.now, found, here.usable)

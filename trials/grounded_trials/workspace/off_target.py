@@ -23,7 +23,6 @@ from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.task_file import equal_weights
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
-WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 FARTHER = 1.1  # of the error before: a better candidate's larger error is explained
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
@@ -332,36 +330,3 @@ def _resolution(trials: Sequence[Trial]) -> Array:
             gaps = np.diff(again)
             found[i] = gaps[gaps > NARROW * np.median(gaps)].min()
     return found
-
-
-def logged_target(workspace: Folder) -> str:
-    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
-
-    Only trials that ran no candidate count, also those that are set aside: a log in a wrong unit is
-    ingested again, but target.csv is the run as it was first read. The target must equal their
-    states row by row.
-    """
-    if not workspace.config.task.target:
-        return ""
-    task = workspace.task
-    asked = np.isfinite(task.target).any(axis=0)
-    for trial in (one.trial for one in (*workspace.whole_trials(), *workspace.aside_trials())):
-        rows = len(task.target)
-        if trial.candidate or trial.steps + 1 < rows or not workspace.fits(trial):
-            continue
-        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
-        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
-        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
-            return trial.id
-    return ""
-
-
-def still_logged(workspace: Folder) -> bool:
-    """Return whether the target of a workspace made from a log is still the run in that log.
-
-    If that log was not ingested, there is no trial to compare with. Then the target is the log's
-    until `target` replaces it, which keeps the old one as .bak.
-    """
-    if any(not stored.trial.candidate for stored in workspace.whole_trials()):
-        return bool(logged_target(workspace))
-    return not (workspace.folder / f"{workspace.config.task.target}.bak").exists()

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.result import Document
 from grounded.search.candidate import Candidate
 from grounded.search.difference import student
 from grounded.search.starts import worth_of_start
@@ -44,17 +45,17 @@ class Placing:
     runs: Array
 
 
-@dataclass(frozen=True)
-class FromStarts:
+@dataclass(frozen=True, eq=False)
+class FromStarts(Document):
     """What a candidate is predicted to be worth from where the latest runs began.
 
     Args:
-        change: mean change of its utility against one from [task] start exactly.
+        utility_change: mean change of its utility against one from [task] start exactly.
         std: standard deviation of single runs due to the start alone.
         runs: how many runs that rests on.
     """
 
-    change: float
+    utility_change: float
     std: float
     runs: int
 

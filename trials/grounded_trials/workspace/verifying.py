@@ -10,7 +10,8 @@ from typing import Any
 
 from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded.result import Result
+from grounded.findings import Finding
+from grounded.result import Document
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
@@ -20,21 +21,17 @@ from grounded_trials.workspace.identity import Noted, noted, sha256
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
 
-@dataclass(frozen=True, repr=False)
-class Verified(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class Verified(Document):
     """How many files were checked, and which are changed, damaged or missing."""
 
     checked: int
     damaged: tuple[Lost, ...]
+    findings: tuple[Finding, ...] = ()
 
     def summary(self) -> str:
         """Return how many files were checked and how many are damaged."""
         return f"{self.checked} files, {len(self.damaged)} damaged"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `verify --json`."""
-        damaged = [vars(one) for one in self.damaged]
-        return {"checked": self.checked, "damaged": damaged, "findings": []}
 
 
 def verify_in(workspace: Folder) -> Verified:

@@ -14,7 +14,7 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,9 @@ from grounded.checks import one_of, refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
 from grounded.policy import Policy, to_arrays
-from grounded.result import Result
+from grounded.result import UNSAID, Document
 from grounded.search.standing import Ending, Phase, Standing
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.store import DIGITS, hash_file, write_atomically
 from grounded_trials.workspace.candidates.handover import (
     Check,
     checked_candidate,
@@ -59,6 +59,14 @@ def is_export(workspace: Folder, identity: str, path: Path) -> bool:
         return path.stat().st_size == len(data) and path.read_bytes() == data
     except (OSError, GroundedError):
         return False
+
+
+def exported_as(workspace: Folder, candidate: str) -> str:
+    """Return the format in which a candidate was exported here or to the workspace; "" for none."""
+    places = [at / candidate for at in (workspace.folder, Path())]
+    files = [path.with_suffix(f".{form}") for path in places for form in encoders()]
+    found = (path for path in files if path.is_file() and is_export(workspace, candidate, path))
+    return next((path.suffix[1:] for path in found), "")
 
 
 def encoders() -> dict[str, Callable[[Policy, dict[str, str], dict[str, str]], bytes]]:
@@ -144,11 +152,19 @@ def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     return stream.getvalue().encode()
 
 
+def not_stored(workspace: Folder, candidate: str) -> Path | None:
+    """Return the trial file of the last `run` of a candidate if it was not ingested yet."""
+    files = [*(workspace.folder / "runs").glob(f"{candidate}-*.mcap")]
+    last = max(files, key=lambda path: (len(path.name), path.name), default=None)
+    stored = last is None or hash_file(last)[:DIGITS] in workspace.store.digests()
+    return None if stored else last
+
+
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
 
-    It counts as exported if a file with the contents of its export is in the workspace or in the
-    current folder; the name of a file alone proves nothing.
+    A run that was not ingested yet is ingested first. A candidate counts as exported if a file with
+    the contents of its export is in the workspace or in the current folder.
 
     Args:
         workspace: the workspace.
@@ -156,8 +172,8 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
         named: the name to use in the command; () for the outstanding candidate.
     """
     if workspace.config.system.reachable:
-        return NextCommand("run", named)
-
+        waits = not_stored(workspace, candidate)
+        return NextCommand("run", named) if waits is None else NextCommand("ingest", (str(waits),))
     name = named[0] if named else candidate
     files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
     if any(is_export(workspace, candidate, path) for path in files):
@@ -168,18 +184,17 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
 RUNNER = "grounded_runner.py"
 
 
-@dataclass(frozen=True, repr=False)
-class Exported(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class Exported(Document):
     """An exported candidate and its file."""
 
     candidate: str
     file: Path
     format: str
-    runner: Path | None = None  # the program that runs it, if requested
-    findings: tuple[Finding, ...] = ()  # on the candidate
-    overridden: tuple[Finding, ...] = ()  # reasons against it, overridden by `anyway`
-    named: tuple[str, ...] = ()  # options of `ingest` for its log if another one is outstanding
-    ended: bool = False  # whether it is the best candidate of a search that has ended
+    runner: Path | None = field(metadata={"brief": True}, default=None)  # the program that runs it
+    findings: tuple[Finding, ...] = ()  # reasons against it that were overridden, and notes
+    search_ended: bool = False  # whether it is the best candidate of a search that has ended
+    named: tuple[str, ...] = field(metadata=UNSAID, default=())  # options of `next` for its log
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -189,17 +204,6 @@ class Exported(Result):
     def summary(self) -> str:
         """Return the candidate and its file."""
         return f"{self.candidate}: {self.file}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `export --json`."""
-        document: dict[str, Any] = {
-            "file": str(self.file),
-            "candidate": self.candidate,
-            "format": self.format,
-        }
-        told = [*self.overridden, *self.findings]
-        document |= {"search_ended": self.ended, "findings": [one.to_json() for one in told]}
-        return document | ({"runner": str(self.runner)} if self.runner else {})
 
 
 def export_candidate(
@@ -238,7 +242,8 @@ def export_candidate(
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     ended = _has_ended(workspace, identity, handed.check.standing)
-    return Exported(identity, path, form, program, handed.findings, handed.overridden, how, ended)
+    told = (*handed.overridden, *handed.findings)
+    return Exported(identity, path, form, program, told, ended, how)
 
 
 def _has_ended(workspace: Folder, identity: str, now: Standing) -> bool:

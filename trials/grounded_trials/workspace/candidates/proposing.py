@@ -36,13 +36,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import (
-    doubted,
-    next_command,
-    not_adopted,
-    not_ingested,
-    outlook,
-)
+from grounded_trials.workspace.next_step import doubted, next_command, not_ingested, outlook
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
@@ -53,8 +47,8 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
+    from grounded_trials.workspace.adoption import Settled
     from grounded_trials.workspace.identity import StoredTrial
-    from grounded_trials.workspace.settled import Settled
 
 PROPOSE = NextCommand("propose")
 
@@ -101,11 +95,7 @@ class Proposed(Result):
         told = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
         age = self.candidate.sample_age if self.candidate else None
-        begun = self.from_starts and {
-            "utility_change": self.from_starts.change,
-            "std": self.from_starts.std,
-            "runs": self.from_starts.runs,
-        }
+        begun = self.from_starts and self.from_starts.to_json()
         every = [*self.standing.findings, *self.findings]
         every += [one for one in (self.made, self.predicted, self.so_far, self.trust) if one]
         told |= {"notes": list(self.notes)}
@@ -194,7 +184,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         held = held_before(workspace, _other_model(workspace, before))
         notes += left_open(workspace, proposal, held)
     status = status_of(workspace, now)
-    lacks = not_adopted(workspace, status.diagnosis) if candidate else None
+    lacks = _lacks(workspace, status.diagnosis) if candidate and status.diagnosis else None
     doubt = now.doubt
     doubt = doubt if doubt and doubted(now, status.since, usable_ids(workspace)) else None
     notes += [one for one in (lacks, doubt) if one]
@@ -411,11 +401,17 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     )
 
 
+def _lacks(workspace: Folder, diagnosis: Diagnosis) -> Finding | None:
+    from grounded_trials.workspace.adoption import not_adopted
+
+    return not_adopted(workspace, diagnosis)
+
+
 def _settled(workspace: Folder, last: Diagnosis | None, since: Since | None) -> Settled | None:
     """Return what was adopted; None, and without slow imports, if nothing was."""
     if not (workspace.config.model.effects or workspace.config.model.params):
         return None
-    from grounded_trials.workspace.settled import settled_in
+    from grounded_trials.workspace.adoption import settled_in
 
     return settled_in(workspace, last, since or Since())
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 import shlex
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from grounded.checks import known, refused, wrong
 from grounded.errors import NextCommand
 from grounded.findings import Finding, found
 from grounded.plant import Noise, Plant
-from grounded.result import Result
+from grounded.result import UNSAID, Document
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.step.step_size import SearchOptions
@@ -40,14 +39,14 @@ TRIALS = 30  # limit of the search for the optimum
 EXAMPLE = "python drive.py {candidate} {trial}"  # a command of [system]
 
 
-@dataclass(frozen=True, repr=False)
-class Ran(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class Ran(Document):
     """A candidate that was run, and the file of its trial, to be ingested."""
 
-    candidate: str
     trial_file: Path
+    candidate: str
     findings: tuple[Finding, ...] = ()  # on the candidate
-    overridden: tuple[Finding, ...] = ()  # reasons against it, overridden by `anyway`
+    overridden: tuple[Finding, ...] = field(metadata=UNSAID, default=())  # reasons against it
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -62,12 +61,6 @@ class Ran(Result):
     def summary(self) -> str:
         """Return what was run, and where its trial is."""
         return f"{self.candidate}: {self.trial_file}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `run --json`."""
-        told = [one.to_json() for one in self.findings]
-        document = {"trial_file": str(self.trial_file), "candidate": self.candidate}
-        return {**document, "findings": told}
 
 
 def run_candidate(
@@ -91,7 +84,7 @@ def run_candidate(
     else:
         then = to_run(workspace, identity, *(() if candidate is None else (candidate,)))
         raise refused("run.by_hand", workspace.candidate_path(identity), example=EXAMPLE, then=then)
-    return Ran(identity, path, handed.findings, handed.overridden)
+    return Ran(path, identity, handed.findings, handed.overridden)
 
 
 def simulated_plant(workspace: Folder) -> Plant:

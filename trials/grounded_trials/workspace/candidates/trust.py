@@ -161,14 +161,14 @@ def predicted(made: Candidate, cost: float, whole: float, begun: FromStarts | No
     """
     promised = made.predicted_utility
     in_log = promised - cost
-    moved = begun is not None and max(abs(begun.change), begun.std) > PLACED * abs(in_log)
+    moved = begun is not None and max(abs(begun.utility_change), begun.std) > PLACED * abs(in_log)
     return found(
         "plan.predicted",
         made.id,
         utility=promised,
         log=in_log if cost > 0 and f"{in_log:.4g}" != f"{promised:.4g}" else None,
         noise=much_noise(whole, in_log),
-        usual=Quantity(in_log + begun.change, "1", begun.std) if begun and moved else None,
+        usual=Quantity(in_log + begun.utility_change, "1", begun.std) if begun and moved else None,
         runs=begun.runs if begun and moved else None,
     )
 

@@ -34,11 +34,11 @@ from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.findings import found as finding
 from grounded.model import Model
-from grounded.result import Result
+from grounded.result import Document
 from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.adoption import known_values, units_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held
-from grounded_trials.workspace.home.taking_home import known_values, units_of
 from grounded_trials.workspace.home.yaml_file import as_yaml, number_in, read_yaml
 from grounded_trials.workspace.last_diagnosis import usable_ids
 from grounded_trials.workspace.user_files.config import set_in_model, set_priors
@@ -61,27 +61,18 @@ HELD = {"frictionloss": "dry_friction", "damping": "viscous_friction", "armature
 RATES = {"coulomb_friction": ("c", "dry_friction"), "viscous_friction": ("k", "viscous_friction")}
 
 
-@dataclass(frozen=True, repr=False)
-class Shelved(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class Shelved(Document):
     """An actuator written as a file."""
 
     file: Path
     actuator: str
-    values: Mapping[str, Estimate]
+    values: Mapping[str, Mapping[str, Any]]  # as `as_table`
     findings: tuple[Finding, ...] = ()
 
     def summary(self) -> str:
         """Return the actuator and its file."""
         return f"{self.actuator}: {self.file}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `export --library --json`."""
-        return {
-            "file": str(self.file),
-            "actuator": self.actuator,
-            "values": {key: as_table(one) for key, one in self.values.items()},
-            "findings": [one.to_json() for one in self.findings],
-        }
 
 
 def as_table(one: Estimate) -> dict[str, Any]:
@@ -111,8 +102,9 @@ def export_actuator(workspace: Folder, path: Path, name: str | None = None) -> S
         "trials": usable_ids(workspace),
     }
     head = {"actuator": name, "drives": drives, "unit": model.inputs[name], "source": about}
-    write_atomically(path, as_yaml(head | {key: as_table(one) for key, one in values.items()}))
-    return Shelved(path, name, values)
+    tables = {key: as_table(one) for key, one in values.items()}
+    write_atomically(path, as_yaml(head | tables))
+    return Shelved(path, name, tables)
 
 
 def begin_with(workspace: Folder, files: Sequence[str]) -> tuple[dict[str, Any], ...]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,14 @@ import numpy as np
 from grounded.accounts.sound_trials import sound_trials
 from grounded.adapters.mujoco import MujocoStepper
 from grounded.checks import same_names
+from grounded.diagnosis.error_report import BRIEF
 from grounded.diagnosis.levels import LEAST, SURE
 from grounded.diagnosis.rivals import Predicted, predicted
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity
 from grounded.findings import found as finding
 from grounded.model import Model
-from grounded.result import Result
+from grounded.result import Document
 from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.files_of_others import numbers_of_file, simulated_model
@@ -76,52 +77,31 @@ class Rival:
         return replace(self, effects=tuple(effects))
 
 
-@dataclass(frozen=True)
-class Decided:
-    """A number in which two models differ, and what the trials say of it."""
+@dataclass(frozen=True, eq=False)
+class Decided(Document):
+    """What the trials say of a state, or of a number, in which two models differ."""
 
-    name: str
-    values: tuple[str, str]  # of the two models
-    better: str  # the label of the model whose value predicts better; "" if it can't be decided
-
-    def to_json(self) -> dict[str, Any]:
-        """Return its entry in the document."""
-        return {"values": list(self.values), "better": self.better or None}
+    better: str | None  # the label of the model that predicts better; None if it can't be decided
+    values: tuple[str, str] | None = field(metadata=BRIEF, default=None)  # of a number
+    errors: tuple[float, float] | None = field(metadata=BRIEF, default=None)  # rms of a state
 
 
-@dataclass(frozen=True, repr=False)
-class Compared(Result):
+@dataclass(frozen=True, eq=False, repr=False)
+class Compared(Document):
     """Which of two models predicts the stored trials better."""
 
-    labels: tuple[str, str]
-    better: str  # a label; "" if it can't be decided
+    models: tuple[str, str]  # what the user called them
+    better: str | None  # one of them; None if it can't be decided
     gain: Quantity  # mean log ratio of errors, of the second over the first
-    ahead_s: float  # how far ahead `errors` are
-    errors: Mapping[str, tuple[float, float]]  # rms by state of both
-    channels: Mapping[str, str]  # the label that predicts a state better, "" if undecided
-    numbers: tuple[Decided, ...]
+    ahead_s: float  # how far ahead the errors are
+    where: Mapping[str, Decided]  # by state
+    numbers: Mapping[str, Decided]
     trials: tuple[str, ...]
     findings: tuple[Finding, ...]
 
     def summary(self) -> str:
         """Return what was found."""
         return self.findings[0].sentence
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `diagnose --compare` for two models."""
-        return {
-            "models": list(self.labels),
-            "better": self.better or None,
-            "gain": self.gain.to_json(),
-            "ahead_s": self.ahead_s,
-            "where": {
-                name: {"errors": list(both), "better": self.channels[name] or None}
-                for name, both in self.errors.items()
-            },
-            "numbers": {one.name: one.to_json() for one in self.numbers},
-            "trials": list(self.trials),
-            "findings": [one.to_json() for one in self.findings],
-        }
 
 
 def compare_models(
@@ -151,14 +131,13 @@ def compare_models(
     a, b = errors(one), errors(other)
     labels = (one.label, other.label)
     mine, theirs = one.numbers(), other.numbers()
-    numbers = []
+    numbers = dict[str, Decided]()
     for name in (n for n in {**mine, **theirs} if not _same(mine.get(n), theirs.get(n))):
         tick(name)
         swapped = one.having(name, theirs.get(name)), other.having(name, mine.get(name))
         votes = {a.better(errors(swapped[0])), -b.better(errors(swapped[1]))} - {0}
-        better = "" if len(votes) != 1 else labels[1] if 1 in votes else labels[0]
-        texts = _text(mine.get(name)), _text(theirs.get(name))
-        numbers.append(Decided(name, texts, better))
+        better = None if len(votes) != 1 else labels[1] if 1 in votes else labels[0]
+        numbers[name] = Decided(better, values=(_text(mine.get(name)), _text(theirs.get(name))))
     return _result(labels, a, b, numbers, ids_of(used))
 
 
@@ -166,21 +145,18 @@ def _result(
     labels: tuple[str, str],
     a: Predicted,
     b: Predicted,
-    numbers: Sequence[Decided],
+    numbers: Mapping[str, Decided],
     trials: tuple[str, ...],
 ) -> Compared:
     """Return the comparison of two models with the same trials."""
     way, gain = a.better(b), a.gain(b)
-    better = {1: labels[1], -1: labels[0], 0: ""}[way]
+    better = {1: labels[1], -1: labels[0]}.get(way)
     ahead = len(a.by_horizon) - 2 if len(a.by_horizon) > 1 else 0  # the last one before the whole
-    errors = {
-        name: (value, b.by_horizon[ahead][1][name])
-        for name, value in a.by_horizon[ahead][1].items()
-    }
     sure = np.abs(gain.channels) > np.maximum(SURE * gain.scatters, LEAST)
-    channels = {
-        name: (labels[1] if more > 0 else labels[0]) if clear else ""
-        for name, more, clear in zip(errors, gain.channels, sure, strict=True)
+    (ahead_s, first), (_, second) = a.by_horizon[ahead], b.by_horizon[ahead]
+    where = {
+        name: Decided(labels[int(more > 0)] if clear else None, errors=(first[name], second[name]))
+        for name, more, clear in zip(first, gain.channels, sure, strict=True)
     }
     size = Quantity(gain.mean, "1", gain.scatter)
     if better:
@@ -189,12 +165,9 @@ def _result(
         told = [finding("gap.trusted", better, better=better, worse=worse, ratio=ratio)]
     else:
         told = [finding("gap.undecided", *labels, models=True)]
-    if open_ := [one.name for one in numbers if not one.better]:
+    if open_ := [name for name, one in numbers.items() if not one.better]:
         told.append(finding("gap.undecided", *open_))
-    ahead_s = a.by_horizon[ahead][0]
-    return Compared(
-        labels, better, size, ahead_s, errors, channels, tuple(numbers), trials, tuple(told)
-    )
+    return Compared(labels, better, size, ahead_s, where, numbers, trials, tuple(told))
 
 
 def _rival(workspace: Folder, text: str) -> Rival:

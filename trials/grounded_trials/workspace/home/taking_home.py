@@ -8,7 +8,6 @@ listed with its equation, there and as a finding.
 from __future__ import annotations
 
 import datetime
-import math
 import os
 import shutil
 import tempfile
@@ -24,61 +23,49 @@ from grounded.effects import param_name
 from grounded.errors import GroundedError
 from grounded.findings import Finding, settle
 from grounded.findings import found as finding
-from grounded.result import Result
+from grounded.result import Document
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.adopted import installed_effects
-from grounded_trials.workspace.adopting import as_adopted
+from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held, Number, value_of
 from grounded_trials.workspace.home.mjcf import Mjcf
 from grounded_trials.workspace.home.python_file import with_values
 from grounded_trials.workspace.home.urdf import Urdf
 from grounded_trials.workspace.home.xml_text import XmlText, commented
-from grounded_trials.workspace.last_diagnosis import as_fitted
 
-SAME = 1e-6  # relative difference of a value from the one whose +- is known
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
 
 
-@dataclass(frozen=True)
-class Value:
-    """A number of the exported file."""
+@dataclass(frozen=True, eq=False)
+class Value(Document):
+    """A number of the exported file, and what it was in the file that the model came from."""
 
-    name: str  # elbow.damping
-    now: Estimate
-    was: float  # in the file that the model came from
+    value: float
+    std: float
+    unit: str
+    was: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return its entry in the document of `export --model`."""
-        std = self.now.std if math.isfinite(self.now.std) else None
-        return {"value": self.now.value, "std": std, "unit": self.now.unit, "was": self.was}
+    @property
+    def text(self) -> str:
+        """The value with its +-."""
+        return Estimate(self.value, self.std, unit=self.unit).text
 
 
-@dataclass(frozen=True, repr=False)
-class TakenHome(Result):
-    """An exported model: its file, its numbers, and what the file can't hold."""
+@dataclass(frozen=True, eq=False, repr=False)
+class TakenHome(Document):
+    """An exported model: its file, its numbers by name, and what the file can't hold."""
 
     file: Path
     source: Path
     date: str
-    values: tuple[Value, ...]
+    values: Mapping[str, Value]
     findings: tuple[Finding, ...]
     others: tuple[Path, ...] = ()  # files that it includes, written beside it
 
     def summary(self) -> str:
         """Return the file."""
         return str(self.file)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `export --model --json`."""
-        return {
-            "file": str(self.file),
-            "source": str(self.source),
-            "date": self.date,
-            "values": {one.name: one.to_json() for one in self.values},
-            "others": [str(path) for path in self.others],
-            "findings": [one.to_json() for one in self.findings],
-        }
 
 
 def export_model(workspace: Folder, path: Path | None) -> TakenHome:
@@ -98,37 +85,6 @@ def export_model(workspace: Folder, path: Path | None) -> TakenHome:
     return (_simulated if simulated else _python)(workspace, source, path)
 
 
-def known_values(workspace: Folder) -> dict[str, Estimate]:
-    """Return the values of parameters and adopted effects, by parameter name, with their +-.
-
-    The +- is that of the adoption or of the last fit, NaN if the value is another one now.
-    """
-    sources = [{n: (e.value, e.std) for n, e in as_adopted(workspace).items()}]
-    sources, now = [*sources, as_fitted(workspace)], dict[str, Estimate]()
-    for name, param in workspace.base_model.params.items():
-        now[name] = Estimate(param.value, unit=param.unit)
-    for effect in workspace.config.model.effects:
-        units = units_of(workspace, str(effect["name"]))
-        for q, value in effect.items():
-            if q != "name":
-                name = param_name(str(effect["name"]), q)
-                now[name] = Estimate(float(value), unit=units.get(q, ""))
-    for name, one in now.items():
-        for value, std in (source[name] for source in sources if name in source):
-            if math.isclose(value, one.value, rel_tol=SAME, abs_tol=1e-12):
-                now[name] = Estimate(one.value, std, unit=one.unit)
-    return now
-
-
-def units_of(workspace: Folder, effect: str) -> dict[str, str]:
-    """Return the units of an effect's quantities."""
-    try:
-        known = installed_effects().effect(effect, workspace.base_model).quantities
-    except GroundedError:  # beside another adopted effect, or of a package that is not installed
-        return {}
-    return {q.name: q.unit for q in known}
-
-
 def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     """Write an MJCF or URDF file."""
     model, file, values = workspace.base_model, load(source), known_values(workspace)
@@ -142,7 +98,7 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
         numbers = held.without(dropped)
         dropped += form.write(numbers)
         numbers = held.without(dropped)
-        taken = [Value(n.name, Estimate(n.value, n.std, unit=n.unit), n.was) for n in numbers]
+        taken = {n.name: Value(n.value, n.std, n.unit, n.was) for n in numbers}
         told = [*lost, *(_no_place(one) for one in dropped)]
         date, comment = _comment(workspace, taken, told)
         files = form.files(path, commented(comment))
@@ -155,7 +111,7 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
         beside = [os.path.relpath(one, source.parent) for one in files_of(source)[1:]]
         told += [finding("model.reads", *sorted(beside))] if beside else []
     others = tuple(name for name in files if name != path)
-    return TakenHome(path, source, date, tuple(taken), settle(told), others)
+    return TakenHome(path, source, date, taken, settle(told), others)
 
 
 def _adopted(workspace: Folder, held: Held, values: Mapping[str, Estimate]) -> Any:
@@ -225,7 +181,11 @@ def _python(workspace: Folder, source: Path, path: Path) -> TakenHome:
         name: values[name] for name, param in written.items() if values[name].value != param.value
     }
     text, hidden = with_values(source, {name: one.value for name, one in changed.items()})
-    taken = [Value(n, one, written[n].value) for n, one in changed.items() if n not in hidden]
+    taken = {
+        name: Value(one.value, one.std, one.unit, written[name].value)
+        for name, one in changed.items()
+        if name not in hidden
+    }
     told = [finding("model.no_place", n, value=changed[n].text) for n in hidden]
     for effect in workspace.config.model.effects:
         name = str(effect["name"])
@@ -235,7 +195,7 @@ def _python(workspace: Folder, source: Path, path: Path) -> TakenHome:
     head, rest = _head(text)
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment)
     write_atomically(path, f"{head}{lines}{rest}".encode())
-    return TakenHome(path, source, date, tuple(taken), settle(told))
+    return TakenHome(path, source, date, taken, settle(told))
 
 
 def _head(text: str) -> tuple[str, str]:
@@ -250,10 +210,10 @@ def _head(text: str) -> tuple[str, str]:
 
 
 def _comment(
-    workspace: Folder, values: Sequence[Value], told: Sequence[Finding]
+    workspace: Folder, values: Mapping[str, Value], told: Sequence[Finding]
 ) -> tuple[str, list[str]]:
     """Return the date, and the lines of the comment that goes into the file."""
     date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     lines = [f"grounded, {date}: values found in {workspace.folder.resolve().name}"]
-    lines += [f"{one.name} = {one.now.text} (was {one.was:g})" for one in values]
+    lines += [f"{name} = {one.text} (was {one.was:g})" for name, one in values.items()]
     return date, lines + [one.what for one in told]

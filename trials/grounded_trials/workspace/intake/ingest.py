@@ -54,8 +54,9 @@ from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gon
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
-from grounded_trials.workspace.next_step import PROPOSE, after_log, another_trial
+from grounded_trials.workspace.next_step import after_log, another_trial
 from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
+from grounded_trials.workspace.target_state import PROPOSE
 from grounded_trials.workspace.unknown_id import refuse_ids
 
 if TYPE_CHECKING:

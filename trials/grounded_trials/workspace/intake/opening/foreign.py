@@ -36,8 +36,8 @@ from grounded_trials.workspace.intake.opening.estimating import (
     read_estimate,
     with_estimates,
 )
-from grounded_trials.workspace.last_diagnosis import hashed, read_by
 from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.where_to_mend import hashed, read_by
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
