@@ -285,7 +285,7 @@ def _probe(
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
     offer = write or bool(ties)
-    plan = near(planner, trials)
+    plan = near(planner.plan, task.model.n, trials)
     for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
@@ -326,18 +326,17 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
     )
 
 
-def near(planner: Planner, trials: Sequence[Trial]) -> Task:
+def near(task: Task, n: int, trials: Sequence[Trial]) -> Task:
     """Bound the states without [safety] to the range of the trials, extended by half on each side.
 
     Without it, a probe may go anywhere (doublets took a quadrotor 100 m below the ground). States
-    that nothing measures, angles, and the memory states of effects remain unbounded.
+    that nothing measures, angles, and the memory states of effects, from the nth on, stay unbounded.
     """
-    task = planner.plan
     been = np.vstack([trial.states for trial in trials])
     known = np.isfinite(been)
     low = np.where(known, been, np.inf).min(axis=0)
     high = np.where(known, been, -np.inf).max(axis=0)
-    unknown = ~known.any(axis=0) | (np.arange(task.model.n) >= planner.task.model.n)
+    unknown = ~known.any(axis=0) | (np.arange(task.model.n) >= n)
     low, high = np.where(unknown, 0.0, low), np.where(unknown, 0.0, high)
     free = task.model.angle_mask | unknown
     room = np.where(free, np.inf, 0.5 * (high - low))

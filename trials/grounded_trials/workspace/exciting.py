@@ -128,7 +128,7 @@ def _bounded(workspace: Folder) -> Task:
         raise GroundedError(found("plan.no_limits", *free, weight=Weight.REFUSE))
     trials = [one for one in workspace.task_trials() if one.steps > 1]
     if trials:
-        task = near(planner, trials)
+        task = near(task, planner.task.model.n, trials)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([*task.safety_low, *task.safety_high]).any():
         raise GroundedError(found("plan.no_drive", state=task.model.state_names[0]))
