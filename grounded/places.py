@@ -23,6 +23,7 @@ HEADINGS = ("psi", "yaw", "heading", "theta")
 SHORT = 1e-5  # step for instantaneous rates [s]
 STRAIGHT = 1e-3  # error of velocities of about 1 from such a step
 LITTLE = 1e-3  # part of what an input moves most below which it does not move a state
+SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
 
@@ -339,6 +340,13 @@ def _integrals(model: Model) -> tuple[Integral, ...]:
     ]
     carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
     return (*found, *(Integral(i, names.index(k), 1.0, exact=False) for i, k in carried))
+
+
+def rate_states(model: Model) -> dict[str, str]:
+    """Return the states whose rate is another state of the model: {q: w}."""
+    names = model.state_names
+    own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
+    return {names[r.i]: names[r.j] for r in own}
 
 
 def told_by(model: Model, pair: Sequence[str]) -> set[str]:

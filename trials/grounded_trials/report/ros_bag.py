@@ -26,8 +26,8 @@ import numpy as np
 from grounded.checks import one_of, refused
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import rate_states
 from grounded_trials.formats.bags import standard_types
-from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.candidates.exporting import Exported, format_of
@@ -69,7 +69,7 @@ class _Run:
         self.kinds = standard_types().types
         scene = scene_of(model)
         self.scene: Scene | None = scene if scene.spatial else None
-        self.joints = {q: w for q, w in velocities(model).items() if model.states[q] == "rad"}
+        self.joints = {q: w for q, w in rate_states(model).items() if model.states[q] == "rad"}
 
     def messages(self, states: Array, inputs: Array, target: Array) -> Iterator[Message]:
         """Yield all messages; values that are not finite are left out."""

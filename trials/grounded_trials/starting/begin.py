@@ -19,7 +19,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import undeclared_angles
+from grounded.places import rate_states, undeclared_angles
 from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import states_time_unit
@@ -29,7 +29,6 @@ from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
 from grounded_trials.logs.inspection.names import PARTS
-from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.logs.log_files import column_units, kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
@@ -227,7 +226,7 @@ def _begin(
     notes = (*notes, *(_on_own(report, states, inputs, built) if own else ()))
 
     # The files: first without a target, since the log is read as grounded.toml says.
-    rates = velocities(built)
+    rates = rate_states(built)
     simulated = report.simulated
     table = mapping_toml(states, inputs, simulated=simulated, rates=rates, layout=layout)
 

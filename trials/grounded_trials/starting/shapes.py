@@ -17,10 +17,9 @@ from grounded import places
 from grounded.checks import known, positive, refused, wrong
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import integrals
+from grounded.places import integrals, rate_states
 from grounded.places import velocities as velocities_of
 from grounded.task import MAX_HORIZON
-from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.workspace.off_target import position_names
 
 PATHS = ("line", "circle", "figure-8")
@@ -261,7 +260,7 @@ def line_target(
     if not 0 < length < np.inf:
         there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
         still = {*to} <= {*velocities_of(model)}
-        goes = next((q for q in (*position_names(model), *velocities(model)) if q not in to), "")
+        goes = next((q for q in (*position_names(model), *rate_states(model)) if q not in to), "")
         raise wrong("--to", got=there, must="way", like=f"{goes}=1.0" if still and goes else None)
     if seconds is not None:
         drive = _in_time(drive, length, seconds, kept)
@@ -273,7 +272,7 @@ def line_target(
     t, share, rate = _driven(along, speed, drive.hold, dt, seconds)
     share, rate = share / length, rate / length
     columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
-    rates, place = velocities(model), position_names(model)
+    rates, place = rate_states(model), position_names(model)
     way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
     columns |= {q: np.full(len(t), start.get(q, 0.0)) for q in way if q not in columns}
     columns |= {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
@@ -308,7 +307,7 @@ def has_plane(model: Model) -> bool:
 
 def _axis(model: Model) -> str:
     """Return the state along which a line without `--to` runs."""
-    named = model.roles.get("position") or model.roles.get("rail") or tuple(velocities(model))
+    named = model.roles.get("position") or model.roles.get("rail") or tuple(rate_states(model))
     moved = (named,) if isinstance(named, str) else named
     if len(moved) == 1:
         return moved[0]
@@ -448,7 +447,7 @@ def swing_up(
     if not chosen and not any(model.states.get(name) == "rad" for name in to):
         raise wrong("--to", must="hinge", like="--to q=3.1416")
     first = np.arange(in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
-    columns, rates = {}, velocities(model)
+    columns, rates = {}, rate_states(model)
     for one in chosen:
         if (rate := rates.get(one.angle, "")) in to:
             facts = {"asked": f"{to[rate]:g}", "why": "swing"}

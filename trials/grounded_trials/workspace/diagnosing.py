@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded.policy import Policy
     from grounded.search.candidate import Candidate
-    from grounded.search.planner import Planner
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -330,7 +329,7 @@ def near(task: Task, n: int, trials: Sequence[Trial]) -> Task:
     """Bound the states without [safety] to the range of the trials, extended by half on each side.
 
     Without it, a probe may go anywhere (doublets took a quadrotor 100 m below the ground). States
-    that nothing measures, angles, and the memory states of effects, from the nth on, stay unbounded.
+    that nothing measures, angles, and memory states of effects, from the nth on, stay unbounded.
     """
     been = np.vstack([trial.states for trial in trials])
     known = np.isfinite(been)

@@ -115,6 +115,8 @@ class Folder:
     @property
     def log_mapping(self) -> LogMapping | None:
         """Where [log] finds the signals of the model; None without that table."""
+        if not self.config.log.names():
+            return None
         from grounded_trials.logs.log_table import log_mapping
 
         model = self.base_model

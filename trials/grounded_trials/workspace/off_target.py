@@ -18,6 +18,7 @@ import numpy as np
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.places import rate_states
 from grounded.result import Document, or_zero
 from grounded.search.scatter import beyond_noise
 from grounded.task import Task
@@ -211,10 +212,8 @@ def position_names(model: Model) -> list[str]:
 
 def rates_beside(model: Model, names: Collection[str]) -> set[str]:
     """Return which of some states are the velocities of others, or of a position among them."""
-    from grounded_trials.logs.inspection.relations import velocities
-
     known = {model.state_names[i] for role in RATES for i in roles_of(model).get(role, ())}
-    moved = {rate for place, rate in velocities(model).items() if place in names}
+    moved = {rate for place, rate in rate_states(model).items() if place in names}
     return {*names} & (moved | (known if {*position_names(model)} & {*names} else set()))
 
 

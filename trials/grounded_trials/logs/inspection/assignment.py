@@ -25,6 +25,7 @@ import numpy as np
 
 from grounded.findings import Finding, found
 from grounded.model import Model
+from grounded.places import rate_states
 from grounded.units import DEGREES, factor_between
 from grounded_trials.logs.inspection import names as words
 from grounded_trials.logs.inspection.guess import Guess
@@ -46,7 +47,6 @@ from grounded_trials.logs.inspection.relations import (
     Follows,
     Signals,
     follows,
-    velocities,
 )
 from grounded_trials.logs.inspection.steps import by_groups, by_inputs
 from grounded_trials.logs.stated_units import (
@@ -126,7 +126,7 @@ def assigned(
         table.look(model, signals)
     guesses = {guess.name: guess for guess in table.solved()}
     if model is not None and signals is not None:
-        for pair in velocities(model).items():
+        for pair in rate_states(model).items():
             if set(pair) <= guesses.keys():
                 guesses |= _followed(guesses, pair, signals, table)
         guesses = _by_steps(guesses, model, signals, table)
@@ -312,7 +312,7 @@ class _Table:
                 value = _lagged(signals, angle, path)
                 if value < FOLLOWS:
                     self.add(role.name, path, -2 * CAP)
-        for pair in velocities(model).items():
+        for pair in rate_states(model).items():
             if set(pair) <= self.row.keys():
                 self._relate(pair, first, signals)
         self._speed(model, signals)
@@ -633,7 +633,7 @@ def _by_steps(
     signals.read(moving * (len(moving) <= 2 * FEW))
     bare = [
         pair
-        for pair in velocities(model).items()
+        for pair in rate_states(model).items()
         if not any((name, guesses[name].path) in table.named for name in pair)
     ]
     guesses = {**guesses, **by_groups(model, guesses, bare, signals, measured)}
@@ -649,7 +649,7 @@ def _the_rest(
     """
     lost = [name for name in model.input_names if not guesses[name].path]
     known = {name for name in model.state_names if guesses[name].path}
-    known |= {w for q, w in velocities(model).items() if q in known}
+    known |= {w for q, w in rate_states(model).items() if q in known}
     used = {guess.path for guess in guesses.values()}
     left = [n for n in table.numbers if n.moves and n.path not in used]
     named = any((name, guesses[name].path) in table.named for name in model.state_names)

@@ -12,8 +12,6 @@ from itertools import permutations
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.model import Model
-from grounded.places import integrals
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy
@@ -21,7 +19,6 @@ from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.within import OverBudget
 
-SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 FOLLOWS, SURELY = 0.8, 0.95  # correlation of a rate with a derivative: named so, or not
 SAME = 0.15  # relative tolerance of the size of a rate
 COMBINATIONS, LONGEST = 64, 20_000  # largest number of combinations tried; samples of a grid
@@ -63,13 +60,6 @@ def follows(q: Floats, w: Floats, step: float) -> Follows:
         return Follows(0.0, 1.0)
     a, b = a - a.mean(), b - b.mean()
     return Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
-
-
-def velocities(model: Model) -> dict[str, str]:
-    """Return the states whose rate is another state of the model: {q: w}."""
-    names = model.state_names
-    own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
-    return {names[r.i]: names[r.j] for r in own}
 
 
 def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:

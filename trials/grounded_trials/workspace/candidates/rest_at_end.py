@@ -21,14 +21,13 @@ import numpy as np
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
-from grounded.places import integrals
+from grounded.places import integrals, rate_states
 from grounded.search.candidate import Candidate
 from grounded.search.planner import Planner
 from grounded.search.safety import as_sent, coasting, coasts_out
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.workspace.candidates.at_rest import rest_value
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import reaches, tracked, usual_weights, weighed_groups
@@ -127,7 +126,7 @@ def rest_at_end(
         start: [task] start.
     """
     model = workspace.base_model
-    rates, free = velocities(model), [name for name in model.states if name not in columns]
+    rates, free = rate_states(model), [name for name in model.states if name not in columns]
     if not free:
         return None
     last = {name: float(column[-1]) for name, column in columns.items()}
@@ -183,7 +182,7 @@ def _rests(task: Task) -> int:
 
 def drawn(task: Task) -> NextCommand | None:
     """Return the `target` command for the line or step that a target appears to be; else None."""
-    names, rates = task.model.state_names, {*velocities(task.model).values()}
+    names, rates = task.model.state_names, {*rate_states(task.model).values()}
     given = [i for i in tracked(task) if names[i] not in rates]
     way = task.model.difference(task.target, task.start)[:, given]
     if not way.any():

@@ -27,11 +27,10 @@ from grounded.estimate.record import Record
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import probe
+from grounded.places import probe, rate_states
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.command_steps import stands_still
-from grounded_trials.logs.inspection.relations import velocities
 from grounded_trials.logs.resample import stamped_otherwise
 from grounded_trials.logs.samples import Samples, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
@@ -135,7 +134,7 @@ def _at_rest(samples: Sequence[Samples], sent: Sequence[Samples], model: Model) 
     if not stands_still(samples, (), until):
         return {}
     own = {s.name for s in samples}
-    return {rate: until for place, rate in velocities(model).items() if place in own}
+    return {rate: until for place, rate in rate_states(model).items() if place in own}
 
 
 @dataclass(frozen=True)
