@@ -14,7 +14,7 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import wraps
 from io import StringIO, TextIOWrapper
@@ -67,8 +67,6 @@ COMMANDS = {
     "completion": ("console.completion", "Print the shell's completion script."),
 }
 
-ABOUT = 0.1  # difference in likeness of two spellings that is hardly one
-
 
 class LazyGroup(click.Group):
     """A group that imports a command's module when it is called, so that start-up stays fast."""
@@ -104,16 +102,6 @@ class LazyGroup(click.Group):
         """Run a command; append the command to type next to the message of a GroundedError."""
         try:
             return super().invoke(ctx)
-        except click.NoSuchOption as error:
-            if error.possibilities:
-                near = _closest(error.option_name, error.possibilities)
-                raise click.NoSuchOption(
-                    error.option_name, possibilities=near, ctx=error.ctx
-                ) from None
-            if not (meant := _meant(error)):
-                raise
-            text = f"{error.message} Did you mean {' or '.join(map(repr, meant))}?"
-            raise click.NoSuchOption(error.option_name, text, ctx=error.ctx) from None
         except Exception as error:
             if not isinstance(error, GroundedError):
                 raise
@@ -145,22 +133,6 @@ def _apart(command: Callable[..., T]) -> Callable[..., T]:
 
     vars(run)["apart"] = True
     return run
-
-
-def _closest(name: str, options: Sequence[str]) -> list[str]:
-    """Return the options that are about as close to a misspelt one as the closest (--hmtl)."""
-    from difflib import SequenceMatcher
-
-    near = {one: SequenceMatcher(None, name, one).ratio() for one in options}
-    return [one for one in options if near[one] > max(near.values()) - ABOUT]
-
-
-def _meant(error: click.NoSuchOption) -> list[str]:
-    """Return the options whose help text has the word of an unknown one (--radius: --size)."""
-    word = error.option_name.strip("-").lower()
-    own = error.ctx.command.params if error.ctx else []
-    some = [o for o in own if isinstance(o, click.Option) and word in (o.help or "").lower()]
-    return [option.opts[0] for option in some] if len(word) > 2 else []
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

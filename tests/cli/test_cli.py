@@ -88,7 +88,6 @@ def test_version():
     [
         (["propse"], "no command 'propse': did you mean 'propose'"),
         (["propose", "--jsn"], "--json"),
-        (["target", "circle", "--radius", "1"], "'--size'"),
         (["init"], "--from LOG"),
         (["init", "x"], "--blank --model"),
         (["ingest"], "Missing argument"),

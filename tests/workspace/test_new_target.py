@@ -10,8 +10,6 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace import new_target
-from grounded_trials.workspace.new_target import refuse_degrees
-from small_tasks import rover
 from workspaces import blank, edit
 
 LINE = np.linspace(0, 1, 21)
@@ -105,33 +103,12 @@ def test_a_broken_grounded_toml_is_told_before_a_target_is_written(w, change, na
     assert files(w) == before
 
 
-T = np.linspace(0.0, 1.0, 201)
-S_CURVE = {"x": 12 * T, "y": 2.5 * T**3 * (10 - 15 * T + 6 * T**2)}
-COURSE = np.arctan2(np.gradient(S_CURVE["y"]), np.gradient(S_CURVE["x"]))
-CIRCLE = {"x": np.sin(2 * np.pi * T), "y": 1 - np.cos(2 * np.pi * T)}
-
-
-@pytest.mark.parametrize(
-    ("path", "heading", "ok"),
-    [
-        (S_CURVE, COURSE, True),
-        (S_CURVE, np.pi / 2 - COURSE, True),  # a compass
-        (S_CURVE, COURSE + np.pi, True),  # backwards
-        (S_CURVE, 1.5 + 0 * T, True),  # sideways
-        ({"x": 12 * T, "y": 0 * T}, 1.5 + 0 * T, True),
-        (S_CURVE, 3 * T, True),
-        (S_CURVE, np.degrees(COURSE), False),
-        (S_CURVE, 90 - np.degrees(COURSE), False),
-        (CIRCLE, 2 * np.pi * T, True),
-        (CIRCLE, 360 * T, False),
-        (CIRCLE, (360 * T + 180) % 360 - 180, False),
-    ],
-)
-def test_a_heading_in_degrees_beside_its_positions_is_refused(path, heading, ok):
-    if ok:
-        return refuse_degrees({**path, "psi": heading}, rover)
-    with pytest.raises(GroundedError, match=holding("psi", "rad")):
-        refuse_degrees({**path, "psi": heading}, rover)
+@pytest.mark.parametrize(("end", "told"), [(1.5, False), (90.0, True)])
+def test_a_table_in_degrees_is_told(w, tmp_path, end, told):
+    rows = "".join(f"{0.02 * k:.2f},{end * k / 100}\n" for k in range(101))
+    (table := tmp_path / "mine.csv").write_text("t,theta\n" + rows)
+    done = grounded("-C", w.folder, "target", table, "--json").json
+    assert ("start.degrees" in {one["code"] for one in done["findings"]}) == told
 
 
 def test_a_target_that_was_drawn_in_readings_of_a_biased_sensor_is_told(w):

@@ -72,11 +72,6 @@ def ranges(names: Sequence[str]) -> str:
     return ", ".join(name for piece in told for name in piece)
 
 
-def changed(name: str, old: float, new: float, unit: str) -> str:
-    """Return `m 1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
-    return f"{name} {moved(old, new, unit)}"
-
-
 def moved(old: float, new: float, unit: str, least: int = 3) -> str:
     """Return `1.00 -> 1.30 kg`, with enough digits to distinguish the two values."""
     was, now = in_digits_apart(old, new, least)

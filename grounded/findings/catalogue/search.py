@@ -138,13 +138,6 @@ ENTRIES: dict[str, Entry] = {
         "longer",
         "if the robot has run {candidate} meanwhile, that log still counts",
     ),
-    "traded": Entry(
-        "note",
-        "{candidate} is better than {before} although {what} is off by {now:size} rms instead of "
-        "{was:size}: [[inputs? its inputs cost less]][[!inputs? other states are nearer to "
-        "theirs]]",
-        "if that matters more, weigh it more in [reward] state, or stop here",
-    ),
     # names
     "aside": Entry("refuse", "{about}[[, a run of {candidate},]] is set aside[[ ({why})]]"),
     "unknown": Entry(

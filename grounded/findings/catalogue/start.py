@@ -86,8 +86,8 @@ ENTRIES: dict[str, Entry] = {
     "degrees": Entry(
         "note",
         "{about} is in rad by the model[[, but goes from {low} to {high}]][[: {turns:.2g} turns]]",
-        "[[if you meant degrees, use `--to {about}={to}`]][[target? its course shows degrees: "
-        "multiply it by {scale:.8g}]][[!target? if in degrees,"
+        "[[if you meant degrees, use `--to {about}={to}`]][[target? if in degrees, multiply it by "
+        "{scale:.8g}]][[!target? if in degrees,"
         " set scale = {scale:.8g} in [log], of its rate too; [limits] are in rad]]",
     ),
     "no_start": Entry(

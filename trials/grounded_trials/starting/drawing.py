@@ -295,10 +295,14 @@ def _slower(case: _Case) -> Iterator[Finding]:
 
 
 def _in_degrees(case: _Case) -> Iterator[Finding]:
-    for name, value in case.asked.to.items():
-        if case.units.get(name) == "rad" and abs(value) > TURNS * 2 * math.pi:
-            turns = abs(value) / (2 * math.pi)
-            yield found("start.degrees", name, turns=turns, to=f"{math.radians(value):.4g}")
+    given, columns = case.asked.to, {} if case.asked.is_path else case.columns
+    largest = {name: max(column, key=abs) for name, column in columns.items()} | dict(given)
+    for name, value in largest.items():
+        turns = abs(float(value)) / (2 * math.pi)
+        if case.units.get(name) == "rad" and turns > TURNS:
+            to = f"{math.radians(value):.4g}" if name in given else None
+            scale = math.radians(1.0)
+            yield found("start.degrees", name, turns=turns, to=to, target=not to, scale=scale)
 
 
 def _weighed_without_column(case: _Case) -> Iterator[Finding]:

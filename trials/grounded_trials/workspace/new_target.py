@@ -1,11 +1,7 @@
-"""Replace the target of a workspace, once its columns are checked.
-
-A heading in degrees is found by the course of the target's positions.
-"""
+"""Replace the target of a workspace, once its columns are checked."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -15,12 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.table import DEGREES
-from grounded.checks import numbers, refused, unknown, wrong
+from grounded.checks import numbers, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import role
 from grounded.task import MAX_HORIZON
 from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import write_atomically
@@ -31,12 +25,6 @@ from grounded_trials.workspace.user_files.task_file import (
     read_target,
     write_target,
 )
-
-MOVING = 0.1  # of the fastest step: slower ones have no course
-TURNS = 0.05  # rad: a course that changes less, in rms, shows no unit
-FITS = 0.2  # of that change: rms difference up to which a heading in degrees follows the course
-LEFT = 0.5  # of that change: difference from which on a heading in radians does not
-FRAMES = ((1.0, 0.0), (-1.0, 0.0), (-1.0, math.pi / 2))  # from x; clockwise; a compass: from y
 
 
 def replace_target(
@@ -57,7 +45,6 @@ def replace_target(
     from grounded_trials.workspace.off_target import usual_weights
 
     columns = checked(columns, model)
-    refuse_degrees(columns, model)
     check_tables(config, model, len(next(iter(columns.values()))))
     each = usual_weights(model, columns)  # of ranges such as 1800 mm
     weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
@@ -133,49 +120,3 @@ def checked(columns: Any, model: Model) -> dict[str, Array]:
         rows_at_most = MAX_HORIZON + 1
         raise wrong("the rows of a target", count, low=2, high=rows_at_most, do="rows")
     return found
-
-
-def refuse_degrees(columns: Mapping[str, Array], model: Model) -> None:
-    """Refuse a target whose heading fits the course of its positions only as degrees.
-
-    Only models that declare the roles heading and position are checked. The course may be driven
-    backwards, and a heading may be counted clockwise, from x or from y. A robot that moves sideways
-    has any heading: it then fits neither way, and nothing is refused.
-
-    Args:
-        columns: the desired values, (H + 1,) each.
-        model: whose heading is in rad.
-
-    Raises:
-        GroundedError: naming the largest heading and that of the course.
-    """
-    name, position = next(iter(role(model, "heading")), ""), role(model, "position")[:2]
-    if model.states.get(name) != "rad" or len(position) < 2:
-        return
-    if not {name, *position} <= columns.keys():
-        return
-    steps = np.diff([columns[axis] for axis in position], axis=1)
-    far = np.hypot(*steps)
-    moves = far > MOVING * far.max()
-    if not moves.any():
-        return
-    course = np.arctan2(steps[1], steps[0])[moves]
-    heading = columns[name][:-1][moves]
-    turned = _off(course, np.angle(np.exp(2j * course).mean()) / 2)
-    if turned < TURNS or _nearest(course, heading) < LEFT * turned:
-        return
-    if _nearest(course, heading / DEGREES) > FITS * turned:
-        return
-    most = float(np.abs(columns[name]).max())
-    facts = {"low": f"{-most:.4g}", "high": f"{most:.4g}", "scale": 1 / DEGREES}
-    raise refused("start.degrees", name, target=1, **facts)
-
-
-def _nearest(course: Array, heading: Array) -> float:
-    """Return the rms difference of a course from a heading in the frame that fits best [rad]."""
-    return min(_off(course, sign * heading + offset) for sign, offset in FRAMES)
-
-
-def _off(course: Array, heading: Array | float) -> float:
-    """Return the rms difference of two angles, forwards or backwards alike [rad]."""
-    return float(np.sqrt(np.mean((np.angle(np.exp(2j * (course - heading))) / 2) ** 2)))

@@ -27,12 +27,11 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.user_files.task_file import equal_weights
 
 if TYPE_CHECKING:
-    from grounded.search.candidate import Tried
+    pass
 
 FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
 MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
-FARTHER = 1.1  # of the error before: a better candidate's larger error is explained
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
@@ -263,40 +262,6 @@ def asked_for(task: Task) -> list[int]:
 def tracking_error(task: Task, trial: Trial) -> Array:
     """Return s_t - target_t, (T + 1, n), with angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
-
-
-def traded(task: Task, best: Tried, before: Tried) -> Finding | None:
-    """Return that a better candidate is farther from its target than the one before; else None.
-
-    Utility also counts inputs and other states. On a path that is followed to a centimetre they may
-    be all that is left to gain. Runs that began apart are farther off for that reason alone.
-    """
-    if best.starts is not None and best.starts.owed(best, before) != 0:
-        return None
-    pair = [off_target_of(task, tried.trials)[:1] for tried in (before, best)]
-    if not all(pair) or pair[0][0].what != pair[1][0].what:
-        return None
-    was, now = pair[0][0], pair[1][0]
-    if not now.rms > FARTHER * was.rms:
-        return None
-    each = ([cost_of_inputs(task, run) for run in one.trials] for one in (before, best))
-    costs = [float(np.mean(own)) for own in each]
-    return found(
-        "search.traded",
-        best.candidate.id,
-        candidate=best.candidate.id,
-        before=before.candidate.id,
-        what=was.what,
-        was=Quantity(was.rms, was.unit),
-        now=Quantity(now.rms, was.unit),
-        inputs=int(costs[0] - costs[1] > 0.5 * (best.utility - before.utility)),
-    )
-
-
-def cost_of_inputs(task: Task, run: Trial) -> float:
-    """Return what the inputs of a run cost by [reward] input and input_change."""
-    terms = task.terms(run)
-    return -(terms.get("input", 0.0) + terms.get("input_change", 0.0))
 
 
 def began_elsewhere(task: Task, trials: Sequence[Trial], predicted: Array) -> dict[str, str]:

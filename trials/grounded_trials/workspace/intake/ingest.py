@@ -55,7 +55,7 @@ from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhe
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
 from grounded_trials.workspace.next_step import after_log, another_trial
-from grounded_trials.workspace.off_target import OffTarget, off_target_of, traded
+from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.target_state import PROPOSE
 from grounded_trials.workspace.unknown_id import refuse_ids
 
@@ -273,10 +273,6 @@ def _of_search(
     said = [] if added.known else [*no_longer(workspace, added.id, now)]
     if read.doubted and added.id not in workspace.discarded():
         said += odd_run(workspace, now, added.id, aside=_aside(read))
-    rest = [one for one in now.history if one is not tried and one.accepted]
-    outdone = max(rest, key=lambda one: one.utility, default=None)
-    if tried is not None and now.incumbent is tried and outdone:
-        said += filter(None, [traded(workspace.task, tried, outdone)])
     yield from said
 
 
