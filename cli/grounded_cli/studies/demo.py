@@ -114,7 +114,7 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
         show(field("optimum", f"{number(document['optimum'])}, by the true model"))
     used, trials = document["diagnosed_trials"], document["trials"]
     if 0 < used < trials:
-        verdict = [*verdict, f"Diagnosis: {used} of {trials} trials."]
+        verdict = [*verdict, f"Diagnosed: {used} of {trials} trials."]
     for k, line in enumerate(verdict):
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():
