@@ -20,15 +20,15 @@ from pathlib import Path
 import grounded.diagnosis.diagnose as diagnosing
 from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
 from grounded.challenge.score import share
-from grounded.diagnosis.validation import choose, gain
+from grounded.diagnosis.validation import choose
 from grounded.diagnosis.validation.choose import Comparison
 from grounded.diagnosis.validation.decide import Options, decide
 
 CURVES = {
     (choose, "NATS"): (1.0, 2.0, 3.0, 5.0, 8.0),
-    (gain, "SURE"): (0.5, 1.0, 1.5, 2.0, 3.0),
+    (choose, "SURE"): (0.5, 1.0, 1.5, 2.0, 3.0),
     (choose, "SHARE"): (0.0, 0.01, 0.02, 0.05),
-    (gain, "LEAST"): (0.0, 0.01, 0.03, 0.1),
+    (choose, "LEAST"): (0.0, 0.01, 0.03, 0.1),
 }
 
 
