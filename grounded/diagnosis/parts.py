@@ -39,7 +39,6 @@ Kind = Literal["effect", "several", "none", "unknown"]
 LARGE, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
 UNKNOWABLE = (  # codes of what the trials can't show
     *("model.few", "model.still", "model.unmeasured", "model.share", "model.copy"),
-    *("model.joint_friction",),
 )
 UNKNOWN = 1e4  # times a value, at least of 1: standard deviation from which it is unknown
 
@@ -179,7 +178,6 @@ class Agreement(Document):
     agrees: bool = True
     chance: float = math.nan
     estimate: Estimate = field(default_factory=lambda: Estimate(math.nan))
-    goes_with: str = ""  # "rises with the mean throttle"
 
 
 @dataclass(frozen=True, eq=False)

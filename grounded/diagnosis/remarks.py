@@ -110,7 +110,6 @@ def _of_groups(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
             high=Quantity(high.value, unit, high.std),
             trial=low.trial,
             trial2=high.trial,
-            goes_with=test.goes_with,
         )
 
 
@@ -167,7 +166,6 @@ def _power_of_ten(ratio: float) -> bool:
 def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
     """What the model's structure lets a claimed effect stand for."""
     from grounded import places
-    from grounded.diagnosis.validation.limits import joints_without_input
 
     names = {*d.effects}
     if any(name.startswith("sensor_scale:") for name in names):
@@ -177,7 +175,6 @@ def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
     if any(name.startswith("sensor_bias:") for name in names):
         level = [name for name in places.levelled(model) if f"sensor_bias:{name}" in names]
         yield from [found("model.sensor", *level)] * bool(level)
-    yield from joints_without_input(model, d.effects)
 
 
 def next_step(

@@ -29,7 +29,7 @@ from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
@@ -179,6 +179,7 @@ def parametric(fit: Fitted) -> bool:
     return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
 
 
+ACTS = RateFamily | InputFamily | MediumFamily  # what may cancel
 PARAM_PRIOR = 0.2  # prior standard deviation of a blamed parameter, relative to its size
 BRIEF = 0.1  # of a control step: shorter delays and lags may be errors of the time stamps
 LEFT = 0.25  # effects cancel if together they do less than this fraction of what each does alone
@@ -268,47 +269,19 @@ def no_limits(data: Data, h: Hypothesis) -> list[str]:
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
-    """Check whether two added rates, or three or more effects, nearly cancel."""
-    size = sizes(predictor)
-    return _two_rates_cancel(predictor, h, size) or _several_cancel(predictor, h, size)
+    """Check whether effects change a step by less than LEFT of what each of them does alone.
 
-
-def sizes(predictor: Predictor) -> Array:
-    """Return the scale of each state's changes, (n,), common to all states of one unit."""
-    units, scales = predictor.data.model.states, predictor.data.scales
-    return np.array(
-        [max(scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
-    )
-
-
-def _two_rates_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
-    """Check whether two added rates sum to less than LEFT of the larger; `size`: scales (n,)."""
-    rates, data = rates_of(h), predictor.data
-    if len(rates) < 2:
-        return False
-    x, u = data.y[:-1], predictor.inputs(h)
-    needed = any(effect.family.needs_own for effect, _ in rates)
-    own = predictor.named((predictor.moved(h, x, u) - x) / data.dt) if needed else {}
-    by = [predictor.added_rate([one], x, u, data.time, own) / size for one in rates]
-    lengths = [float(np.sqrt(np.sum(one**2))) for one in by]
-    return any(
-        np.sqrt(np.sum((by[i] + by[j]) ** 2)) < LEFT * max(lengths[i], lengths[j])
-        for i in range(len(by))
-        for j in range(i)
-    )
-
-
-def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
-    """Check whether three or more effects change a step by less than LEFT of what each does alone.
-
-    This covers effects on rates and on inputs. For example, a larger rate gain with a weaker input
-    and less friction may just be a time constant that is 3 % shorter. (Two effects of different
-    kinds, such as a dead zone and a gain, may well both be present.)
+    Two added rates can, or three and more effects on rates and inputs: a larger rate gain with a
+    weaker input and less friction may just be a time constant that is 3 % shorter. (Two effects of
+    different kinds, such as a dead zone and a gain, may well both be present.)
     """
     data, x = predictor.data, predictor.data.y[:-1]
-    kinds = RateFamily | InputFamily | MediumFamily
-    known = [p for p in h.pairs if isinstance(p[0].family, kinds)]
-    names = [effect.name for effect, _ in known if not getattr(effect.family, "parts", 0)]
+    acting = (e for e in h.effects if not getattr(e.family, "parts", 0))
+    rates = {e.name: isinstance(e.family, RateFamily) for e in acting if isinstance(e.family, ACTS)}
+    units, size = data.model.states, dict[str, float]()  # common to all states of one unit
+    for name, unit in units.items():
+        size[unit] = max(size.get(unit, 0.0), data.scales.spread(name))
+    scale = np.array([size[unit] for unit in units.values()])
 
     @cache
     def step(taken: frozenset[str]) -> Array:
@@ -317,17 +290,16 @@ def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
             of = of.minus(name)
         return predictor.next(of, x)
 
-    for count in range(3, len(names) + 1):
-        for some in map(frozenset, combinations(names, count)):
-            bare = step(some)
+    def change(some: frozenset[str], left: frozenset[str]) -> float:
+        moved = data.model.difference(step(some - left), step(some)) / scale
+        return float(np.sqrt(np.sum(moved**2 * data.valid.T[..., None])))
 
-            def change(taken: frozenset[str], bare: Array = bare) -> float:
-                moved = data.model.difference(step(taken), bare) / size
-                return float(np.sqrt(np.sum(moved**2 * data.valid.T[..., None])))
-
-            if change(frozenset()) < LEFT * min(change(some - {name}) for name in some):
-                return True
-    return False
+    sets = (frozenset(s) for k in range(2, len(rates) + 1) for s in combinations(rates, k))
+    return any(
+        change(some, some) < LEFT * min(change(some, frozenset({name})) for name in some)
+        for some in sets
+        if len(some) > 2 or all(rates[name] for name in some)
+    )
 
 
 def _of_less_friction(effect: Effect, values: Mapping[str, float]) -> float:

@@ -34,7 +34,6 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.parts import Agreement, Changed, Estimate, TrialValue
 from grounded.frozen import Array
 
-GOES_WITH = 0.8  # correlation from which a value depends on a condition
 RIVALS = 8  # hypotheses of one, and of two effects, that are also tested for changes
 
 
@@ -110,30 +109,9 @@ def by_trial(
             far = differs and abs(d - one.scale * mean) > MANY * e
             name = data.ids[i] or f"#{i + 1}"
             rows.append(TrialValue(name, one.effect, one.quantity, one.value + d, e, not far))
-        with_ = _goes_with(data, some, own) if differs else ""
         estimate = Estimate(one.value, float(beyond), unit=one.unit)
-        tests.append(Agreement(one.effect, one.quantity, not differs, chance, estimate, with_))
+        tests.append(Agreement(one.effect, one.quantity, not differs, chance, estimate))
     return tuple(rows), tuple(tests)
-
-
-def _goes_with(data: Data, some: Any, own: Array) -> str:
-    """Return what a differing value correlates with (order of trials, mean of a signal), or ""."""
-    if len(some) < 5:
-        return ""
-    edges = np.cumsum([0, *(data.lengths + 1)])
-    means = {"the order of the trials": np.arange(len(some), dtype=float)}
-    for i, name in enumerate(data.model.state_names):
-        if i not in data.hidden:
-            parts = [data.filled[edges[t] : edges[t + 1], i] for t in some]
-            means[f"the mean {name}"] = np.array([x.mean() for x in parts])
-    for j, name in enumerate(data.model.input_names):
-        used = [data.commands[t, : data.lengths[t], j] for t in some]
-        means[f"the mean {name}"] = np.array([x.mean() for x in used])
-    ties = {n: float(np.corrcoef(x, own)[0, 1]) for n, x in means.items() if np.ptp(x) > 0}
-    best = max(ties, key=lambda n: abs(ties[n]), default="")
-    if not best or abs(ties[best]) < GOES_WITH:
-        return ""
-    return f"{'rises' if ties[best] > 0 else 'falls'} with {best}"
 
 
 def compared(search: HypothesisSearch, best: Fitted, first: Sequence[bool]) -> tuple[Changed, ...]:

@@ -33,17 +33,15 @@ from grounded.effects import (
     param_name,
 )
 from grounded.effects.actuator import backlash
-from grounded.effects.sensed import moved_model
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import LITTLE, integrals, told_by
+from grounded.places import LITTLE, told_by
 from grounded.trial import Trial
 
 FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
 DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor
-FRICTIONS = ("viscous_friction", "coulomb_friction", "quadratic_drag", "stiction")
 SAMPLES = 20  # of the slopes by which inputs are compared
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
@@ -84,28 +82,6 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
         told.append(found("model.unmeasured", *missing))
     no_cause |= {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}
     return Limits(tuple(told), no_cause)
-
-
-def joints_without_input(model: Model, claimed: Collection[str]) -> list[Finding]:
-    """Return a finding for each joint whose friction is claimed as two effects on two axes.
-
-    Friction in a joint acts on every acceleration through the inertia matrix. Where no input acts
-    on the joint (a pole on its cart), that matrix is not known from the model, and the friction is
-    found as a damping of its own velocity and a coupling to another one.
-
-    Args:
-        model: its exact integrals show which states are velocities of joints.
-        claimed: names of the claimed effects.
-    """
-    moved = moved_model(model)  # its true speeds, not those that an adopted filter makes of them
-    rates = {moved.state_names[one.j] for one in integrals(moved) if one.exact}
-    told = []
-    for v in sorted(rates):
-        own = [f"{kind}:{v}" for kind in FRICTIONS if f"{kind}:{v}" in claimed]
-        onto = [name for w in sorted(rates - {v}) if (name := f"coupling:{w}<-{v}") in claimed]
-        if own and onto:
-            told.append(found("model.joint_friction", *own, *onto, joint=v))
-    return told
 
 
 def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:

@@ -67,8 +67,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "disagree": Entry(
         "warn",
-        "the trials disagree on {quantity} of {effect}: {low} in {trial}, {high} in {trial2}"
-        "[[; it {goes_with}]]",
+        "the trials disagree on {quantity} of {effect}: {low} in {trial}, {high} in {trial2}",
     ),
     "one_motion": Entry(
         "note", "all trials repeat one motion: these values may not hold for another"

@@ -47,12 +47,6 @@ ENTRIES: dict[str, Entry] = {
         "the adopted {effect} may be none ({value})",
         "remove it from [model] effects and diagnose again to see whether it is missed",
     ),
-    "joint_friction": Entry(
-        "note",
-        "{about} may be one cause: friction in the joint of {joint}, which acts on both through "
-        "the inertia",
-        "write this torque into model.py with an uncertain parameter",
-    ),
     "sensor": Entry(
         "note",
         "[[a gear between {rate} and it]][[!rate? a mount out of level]] would look the same in "

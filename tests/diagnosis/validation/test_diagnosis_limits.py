@@ -9,13 +9,11 @@ from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
-    joints_without_input,
     knowable,
     still_states,
     switches,
 )
 from grounded.effects import Library
-from grounded.effects.wrap import wrap
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -106,34 +104,3 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
     with pytest.raises(GroundedError, match=r"t0001, t = 1\.7 s, h = -0\.004") as raised:
         diagnose(tank, trials)
     assert "np.maximum" in str(raised.value)
-
-
-def hanging(s, a, p):
-    """A pole on a cart: no input acts on the pole's own joint."""
-    return {"x": s.v, "q": s.w, "v": a.force, "w": -a.force * np.cos(s.q) - 9.81 * np.sin(s.q)}
-
-
-CART_POLE = Model(
-    states={"x": "m", "q": "rad", "v": "m/s", "w": "rad/s"},
-    inputs={"force": "N"},
-    params={},
-    derivative=hanging,
-)
-
-
-@pytest.mark.parametrize(
-    ("claimed", "said"),
-    [
-        (("viscous_friction:w", "coupling:v<-w"), True),
-        (("coulomb_friction:w", "input_gain:force", "coupling:v<-w"), True),
-        (("viscous_friction:w", "coupling:w<-v"), False),  # of two joints
-        (("viscous_friction:w", "coupling:v<-q"), False),  # a spring
-        (("viscous_friction:w", "delay:force"), False),
-    ],
-)
-def test_friction_of_a_joint_without_an_input_is_suspected_behind_two_effects(claimed, said):
-    filtered = wrap(Library().effect("sensor_lag:w", CART_POLE), {"tau": 0.03}, 0.02)
-    for model in (CART_POLE, filtered):  # as after its adoption: nothing was said
-        found = joints_without_input(model, claimed)
-        assert bool(found) == said
-        assert all(name in one.about for one in found for name in claimed if "input" not in name)
