@@ -27,10 +27,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import SENSOR_DELAY, Preflight, late_as_positions
-from grounded.accounts.finding import Finding as Fault
-from grounded.accounts.lag import whole_steps
-from grounded.accounts.sound_trials import sound_trials
-from grounded.checks import list_of, of_type, refused, whole_number
+from grounded.checks import list_of, of_type, whole_number
 from grounded.diagnosis.hypotheses.attribution import (
     USUAL_EFFECTS,
     attribute,
@@ -39,7 +36,7 @@ from grounded.diagnosis.hypotheses.attribution import (
     so_far,
 )
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
-from grounded.diagnosis.likelihood.data import Data, prepare
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -47,11 +44,9 @@ from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, beside_lookalikes, decide
 from grounded.diagnosis.validation.limits import (
-    Limits,
-    counted_once,
     held,
     knowable,
-    limits,
+    sound_data,
     without_others,
 )
 from grounded.diagnosis.validation.ruler import Ruler
@@ -63,9 +58,8 @@ from grounded.findings import Weight, found
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.result import listed
-from grounded.share import share_of
 from grounded.task import Task
-from grounded.trial import Trial, scattered
+from grounded.trial import Trial
 
 
 @dataclass(frozen=True)
@@ -138,7 +132,14 @@ def diagnose(
     options = _checked(subject, trials, options)
     tick = Stages(progress)
     tick("instruments")
-    sound = _sound(subject, trials, compare, options)
+    sound = sound_data(
+        subject,
+        trials,
+        compare,
+        hidden=options.hidden,
+        one_message=options.one_message,
+        interpolated_s=options.interpolated_s,
+    )
     data, looked = sound.data, sound.looked
 
     # what may be blamed, beside parameters that the data identify
@@ -174,20 +175,15 @@ def diagnose(
         tick("leftover")
         if not sound.limits.no_cause:
             decision = beside_lookalikes(decision)
-        used = [trial for trial in looked.trials if trial.known_steps >= 2]
         written = Writer(
             decision,
             ruler,
-            sound.limits,
+            sound,
             (*options.but, *options.delays),
             loop.most,
             tick,
             subject if isinstance(subject, Task) else None,
-            used,
-            sound.first,
-            sound.exact,
             uncertain,
-            looked.findings,
         )
         groups = [k < sound.first for k in range(data.count)]
         result = written.diagnosis(compared(search, decision.fit, groups) if compare else None)
@@ -205,52 +201,12 @@ def diagnose(
 
 
 def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
-    """Return the options; raise GroundedError for arguments of another type, or too large."""
+    """Return the options; raise GroundedError for arguments of another type."""
     of_type("model", subject, Task, Model)
     list_of(trials, Trial, "trials")
     if options is not None:
         of_type("options", options, DiagnosisOptions)
-    model = subject.model if isinstance(subject, Task) else subject
-    if model.n + model.m > MOST_STATES:
-        sizes = {"states": model.n, "inputs": model.m, "most": MOST_STATES, "what": "diagnosis"}
-        raise refused("given.large", f"model '{model.name}'", **sizes)
     return options or DiagnosisOptions()
-
-
-@dataclass(frozen=True, eq=False)
-class _Sound:
-    """The data of a diagnosis, and what was found while it was made sound."""
-
-    data: Data
-    looked: Preflight
-    limits: Limits
-    first: int  # trials of the first of two groups that are compared
-    exact: bool  # all trials repeat each other to the last bit: there is no noise
-
-
-def _sound(
-    subject: Task | Model,
-    trials: Sequence[Trial],
-    compare: Sequence[Trial],
-    options: DiagnosisOptions,
-) -> _Sound:
-    """Correct the sensors, count copies once, and see what the data can't show."""
-    shares = share_of(trials), share_of(compare)
-    trials, copies = counted_once(shares[0].trials)
-    compare, more = counted_once(shares[1].trials)
-    data, looked = sound_data(
-        subject,
-        [*trials, *compare],
-        hidden=options.hidden,
-        one_message=options.one_message,
-        first=len(trials) if compare else None,
-        interpolated_s=options.interpolated_s,
-    )
-    known = limits(data, looked.left_out)
-    told = filter(None, [share.finding for share in shares])
-    known = replace(known, findings=(*known.findings, *copies, *more, *told))
-    exact = bool(copies or more) and not (scattered(trials) or scattered(compare))
-    return _Sound(data, looked, known, sum(trial.known_steps >= 2 for trial in trials), exact)
 
 
 def _offered(
@@ -364,53 +320,3 @@ def _again(effect: Effect, known: float, data: Data) -> Effect:
 
 
 PAIR = 2  # effects at least that are sought without the leader
-
-
-MOST_STATES = 50  # of a filter, whose step costs their cube; of a diagnosis with the inputs
-
-
-def sound_data(
-    subject: Task | Model,
-    trials: Sequence[Trial],
-    *,
-    hidden: Sequence[str] = (),
-    one_message: Sequence[str] = (),
-    first: int | None = None,
-    interpolated_s: float = 0.0,
-) -> tuple[Data, Preflight]:
-    """Return the data of a likelihood, and what the sensors show by themselves.
-
-    Args:
-        subject: the task (its latency counts as modelled) or a model.
-        trials: real runs with one time step.
-        hidden: names of states without a sensor, such as the memory of adopted effects.
-        one_message: states that are logged in one message.
-        first: number of trials in the first of two groups; None: one group.
-        interpolated_s: standard deviation of times [s] because the states were interpolated.
-
-    Raises:
-        GroundedError: if the trials don't fit the model, or hold no data.
-    """
-    model = subject.model if isinstance(subject, Task) else subject
-    latency = subject.latency if isinstance(subject, Task) else None
-    past = subject.past if isinstance(subject, Task) else None
-    looked = sound_trials(subject, trials, hidden, first, one_message)
-    model = with_measured_filters(model, looked.findings)
-    data = prepare(model, looked.trials, latency, past, hidden)
-    filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
-    moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
-    between = {f.signal for f in moved if not whole_steps(f.delay_s / data.dt)}
-    return (
-        replace(data, filters=filters, between=frozenset(between), interpolated_s=interpolated_s),
-        looked,
-    )
-
-
-def with_measured_filters(model: Model, findings: Sequence[Fault]) -> Model:
-    """Return the model with the constants of adopted sensor filters held that sensors show alone.
-
-    The physics would shift them to fit what it lacks: 0.050 s, seen in the speed beside its
-    position, became 0.035 s.
-    """
-    seen = {f"sensor_lag_{one.signal}_tau" for one in findings if one.kind == "lag"}
-    return model.holding(seen & {*model.params})

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from grounded import places
-from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
     AT_MOST,
@@ -45,7 +44,7 @@ from grounded.diagnosis.remarks import next_step, remarks
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, Doubtful
-from grounded.diagnosis.validation.limits import Limits, identifiable
+from grounded.diagnosis.validation.limits import Sound, identifiable
 from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.prediction_error import (
     by_region,
@@ -59,7 +58,6 @@ from grounded.frozen import Array
 from grounded.places import position
 from grounded.result import number
 from grounded.task import Task
-from grounded.trial import Trial
 
 MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
 NAMED = 2  # most parameters in the words of a cause
@@ -72,26 +70,22 @@ class Writer:
         self,
         decision: Decision,
         ruler: Ruler,
-        known: Limits,
+        sound: Sound,
         adopted: Collection[str],
         most: int,
         tick: Callable[[str], None],
         task: Task | None,
-        trials: Sequence[Trial],
-        first: int,
-        exact: bool,
         uncertain: Predictor,
-        preflight: Sequence[Fault] = (),
     ) -> None:
-        self.decision, self.ruler, self.known = decision, ruler, known
-        self.adopted = adopted
-        self.most, self.tick, self.task, self.trials = most, tick, task, trials
-        self.preflight = tuple(preflight)
+        self.decision, self.ruler, self.known, self.task = decision, ruler, sound.limits, task
+        self.adopted, self.most, self.tick = adopted, most, tick
+        self.preflight = sound.looked.findings
+        self.trials = [trial for trial in sound.looked.trials if trial.known_steps >= 2]
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.measured = Measured(decision, ruler, trials, first, exact)
-        self.claims = Claims(decision, self.measured.credit, known, ruler, uncertain)
+        self.measured = Measured(decision, ruler, self.trials, sound.first, sound.exact)
+        self.claims = Claims(decision, self.measured.credit, self.known, ruler, uncertain)
         self.left, self.uncertain = self.measured.left, uncertain
 
     def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:

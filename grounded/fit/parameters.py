@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 
 from grounded.checks import known, list_of, of_type, one_of, refused, wrong
-from grounded.diagnosis.diagnose import MOST_STATES, sound_data
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
     TO_THE_TOP,
@@ -33,7 +32,7 @@ from grounded.diagnosis.likelihood.polish import SAME as STILL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.validation.limits import counted_once, held
+from grounded.diagnosis.validation.limits import held, sound_data
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again
@@ -42,7 +41,6 @@ from grounded.fit.result import Fit, Found, report
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
-from grounded.share import share_of
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -95,23 +93,22 @@ def fit(
     if isinstance(names, str) or not isinstance(names, Sequence | None):
         raise wrong("names", names, must="names")
     given = model.model if isinstance(model, Task) else model
-    if given.n > MOST_STATES:
-        sizes = {"states": given.n, "inputs": given.m, "most": MOST_STATES, "what": "fit"}
-        raise refused("given.large", f"model '{given.name}'", **sizes)
     delayed = _delayed(given, fit_latency)
     asked = _asked(given, names, bool(delayed))
     if max((trial.known_steps for trial in logged), default=0) < 3:
         raise refused("given.short", what="fit", needs=3)
     # the data of a diagnosis; what is not asked for is constant
-    share, tick = share_of(logged), Stages(progress)
+    tick = Stages(progress)
     tick("instruments")
-    data, looked = sound_data(
+    sound = sound_data(
         model,
-        counted_once(share.trials)[0],
+        logged,
+        what="fit",
         hidden=hidden,
         one_message=one_message,
         interpolated_s=interpolated_s,
     )
+    data = sound.data
     late = data.latency.copy() if latency is None else np.array(latency, float)
     for inputs in delayed.values():
         late[list(inputs)] = late[inputs[0]]
@@ -124,7 +121,7 @@ def fit(
     ):
         result = _identified(data, delayed, tick)
         tick("predict")
-        return report(given, asked, result, looked.findings, share.finding)
+        return report(given, asked, result, sound.looked.findings, sound.shares)
 
 
 class Alone(HypothesisSearch):

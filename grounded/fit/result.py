@@ -197,7 +197,7 @@ def report(
     asked: Sequence[str],
     found: Found,
     findings: Sequence[Fault] = (),
-    share: Finding | None = None,
+    shares: Sequence[Finding] = (),
 ) -> Fit:
     """Build the `Fit` of a finished search.
 
@@ -206,7 +206,7 @@ def report(
         asked: the parameters that were to be fitted.
         found: the end of the search.
         findings: what the sensors show by themselves.
-        share: which part of the trials was used; None for all.
+        shares: which parts of the trials were used, if not all.
     """
     search, best, data = found.search, found.best, found.search.data
     params = dict[str, FittedValue]()
@@ -248,8 +248,7 @@ def report(
         preflight=tuple(findings),
         **more,
     )
-    told = (*_said(made), *([share] if share else []))
-    return replace(made, findings=told)
+    return replace(made, findings=(*_said(made), *shares))
 
 
 def _said(found: Fit) -> Iterator[Finding]:
