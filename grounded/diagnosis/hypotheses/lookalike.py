@@ -27,7 +27,7 @@ run can distinguish the two, unless the same clock stamps a command and its resp
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -263,26 +263,9 @@ def _rate(predictor: Predictor, h: Hypothesis, y: Array, u: Array) -> Array:
 FAMILIES = {"delay": "sensor_delay", "sensor_delay": "delay"}
 
 
-@dataclass(frozen=True)
-class OneClock:
-    """A claimed delay and the equivalent delay of the other side.
-
-    Args:
-        effect: name of the claimed effect.
-        like: name of the equivalent effect.
-        inputs: the inputs of the delayed part of the model.
-        states: its states that have a sensor.
-    """
-
-    effect: str
-    like: str
-    inputs: tuple[str, ...]
-    states: tuple[str, ...]
-
-
 def one_clock(
     model: Model, effects: Sequence[Effect], shown: Sequence[str], still: Collection[str] = ()
-) -> tuple[OneClock, ...]:
+) -> tuple[Likeness, ...]:
     """Find delays that cover all inputs, or all sensors, of an independent part of a model.
 
     Args:
@@ -290,33 +273,31 @@ def one_clock(
         effects: the claimed effects.
         shown: names of states that have a sensor.
         still: inputs that never changed, whose delay makes no difference.
+
+    Returns:
+        Each such delay, and the equivalent one of the other side.
     """
-    moving = [name for name in model.input_names if name not in still]
     some = [e for e in effects if e.family.name in FAMILIES]
-    parts = _parts(model) if some else []
-    found = []
+    part, found = _parts(model) if some else {}, list[Likeness]()
+    moving = [name for name in model.input_names if name not in still]
     for effect in some:
-        targets = set(effect.site.targets)
-        touched = [part for part in parts if targets & part]
-        inputs = tuple(n for n in moving if any(n in part for part in touched))
-        states = tuple(n for n in shown if any(n in part for part in touched))
+        touched = {part[name] for name in effect.site.targets}
+        inputs, states = ([n for n in some if part[n] in touched] for some in (moving, shown))
         side, other = (inputs, states) if effect.family.name == "delay" else (states, inputs)
-        if targets == set(side) and other:
+        if {*effect.site.targets} == {*side} and other:
             like = f"{FAMILIES[effect.family.name]}:{'+'.join(other)}"
-            found.append(OneClock(effect.name, like, inputs, states))
+            found.append(Likeness(effect.name, like, 1.0))
     return tuple(found)
 
 
-def _parts(model: Model) -> list[set[str]]:
-    """Return the connected parts of a model, sets of states and inputs that are coupled."""
+def _parts(model: Model) -> dict[str, int]:
+    """Return the part that each state and input belongs to: those that are coupled."""
+    from scipy.sparse.csgraph import connected_components
+
     dt = places.probe(model, 1e-2)
     f_x, f_u = model.system.linearise(*places.samples(model, 8), model.values, dt)
     slopes = np.abs(np.concatenate([f_x - np.eye(model.n), f_u], axis=-1)).max(axis=0)
-    names = (*model.state_names, *model.input_names)
-    parts = [{name} for name in names]
-    for i, j in np.argwhere(slopes > ROUNDING * slopes.max()):
-        one, other = (next(p for p in parts if names[k] in p) for k in (i, j))
-        if one is not other:
-            parts.remove(other)
-            one |= other
-    return parts
+    coupled = np.zeros(2 * (model.n + model.m,))
+    coupled[: model.n] = slopes > ROUNDING * slopes.max()
+    parts = connected_components(coupled, directed=False)[1].tolist()
+    return dict(zip((*model.state_names, *model.input_names), parts, strict=True))

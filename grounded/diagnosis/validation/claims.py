@@ -308,9 +308,7 @@ class Claims:
         if self.known.no_cause:
             return ()
         tied = {(group[0], other) for group in groups for other in group[1:]}
-        late = {
-            (one.effect, one.like): Likeness(one.effect, one.like, 1.0) for one in self.one_clock
-        }
+        late = {(one.effect, one.like): one for one in self.one_clock}
         found = {(one.effect, one.like): one for one in self.alike}
         return tuple(one for key, one in (late | found | late).items() if key not in tied)
 
