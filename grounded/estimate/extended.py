@@ -1,6 +1,6 @@
 """The extended Kalman filter over all trials at once, the smoother, and their likelihood.
 
-    x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - h(x^-_t),      H = h_x(x^-_t)
+    x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - H x^-_t
 
 The linear equations are those of `grounded.filter.kalman`.
 
@@ -150,7 +150,7 @@ def _about(
     track: Array,
     xbar: Array,
 ) -> Filtered | None:
-    """Run the linear filter about a track: f + A (x - track), h + H (x - xbar).
+    """Run the linear filter about a track: f + A (x - track), H x.
 
     `direct`, the last item of `seen`, says whether channel i measures state i. Returns None if the
     result is not finite.
@@ -203,11 +203,9 @@ def _columns(d: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
-    """Return H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) on a track, zero where not seen."""
-    flat = x.reshape(-1, x.shape[-1])
-    e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))
-    H = measurement.jacobian(flat).reshape(*batch.y.shape, x.shape[-1])
-    return H * batch.seen[..., None], np.where(batch.seen, e, 0.0)
+    """Return H (T + 1, B, ny, n) and y - H x (T + 1, B, ny) on a track, zero where not seen."""
+    e = np.where(batch.seen, measurement.innovation(batch.y, x), 0.0)
+    return measurement.pick * batch.seen[..., None], e
 
 
 def likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
@@ -247,9 +245,9 @@ def recursion(
         try:
             for t in range(T + 1):
                 seen = batch.seen[t]
-                at = measurement.innovation(batch.y[t], measurement.function(x_prior[t]))
+                at = measurement.innovation(batch.y[t], x_prior[t])
                 e[t] = np.where(seen, at, 0.0)
-                H[t] = measurement.jacobian(x_prior[t]) * seen[..., None]
+                H[t] = measurement.pick * seen[..., None]
                 k[t], W, after = updated(P[t], H[t], system.R[t + 1], system.seen[t + 1])
                 weight[t] = np.einsum("bii->bi", W) * seen
                 eps[t] = (W @ e[t][..., None])[..., 0]

@@ -1,13 +1,13 @@
-"""Measurement: the measurement function of the sensors; NoiseStd: process and measurement noise.
+"""Measurement: what the sensors show; NoiseStd: process and measurement noise.
 
-    x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = h(x) + v,  v ~ N(0, diag(r^2))
+    x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = H x + v,  v ~ N(0, diag(r^2))
 
 The states themselves are measured, all or some. `grounded.estimate.likelihood` estimates the noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,34 +19,35 @@ from grounded.model import Model
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A measurement function y = h(x) with ny channels.
+    """Which of n states the ny channels measure.
 
     Args:
-        names: names of the channels.
-        function: h, states (N, n) -> (N, ny).
-        jacobian: h_x, (N, n) -> (N, ny, n).
+        states: index of the state that each channel measures, (ny,).
         angles: whether the innovation of a channel wraps to [-pi, pi], (ny,).
-        states: index of the state that a channel measures directly, -1 for none, (ny,).
+        n: number of states.
     """
 
-    names: tuple[str, ...]
-    function: Callable[[Array], Array]
-    jacobian: Callable[[Array], Array]
-    angles: tuple[bool, ...]
     states: tuple[int, ...]
+    angles: tuple[bool, ...]
+    n: int
 
     @property
     def ny(self) -> int:
         """Number of channels."""
-        return len(self.names)
+        return len(self.states)
 
-    def innovation(self, y: Array, predicted: Array) -> Array:
-        """Return the innovation y - predicted, (..., ny), with angles wrapped to [-pi, pi]."""
-        e = y - predicted
+    @property
+    def pick(self) -> Array:
+        """The Jacobian of what is measured, (ny, n)."""
+        return np.asarray(np.eye(self.n)[list(self.states)])
+
+    def innovation(self, y: Array, x: Array) -> Array:
+        """Return y (..., ny) minus the measured ones of states x (..., n), with angles wrapped."""
+        e = y - x[..., list(self.states)]
         if any(self.angles):
             mask = np.array(self.angles)
             e[..., mask] -= 2 * np.pi * np.rint(e[..., mask] / (2 * np.pi))
-        return e
+        return np.asarray(e)
 
 
 def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
@@ -62,15 +63,8 @@ def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
     names = model.state_names if names is None else tuple(names)
     for name in names:
         known("state", [name], model.states, f"model '{model.name}'")
-    index = [model.state_names.index(name) for name in names]
-    pick = np.eye(model.n)[index]
-    return Measurement(
-        names=names,
-        function=lambda x: np.asarray(x[:, index]),
-        jacobian=lambda x: np.broadcast_to(pick, (len(x), *pick.shape)),
-        angles=tuple(name in model.angles for name in names),
-        states=tuple(index),
-    )
+    index = tuple(model.state_names.index(name) for name in names)
+    return Measurement(index, tuple(name in model.angles for name in names), model.n)
 
 
 @dataclass(frozen=True, eq=False)

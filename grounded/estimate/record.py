@@ -1,12 +1,11 @@
 """Record: measurements and commands of a run, each with its own times; and batches of records.
 
-    y_i = h(x(t_i)) + v_i,         u_j(t) = command_j(t - latency_j)
+    y_i = H x(t_i) + v_i,          u_j(t) = command_j(t - latency_j)
 
 A record may combine a camera at 30 Hz and a controller at 20 Hz: states are estimated at the
 instants `times`, and the input over [t_i, t_i+1] is the mean of the held commands over
 [t_i - latency, t_i+1 - latency]. On a common grid this equals the delay queue of
-`grounded.compile.problem`, including fractions of a step. It is piecewise linear in the latency, so
-its derivative is known. A lost sample is NaN.
+`grounded.compile.problem`, including fractions of a step. A lost sample is NaN.
 
 A filter is a recursion over time; it is fast if it runs over all trials at once. So records are
 combined to a `RecordBatch`: time first, then trial, padded to the longest. Padding and lost samples
@@ -81,37 +80,23 @@ class Record:
         """T, the number of steps."""
         return len(self.times) - 1
 
-    def received(self, latency: Array) -> tuple[Array, Array]:
-        """Return the inputs received over each step (T, m), and their derivative by the latency.
+    def received(self, latency: Array) -> Array:
+        """Return the inputs received over each step, (T, m).
 
         Args:
             latency: latency of each input [s], (m,).
         """
-        m = self.commands.shape[1]
-        mean, slope = np.empty((self.steps, m)), np.empty((self.steps, m))
-        step = np.diff(self.times)
-        for j in range(m):
-            total, value = self._integral(self.times - latency[j], j)
-            mean[:, j] = np.diff(total) / step
-            slope[:, j] = -np.diff(value) / step
-        return mean, slope
+        total = [self._integral(self.times - late, j) for j, late in enumerate(latency)]
+        return np.diff(np.stack(total, axis=1), axis=0) / np.diff(self.times)[:, None]
 
-    def _integral(self, t: Array, j: int) -> tuple[Array, Array]:
-        """Return the integral of command j from the first command to t, and the command at t.
-
-        At the instant of a change, the command is the mean of both sides. This gives the two-sided
-        derivative for latencies of a whole number of steps.
-        """
+    def _integral(self, t: Array, j: int) -> Array:
+        """Return the integral of command j from the first command to t."""
         past = np.asarray(self.past)
         knots, values = self.command_times, np.append(past[j], self.commands[:, j])
         total = np.append(0.0, np.cumsum(values[1:-1] * np.diff(knots)))
-        near = 1e-6 * (self.times[-1] - self.times[0]) / max(self.steps, 1)
         index = np.searchsorted(knots, t, side="right")
         at = np.maximum(index - 1, 0)
-        integral = total[at] + values[index] * (t - knots[at])
-        before = np.searchsorted(knots, t - near, side="right")
-        after = np.searchsorted(knots, t + near, side="right")
-        return integral, 0.5 * (values[before] + values[after])
+        return np.asarray(total[at] + values[index] * (t - knots[at]))
 
 
 def _held(commands: Array, past: Array) -> Array:
@@ -206,7 +191,6 @@ class RecordBatch:
     y: Array  # (T + 1, B, ny), zero where not seen
     seen: NDArray[np.bool_]  # (T + 1, B, ny)
     u: Array  # (T, B, m) inputs as received
-    u_latency: Array  # (T, B, m) derivative of u by the input's latency
     dt: Array  # (T, B) [s]
     valid: NDArray[np.bool_]  # (T, B)
     lengths: NDArray[np.int64]  # (B,) steps of each record
@@ -245,21 +229,21 @@ def batch_of(
     B, T, ny = len(records), max(r.steps for r in records), measurement.ny
     m = records[0].commands.shape[1]
     y, seen = np.zeros((T + 1, B, ny)), np.zeros((T + 1, B, ny), dtype=bool)
-    u, slope, dt = np.zeros((T, B, m)), np.zeros((T, B, m)), np.zeros((T, B))
+    u, dt = np.zeros((T, B, m)), np.zeros((T, B))
     starts = []
     for b, record in enumerate(records):
         of_shape("measurements of a record", record.measured, (len(record.measured), ny))
         t = record.steps
         seen[: t + 1, b] = np.isfinite(record.measured)
         y[: t + 1, b] = np.where(seen[: t + 1, b], record.measured, 0.0)
-        u[:t, b], slope[:t, b] = record.received(latency)
+        u[:t, b] = record.received(latency)
         dt[:t, b] = np.diff(record.times)
         starts.append(_start(record, measurement, n))
         seen[0, b, starts[-1][2][starts[-1][2] >= 0]] = False
     start, var, channel = (np.array(column) for column in zip(*starts, strict=True))
     lengths = np.array([r.steps for r in records])
     valid = np.arange(T)[:, None] < lengths
-    return RecordBatch(y, seen, u, slope, dt, valid, lengths, start, var, channel)
+    return RecordBatch(y, seen, u, dt, valid, lengths, start, var, channel)
 
 
 def _start(
@@ -276,7 +260,7 @@ def _start(
     var, channel = given**2, np.full(n, -1)
     for c, i in enumerate(measurement.states):
         finite = np.flatnonzero(np.isfinite(record.measured[:, c]))
-        if i < 0 or len(finite) == 0:
+        if len(finite) == 0:
             continue
         mean[i] = record.measured[finite[0], c]
         if finite[0] == 0:
