@@ -346,10 +346,9 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    field = next((one for one in report.numbers if one.path == path), None)
     scale = Stated.by(report.files).factor(path, units[guess.name]) if path else 1.0
     why = (found("start.given", guess.name, asked=True),)
-    clock = next((report.clock(t) for t in report.topics if field in t.fields), "log")
+    field, clock = report.number(path), report.clock(report.topic_of(path))
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)
 
 

@@ -1,15 +1,15 @@
 """Estimates a log's control interval from how often its commands change, or else are logged.
 
 A table may have a row every 10 ms although the recorded loop sends a command every 50 ms. So the
-times between changes are examined first: nearly all must be multiples of one interval, and many
-must equal it. A test signal that steps once a second says nothing about the loop.
+times between changes are examined first: of the usual intervals in which many of them pass, the one
+at whose multiples commands change. A test signal that steps once a second says nothing about the
+loop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -27,14 +27,10 @@ GUESSED = 0.05  # [s], if nothing is known
 LONGEST = 0.1  # [s]; slower changes may be the steps of a test signal
 SLOW = 0.95  # [s] from which an interval is rounded to whole seconds
 ENOUGH = 20  # smallest number of times between changes
-NEARLY_ALL = 0.95  # share of them that must be multiples of the interval
-ONCE = 0.25  # share of them that must equal the interval
 APART = 1.5  # smallest ratio of an interval to that of the rows
 NEAR = 0.03  # relative tolerance for rounding to one of STEPS
-OFF = 0.05  # relative tolerance of the mean time between changes
-MOSTLY, IN_STEP = 0.5, 0.6  # for a loop that jitters: share of intervals, and phase coherence
-TOGETHER = 40  # changes per block of phases, short because clocks drift
-EXACT, LOOSE = 0.1, 0.25  # tolerance of a multiple, as a fraction of the interval
+ONCE, WITHIN = 0.25, 0.25  # share of times between changes that are the interval, within a part
+IN_STEP, TOGETHER = 0.6, 40  # coherence of the phases of so many changes, since clocks drift
 
 
 def interval_of(
@@ -52,16 +48,14 @@ def interval_of(
     """
     inputs = _commanded(inputs)
     for guesses in (inputs, states):
-        rates = [
-            t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
-        ]
-        if not rates:
-            continue
-        rows = 1 / min(rates)
-        held = _held(report, inputs, rows) if guesses is inputs else None
-        if held is not None:
+        topics = [report.topic_of(one.path) for one in guesses]
+        rates = [topic.rate_hz for topic in topics if topic is not None and topic.rate_hz > 0]
+        if rates:
+            rows = 1 / min(rates)
+            held = changes_every(_gaps(report, inputs), rows) if guesses is inputs else None
+            if held is None:
+                return round_interval(rows), None
             return held, found("start.interval", every=held, dt=held, rows=rows)
-        return round_interval(rows), None
     return GUESSED, None
 
 
@@ -94,11 +88,6 @@ def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> Finding
     return found("start.interval", every=round_interval(apart), dt=dt)
 
 
-def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:
-    """Return the interval at which commands change if they are logged more often, else None."""
-    return changes_every(_gaps(report, inputs), rows)
-
-
 def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:
     """Return the times between changes of a log's commands [s]; none if they can't be read."""
     specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]
@@ -117,7 +106,7 @@ def _between_changes(series: Series) -> Array:
 
 
 def changes_every(gaps: Array, rows: float) -> float | None:
-    """Return the interval of which nearly all times between changes are multiples, else None.
+    """Return the interval at whose multiples commands change, None if there is no such.
 
     Args:
         gaps: times between changes [s].
@@ -125,37 +114,15 @@ def changes_every(gaps: Array, rows: float) -> float | None:
     """
     if len(gaps) < ENOUGH:
         return None
-    found: dict[float, float] = {}  # relative deviation of the mean, by possible interval
+    changes, coherence = np.cumsum(gaps), dict[float, float]()
+    blocks = np.array_split(changes, max(1, len(changes) // TOGETHER))
     for step in STEPS:
-        if not APART * rows < step <= LONGEST:
-            continue
-        near = step * min(max(EXACT, 1.05 * rows / step), LOOSE)
-        whole = np.maximum(np.rint(gaps / step), 1)
-        on = np.abs(gaps - whole * step) <= near
-        often = on.mean() >= NEARLY_ALL and (on & (whole == 1)).mean() >= ONCE
-        if often:
-            found[step] = abs(float((gaps / whole)[on].mean()) / step - 1)
-    fits = [step for step, off in found.items() if off < OFF]
-    if not fits:
-        return _in_phase(gaps, rows)
-    alike = [step for step in fits if step > max(fits) / (1 + 2 * OFF)]  # 120 and 125 Hz
-    return min(alike, key=found.__getitem__)
-
-
-def _in_phase(gaps: Array, rows: float) -> float | None:
-    """Return the interval of a loop whose changes jitter by a row, else None.
-
-    Single times between changes are then off by a row, but the phase of the changes stays the same.
-    """
-    changes, found = np.cumsum(gaps), dict[float, float]()
-    parts = np.array_split(changes, max(1, len(changes) // TOGETHER))
-    for step in STEPS:
-        once = np.abs(gaps - step) <= LOOSE * step
-        if APART * rows < step <= LONGEST and once.mean() >= MOSTLY:
-            turns = [abs(np.exp(2j * np.pi * part / step).mean()) for part in parts]
-            found[step] = float(np.median(turns))
-    best = max(found, key=found.__getitem__, default=None)
-    return best if best is not None and found[best] >= IN_STEP else None
+        once = np.abs(gaps - step) <= WITHIN * step
+        if APART * rows < step <= LONGEST and once.mean() >= ONCE:
+            turns = [abs(np.exp(2j * np.pi * block / step).mean()) for block in blocks]
+            coherence[step] = float(np.median(turns))
+    best = max(coherence, key=coherence.__getitem__, default=None)
+    return best if best is not None and coherence[best] >= IN_STEP else None
 
 
 def _commanded(inputs: Sequence[Guess]) -> tuple[Guess, ...]:
@@ -164,8 +131,3 @@ def _commanded(inputs: Sequence[Guess]) -> tuple[Guess, ...]:
     return tuple(
         g if g.path else replace(g, path=path) for g, path in zip(inputs, rivals, strict=True)
     )
-
-
-def _topic(report: LogReport, guess: Guess) -> Any:
-    known = {t.topic: t for t in report.topics if guess.path.strip('"').startswith(t.topic)}
-    return known[max(known, key=len)] if known and guess.path else None

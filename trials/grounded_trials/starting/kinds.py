@@ -372,9 +372,8 @@ def by_encoders(states: Sequence[Guess], log: LogReport, joints: Joints, r: floa
     for guess in states:
         path = f"{where}.{ends.get(guess.name, '')}[0]"
         if path in moving and guess.name in ends:
-            topic, field = next((t, f) for t in log.topics for f in t.fields if f.path == path)
-            why, clock = found_("start.encoder", path, joint=wheel), log.clock(topic)
-            guess = Guess(guess.name, path, clock, False, (), field, (why,), r)
+            why, clock = found_("start.encoder", path, joint=wheel), log.clock(log.topic_of(path))
+            guess = Guess(guess.name, path, clock, False, (), log.number(path), (why,), r)
         found.append(guess)
     return found
 

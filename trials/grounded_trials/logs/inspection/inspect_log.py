@@ -110,9 +110,18 @@ class LogReport:
         """Whether header stamps are on another clock than the log, as in a simulation."""
         return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in self.topics)
 
-    def clock(self, topic: TopicReport) -> str:
+    def topic_of(self, path: str) -> TopicReport | None:
+        """Return the topic that a path begins with, None if the log has none."""
+        begins = [t for t in self.topics if path.strip('"').startswith(t.topic)]
+        return max(begins, key=lambda topic: len(topic.topic), default=None)
+
+    def number(self, path: str) -> FieldReport | None:
+        """Return the number at a path, None if it is not in the log."""
+        return next((one for one in self.numbers if one.path == path), None)
+
+    def clock(self, topic: TopicReport | None) -> str:
         """Return the clock by which a topic's numbers are read."""
-        return "header" if topic.stamped and not self.simulated else "log"
+        return "header" if topic is not None and topic.stamped and not self.simulated else "log"
 
     @property
     def moving(self) -> list[str]:
