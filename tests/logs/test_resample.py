@@ -87,6 +87,18 @@ def test_scale_offset_and_unwrapping() -> None:
     np.testing.assert_array_equal(as_angle.states[:, 0], found)
 
 
+@pytest.mark.parametrize(("turn", "wrapped"), [(2 * np.pi, True), (360.0, True), (360.0, False)])
+def test_an_angle_is_unwrapped_by_its_own_turn(turn: float, wrapped: bool) -> None:
+    """In degrees at 97 Hz it turns by 5.6 in a sample, which must not be folded by 2 pi."""
+
+    def angle(t: np.ndarray) -> np.ndarray:
+        y = 1.5 * turn * t
+        return (y + turn / 2) % turn - turn / 2 if wrapped else y
+
+    found = grid(pose(angle), angles=["x"]).states[:, 0]
+    assert np.ptp(np.diff(found)) < 1e-4 and abs(found[20] - found[0] - 1.5 * turn) < 1e-4
+
+
 def test_a_gap_is_refused_where_it_is_and_bridged_where_allowed() -> None:
     x = pose(np.sin)
     keep = (x.t < EPOCH + 1.0e9) | (x.t > EPOCH + 1.9e9)

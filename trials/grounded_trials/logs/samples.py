@@ -31,6 +31,7 @@ JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation 
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
 SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
+MOSTLY, WHOLE = (0.01, 0.99), 1.02  # the values of a wrapped angle are so nearly within a turn
 REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
 
 
@@ -275,7 +276,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     last_of_stamp = np.append(np.diff(t) != 0, True)
     t, y = t[last_of_stamp], y[last_of_stamp]
     if unwrap or spec.unwrap:
-        y = np.unwrap(y)
+        y = unwound(y)
     return Samples(
         name=name,
         spec=spec,
@@ -287,6 +288,20 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
         unstamped=int((~stamped).sum()),
         lost=np.sort(series.t[stamped & ~finite]) - round(spec.delay_s * 1e9),
     )
+
+
+def unwound(y: Floats, *, least: float = 0.5) -> Floats:
+    """Unwrap an angle by the turn that it stays within: of radians, else of degrees.
+
+    One that goes further is continuous, and unwrapped as radians it would be folded.
+
+    Args:
+        y: (N,) values.
+        least: of a turn; no smaller step is the end of one.
+    """
+    width = np.ptp(np.quantile(y, MOSTLY))
+    turn = next((turn for turn in (2 * np.pi, 360.0) if width < WHOLE * turn), np.inf)
+    return np.unwrap(y, period=turn) if np.abs(np.diff(y)).max(initial=0.0) > least * turn else y
 
 
 def _unusable(name: str, spec: SignalSpec, what: str, values: int = 0) -> GroundedError:

@@ -14,7 +14,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_log import LogReport
-from grounded_trials.logs.samples import Samples, tidy
+from grounded_trials.logs.samples import Samples, tidy, unwound
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.within import OverBudget
@@ -105,7 +105,8 @@ class Signals:
                 found = tidy(path, one, unwrap="@rpy" in path)
             except GroundedError:
                 continue
-            self.found[path] = _unwound(found) if path in self._angles else found
+            angle = path in self._angles
+            self.found[path] = replace(found, y=unwound(found.y, least=0.9)) if angle else found
         self._missing |= {*more} - self.found.keys()
 
     def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
@@ -149,13 +150,6 @@ class Signals:
             if not {one for q, (w, _) in pairs.items() for one in (q, w)} & {a, b}:
                 pairs[a] = (b, times)
         return pairs
-
-
-def _unwound(angle: Samples) -> Samples:
-    """Unwrap an angle that jumps by a full turn, in radians or degrees."""
-    jump, width = np.abs(np.diff(angle.y)).max(initial=0.0), np.ptp(angle.y)
-    turns = [turn for turn in (2 * np.pi, 360.0) if 0.9 * turn < jump <= width < 1.02 * turn]
-    return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle
 
 
 def _one_by_one(log: LogReport, specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
