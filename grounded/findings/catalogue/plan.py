@@ -136,16 +136,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "limits_of_log": Entry(
         "note",
-        "[[!beyond? [limits] are only the range used in {log}]][[[limits] of {beyond} reach more "
-        "than {times:.6g} times as far as was ever sent: check their unit]][[; {at} is at them for "
-        "{share:%} of this plan]]",
+        "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]",
         "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
         "(`target`): target.csv is the run in that log]]",
-    ),
-    "another_unit": Entry(
-        "note",
-        "{what} of {state} is {given}, far beyond what it reaches in any log ({seen})",
-        "if it is in {unit}, multiply it by {factor:.8g}",
     ),
     "of_other_limits": Entry(
         "note",

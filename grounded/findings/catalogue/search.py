@@ -126,17 +126,9 @@ ENTRIES: dict[str, Entry] = {
     # what a run changes
     "counts": Entry(
         "note",
-        "{about} counts as a run of {candidate} only because --candidate says so[[: its utility "
-        "changes from {was:.4g} to {now:.4g}]][[, and {best} is the best now]][[; that of this run "
-        "is {run:.4g}, far from its other {runs}]]",
+        "{about} counts as a run of {candidate} only because --candidate says so",
         "[[aside? `{undo}`, unless it ran that; then `propose` goes on]][[!aside? to undo this: "
         "`{undo}`]]",
-    ),
-    "settled": Entry(
-        "note",
-        "{candidate} need not be run once more: by this run, the loss of {loser} is in doubt no "
-        "longer",
-        "if the robot has run {candidate} meanwhile, that log still counts",
     ),
     # names
     "aside": Entry("refuse", "{about}[[, a run of {candidate},]] is set aside[[ ({why})]]"),

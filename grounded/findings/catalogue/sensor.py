@@ -60,8 +60,7 @@ ENTRIES: dict[str, Entry] = {
         "[[the program that writes the trials should {how:late=read it with less delay or filter "
         "it less,sign=flip its sign,degrees=write it in the model's unit}]][[treat it as {of}: ]]"
         "[[if the robot's program gets it as late as this log does, `adopt` sensor_delay, and the "
-        "plan allows for it; else set {log} in its table of [log]; not both]][[{about} are in one "
-        "message, more likely late: set delay_s = {delay:.3g} for each in [log.state]]]"
+        "plan allows for it; else set {log} in its table of [log]; not both]]"
         "[[fed? ; the runner's feedback gets it late as well]]",
     ),
 }

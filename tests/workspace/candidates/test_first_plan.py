@@ -10,8 +10,6 @@ from cli import grounded
 from grounded.findings import Finding
 from grounded_trials import Workspace
 from grounded_trials.starting.begin import begin
-from grounded_trials.workspace.candidates.first_plan import Plan, in_another_unit
-from grounded_trials.workspace.folder import Folder
 from workspaces import blank, edit
 
 HEAD = "from grounded import Model, Param\nfrom numpy import cos, sin\n"
@@ -189,30 +187,3 @@ def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(ball):
     new = (ball.folder / "target.csv").read_text().splitlines()
     assert len(new) == len(old) + 50 and new[0] == "t,x,v,th,w"
     assert not told(ball, "plan.coasts_out")
-
-
-def test_a_target_start_or_safety_in_another_unit_than_the_model_s_is_told(tmp_path):
-    (tmp_path / "ball.py").write_text(BALL)
-    t = np.arange(200) * 0.05
-    rows = np.column_stack([t, np.sin(t), np.cos(t), 0.4 * np.sin(t), 0.4 * np.cos(t), np.sin(t)])
-    np.savetxt(tmp_path / "r.csv", rows, "%.5f", ",", header="t,x,v,th,w,volt", comments="")
-    begin(tmp_path / "w", tmp_path / "r.csv", model=tmp_path / "ball.py")
-    w = Workspace(tmp_path / "w")
-    w.ingest(tmp_path / "r.csv", data=True)
-
-    def found(start: str = "", safety: str = "") -> list[Finding]:
-        edit(w.folder, start=f"{{ {start} }}", safety=safety)
-        return [*in_another_unit(Plan(Folder(w.folder), None, None))]
-
-    assert not found() and not found("th = 0.3", "x = [-3, 3]\nth = [-6, 6]")
-    assert not found("", "x = [-1e6, 1e6]")  # as good as none, in mm too
-    (note,) = found("th = 20")
-    assert note.facts["factor"] == pytest.approx(np.pi / 180)
-    (note,) = found("", "x = [-1500, 1500]")
-    assert note.facts["factor"] == 0.001 and told(w, "plan.another_unit")
-    columns = np.genfromtxt(w.folder / "target.csv", delimiter=",", names=True)
-    columns["th"] *= 57.3
-    names = columns.dtype.names
-    values = np.column_stack([columns[n] for n in names])
-    np.savetxt(w.folder / "target.csv", values, "%.5f", ",", header=",".join(names), comments="")
-    assert len(found()) == 1

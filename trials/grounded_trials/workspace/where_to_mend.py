@@ -169,9 +169,7 @@ def where_to_mend(
         return tuple(
             replace(
                 one,
-                mend=_either(one)
-                if feedback and one.keys and late_effects([one])
-                else one.mend or _late_message(workspace, one, read[-1]),
+                mend=_either(one) if feedback and one.keys and late_effects([one]) else one.mend,
             )
             for one in whole
         )
@@ -206,24 +204,6 @@ def one_message(workspace: Folder) -> tuple[str, ...]:
         return ()
     topics = {_topic(mapping.states[name].path) for name in pose}
     return tuple(pose) if len(topics) == 1 else ()
-
-
-def _late_message(workspace: Folder, one: Finding, meta: Mapping[str, str]) -> said.Finding | None:
-    """Return what to set if a speed is early: no sensor is, so the message of the position is late.
-
-    None for other findings, if both come in one message, or if its states were read differently.
-    """
-    where, mapping = position(workspace.base_model), workspace.log_mapping
-    states = mapping.states if mapping else {}
-    if one.kind != "delay" or one.delay_s >= 0 or not {*where, one.signal} <= {*states}:
-        return None
-    topic = _topic(states[where[0]].path)
-    names = [name for name, spec in states.items() if _topic(spec.path) == topic]
-    whole = {_keys(meta, name).get("delay_s", 0.0) - one.delay_s for name in names}
-    if one.signal in names or not {*where} <= {*names} or len(whole) > 1:
-        return None
-    fed = workspace.config.task.feedback
-    return said.found("sensor.mend", *names, delay=whole.pop(), fed=fed)
 
 
 def _topic(path: str) -> str:

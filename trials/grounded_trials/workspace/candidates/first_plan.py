@@ -2,16 +2,13 @@
 
 Each check is a function of the `Plan`; `CHECKS` lists them in the order in which they are told. A
 task may name no limits, ask for more than they allow, or weigh inputs so much that errors hardly
-count or so little that sensor noise shakes them. Values may be in another unit than the model's: a
-target of 90 rad was meant as 90 degrees. Stored logs show how far the robot really moved.
+count or so little that sensor noise shakes them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,12 +37,7 @@ SHORT = 0.25
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
 PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
-FAR = 5.0  # times the largest command in any stored log: limits beyond it may be in another unit
 OTHER = 1.5  # ratio of weights above which a weight was made for other [limits]
-BEYOND = 20.0  # times as far as any log: from there on, the unit is doubted
-NEAR = (0.2, 10.0)  # times as far as the logs that a value reaches in the right unit
-TURN = 2 * math.pi  # angles up to a turn are not doubted
-SMALLER = {"m": ("mm", 1000.0), "rad": ("degrees", 180 / math.pi)}  # unit, factor; also a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +58,6 @@ class Plan:
     def task(self) -> Task:
         """The task with the crude model."""
         return self.workspace.task
-
-    @cached_property
-    def logs(self) -> list[Trial]:
-        """The stored trials of this robot."""
-        return [t.trial for t in self.workspace.whole_trials() if self.workspace.fits(t.trial)]
 
     def at_limits(self, made: Candidate) -> Iterator[tuple[str, float]]:
         """Yield the share of a plan for which each input is at one of its limits."""
@@ -137,68 +124,18 @@ def without_effect(plan: Plan) -> Iterator[Finding]:
 
 
 def limits_of_log(plan: Plan) -> Iterator[Finding]:
-    """[limits] are only what a log used, or FAR beyond all that was sent, as if in another unit."""
+    """[limits] are only what a log used."""
     if not (log := seen_in(plan.workspace.config)):
         return
-    task, beyond = plan.task, []
-    for j, name in enumerate(task.model.inputs if plan.logs else ()):
-        sent = max(float(np.abs(t.inputs[: t.known_steps, j]).max(initial=0)) for t in plan.logs)
-        most = max(abs(float(task.low[j])), abs(float(task.high[j])))
-        if np.isfinite(most) and 0 < FAR * sent < most:
-            beyond.append(name)
     shares = [] if plan.made is None else [*plan.at_limits(plan.made)]
     share, at = max(((share, name) for name, share in shares), default=(0.0, ""))
     yield found(
         "plan.limits_of_log",
         log=log,
-        beyond=tuple(beyond),
         at=at or None,
         share=share,
-        times=FAR,
         logged=int(still_logged(plan.workspace)),
     )
-
-
-def in_another_unit(plan: Plan) -> Iterator[Finding]:
-    """The target, start or [safety] of a state seems to be in another unit, by the logs."""
-    task = plan.task
-    for i, (name, unit) in enumerate(task.model.states.items() if plan.logs else ()):
-        base, _, per = unit.partition("/")
-        if base not in SMALLER or per not in ("", "s"):
-            continue
-        other, factor = SMALLER[base]
-        moved = max(_largest(t.states[:, i]) for t in plan.logs)
-        for what, most in _given(plan.workspace, i):
-            far = most > max(BEYOND * moved, TURN * (base == "rad"))
-            if far and moved > 0 and NEAR[0] < most / factor / moved < NEAR[1]:
-                yield found(
-                    "plan.another_unit",
-                    name,
-                    what=what,
-                    state=name,
-                    given=Quantity(most, unit),
-                    seen=Quantity(moved, unit),
-                    unit=other + " a second" * bool(per),
-                    factor=1 / factor,
-                )
-
-
-def _given(workspace: Folder, i: int) -> Iterator[tuple[str, float]]:
-    """Yield what is given of a state, and its largest value."""
-    task = workspace.task
-    assert task.safety_low is not None and task.safety_high is not None
-    name = task.model.state_names[i]
-    columns, _ = workspace.read_target(workspace.folder / str(workspace.config.task.target))
-    if name in columns:
-        yield "the target", _largest(task.target[:, i])
-    if name in workspace.config.task.start:
-        yield "[task] start", abs(float(task.start[i]))
-    yield "[safety]", _largest(np.array([task.safety_low[i], task.safety_high[i]]))
-
-
-def _largest(values: np.ndarray) -> float:
-    """Return the largest absolute value that is finite; 0 without any."""
-    return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def of_other_limits(plan: Plan) -> Iterator[Finding]:
@@ -321,7 +258,6 @@ CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (
     no_limits,
     without_effect,
     limits_of_log,
-    in_another_unit,
     of_other_limits,
     off_target,
     rough,

@@ -1,11 +1,4 @@
-"""Compare the standing of the search with what it would be without some trials.
-
-A run that was ingested despite a warning may change which candidate is the best, most visibly if it
-contradicts the candidate's other runs: the search compares means. A run may also settle a doubt: a
-loss is in doubt, and the best candidate is handed out to be run again. Before its log is there,
-another run of the loser settles the doubt. The robot may have run the best one meanwhile, so its
-log is taken all the same.
-"""
+"""The standing of the search as it would be without some trials."""
 
 from __future__ import annotations
 
@@ -21,7 +14,6 @@ from grounded_trials.workspace.folder import Folder
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
 
-FAR = 5.0  # standard deviations of a candidate's other runs by which a run counts as odd
 LATEST = 4  # latest hand-outs that are looked at
 
 
@@ -36,7 +28,7 @@ def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
 def odd_run(
     workspace: Folder, now: Standing, identity: str, *, aside: bool = False
 ) -> tuple[Finding, ...]:
-    """Return that a doubted run counts, and how it changed its candidate's utility.
+    """Return that a doubted run counts, and how to undo that.
 
     Args:
         workspace: the workspace with the trials.
@@ -47,24 +39,10 @@ def odd_run(
     after = _of(now, identity)
     if after is None:
         return ()
-    name, then = after.candidate.id, NextCommand("discard", (identity,))
-    undo = rendered(then, workspace.address)
-    counts = found(
-        "search.counts", identity, then=then, candidate=name, undo=undo, aside=int(aside)
-    )
-    if aside or len(after.utilities) < 3 or now.incumbent is None:
-        return (counts,)
-    was = standing_without(workspace, {identity})
-    before = next((t for t in was.history if t.candidate.id == name), None)
-    if before is None or len(before.utilities) < 2 or not before.deviation > 0:
-        return (counts,)
-    n, run = len(before.utilities), after.utilities[[t.id for t in after.trials].index(identity)]
-    if not abs(run - before.utility) > FAR * before.deviation * (1 + 1 / n) ** 0.5:
-        return (counts,)
-    best = now.incumbent.candidate.id
-    dethroned = was.incumbent is not None and was.incumbent.candidate.id == name != best
-    changed = {"was": before.utility, "now": after.utility, "run": run, "runs": n}
-    return (counts.knowing({**changed, "best": best if dethroned else None}),)
+    then = NextCommand("discard", (identity,))
+    undo, name = rendered(then, workspace.address), after.candidate.id
+    one = found("search.counts", identity, then=then, candidate=name, undo=undo, aside=int(aside))
+    return (one,)
 
 
 def _of(now: Standing, identity: str) -> Tried | None:
@@ -84,24 +62,3 @@ def asked_again(workspace: Folder) -> str:
         if waiting is not None and waiting.id == name:
             return name
     return ""
-
-
-def no_longer(workspace: Folder, trial: str, now: Standing) -> list[Finding]:
-    """Return that a trial that was just stored settled a doubt without the run asked for.
-
-    Args:
-        workspace: the workspace.
-        trial: id of that trial.
-        now: the standing with it.
-    """
-    tried = _of(now, trial)
-    if tried is None or len(tried.trials) < 2:
-        return []
-    before = standing_without(workspace, {trial})
-    waited, doubt = before.outstanding, next((t for t in before.history if t.in_doubt), None)
-    if waited is None or doubt is None or tried.candidate.id == waited.id:
-        return []
-    if now.outstanding is not None and now.outstanding.id == waited.id:
-        return []
-    name, loser = waited.id, doubt.candidate.id
-    return [found("search.settled", name, candidate=name, loser=loser)]

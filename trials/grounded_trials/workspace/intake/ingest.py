@@ -31,7 +31,6 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
 from grounded_trials.workspace.candidates.standing_without import (
-    no_longer,
     odd_run,
     standing_without,
 )
@@ -209,7 +208,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     some += _of_trial(workspace, read, trial)
     some += filter(None, _of_run(workspace, read, trial, tried, history))
     if now:
-        some += _of_search(workspace, read, added, tried, now)
+        some += _of_search(workspace, read, added, now)
     told = settle(some)
     verdict = ASIDE if aside else _verdict(workspace, trial, tried)
     if ahead and verdict == "run again":
@@ -266,14 +265,10 @@ def _of_run(
         yield left_afterwards(task, whole)
 
 
-def _of_search(
-    workspace: Folder, read: Read, added: Added, tried: Tried | None, now: Standing
-) -> Iterator[Finding]:
+def _of_search(workspace: Folder, read: Read, added: Added, now: Standing) -> Iterator[Finding]:
     """Yield what a run changed in the search."""
-    said = [] if added.known else [*no_longer(workspace, added.id, now)]
     if read.doubted and added.id not in workspace.discarded():
-        said += odd_run(workspace, now, added.id, aside=_aside(read))
-    yield from said
+        yield from odd_run(workspace, now, added.id, aside=_aside(read))
 
 
 def _aside(read: Read) -> bool:
