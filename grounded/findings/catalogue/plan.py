@@ -241,14 +241,6 @@ ENTRIES: dict[str, Entry] = {
         "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]] in "
         "{file}, and plan or diagnose again",
     ),
-    "last_command": Entry(
-        "note",
-        "the plan ends with {about} at a limit, and by the model {what} is {off} from its target "
-        "{at} later",
-        "[[let_go? the runner sends {held} then, which lets it go: switch to a controller that "
-        "holds it as soon as `runner.done(t)` is true]][[!let_go? let the target rest for longer "
-        "(`grounded target --hold`), or lower [reward] terminal]]",
-    ),
     "oscillates": Entry(
         "warn",
         "the feedback of {swung} made inputs oscillate[[, while that of {quiet}, {share:%} as "

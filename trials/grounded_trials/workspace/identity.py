@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import NextCommand
-from grounded.result import listed, with_unit
+from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -318,26 +318,14 @@ def other_task(task: Task, made: Candidate) -> str:
         task: the present task.
         made: a candidate of another one.
     """
-    policy, then, model = made.policy, made.predicted_states[0], task.model
+    policy, model = made.policy, task.model
     if (policy.state_names, policy.input_names) != (model.state_names, model.input_names):
-        return "a model with other states or inputs"
-    ends = zip(policy.low, policy.high, strict=True)
-    told = [
-        f"limits of {name}: [{low:g}, {high:g}] then"
-        for j, (name, (low, high)) in enumerate(zip(task.model.input_names, ends, strict=True))
-        if not np.allclose((low, high), (task.low[j], task.high[j]))
-    ]
-    if policy.horizon != task.horizon:
-        told.append(f"a horizon of {policy.horizon} steps then")
-    pairs = zip(task.model.states.items(), then, task.start, strict=True)
-    other = [
-        f"{name} = {with_unit(f'{was:.3g}', unit)}"
-        for (name, unit), was, now in pairs
-        if not np.isclose(was, now)
-    ]
-    if other:
-        told.append(f"a start at {listed(other)} then")
-    return "; ".join(told) or "another target, reward or feedback"
+        return "another model"
+    limits = np.allclose((policy.low, policy.high), (task.low, task.high))
+    start = np.allclose(made.predicted_states[0], task.start)
+    alike = {"limits": limits, "horizon": policy.horizon == task.horizon, "start": start}
+    other = [f"another {what}" for what, same in alike.items() if not same]
+    return listed(other) or "another target, reward or feedback"
 
 
 def unsure_times(stored: Iterable[StoredTrial], trials: Collection[str]) -> tuple[float, float]:

@@ -5,15 +5,10 @@ If the task begins with an input under which the robot is not at rest, another o
 Without a start, a step or a path would begin at zero: a plate at 0 degC in a room of 23 degC. Only
 states whose value the physics depends on are read off a log (a temperature, an angle under
 gravity). A position that may be anywhere is for the user to choose.
-
-Inputs need not be what held a robot that stood still in the first rows of a log (`standstill`): a
-finger may have kept a ball on a beam that is not level. If the logs show it at the start that a
-plan assumes, the start is right although the model would move from there.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -38,7 +33,6 @@ STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
 LEAST = 3  # steps of it
 STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
 SAME = 0.25  # of the distance between two starts: within it of one of them, a robot stood there
-LESS = 0.5  # of the motion that the model predicts: if it moved less, something held it
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,34 +109,6 @@ def standstills(workspace: Folder) -> list[Stand]:
     return [stand for trial in trials if (stand := standstill(model, trial))]
 
 
-def held_there(workspace: Folder, given: Array, rests: Array, rate: Array) -> bool:
-    """Return whether by the stored logs something other than its inputs holds a robot at its start.
-
-    They show it standing there, under the same inputs, although the model would move. Logs in which
-    it stands elsewhere say that nothing holds it.
-
-    Args:
-        workspace: the workspace with the logs.
-        given: states and inputs that the plan assumes before its start (n + m,).
-        rests: those under which the model rests (n + m,); other inputs count as no such start.
-        rate: change of the states per second, by the model, from `given` (n,).
-    """
-    model, n = workspace.base_model, workspace.base_model.n
-    other, k = model.difference(rests[:n], given[:n]), int(np.argmax(np.abs(rate)))
-    if not np.array_equal(rests[n:], given[n:]):
-        return False
-    alike = [
-        one
-        for one in standstills(workspace)
-        if (np.abs(one.inputs - given[n:]) <= STEADY * one.ranges).all()
-    ]
-    return bool(alike) and all(
-        (np.abs(model.difference(one.states, given[:n])) <= SAME * np.abs(other))[other != 0].all()
-        and abs(one.moved[k]) < LESS * abs(rate[k]) * one.seconds
-        for one in alike
-    )
-
-
 def read_at_start(workspace: Folder, name: str, bias: float) -> str:
     """Return the trial in whose first rows a sensor with a bias reads what [task] start has; or "".
 
@@ -188,8 +154,6 @@ UNGIVEN = 3  # largest number of states without a start value that are solved fo
 STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
 NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
-SETTLED = 10  # least steps over which a rest is tried
-SLOW = 0.05  # fraction of its range in the target that a state may move in that time
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
@@ -226,7 +190,6 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
         return None
     units = {**base.model.states, **task.model.inputs}
     given = np.concatenate([task.start[:n], task.past])
-    stands = _as_given(task, stands, base.target)
     stands = np.concatenate([stands[:n], stands[len(states) :]])
     turned = given[:n] + base.model.difference(stands[:n], given[:n])
     stands[:n] = np.where(base.model.angle_mask, turned, stands[:n])  # no whole turns
@@ -241,8 +204,6 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
         rate[own] = max(rate[own], moved[memory_state], key=abs)
     told = np.abs(stands - given) > STILL * (1 + np.abs(stands))
     told[n:] = True
-    if held_there(workspace, given, np.where(told, stands, given), rate):
-        return None
     k = int(np.argmax(np.abs(rate)))
     other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
     before = dict(zip(units, given, strict=True))
@@ -257,44 +218,6 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
         rate=Quantity(rate[k], per_second(units[states[k]])),
         start=f"{{ {', '.join(f'{n} = {whole[n]}' for n in units if n in whole)} }}",
     )
-
-
-def _as_given(task: Task, stands: Array, target: Array) -> Array:
-    """Return states and inputs at rest with each input as given if the robot rests under that too.
-
-    In SETTLED steps, or a second, no state but the rates may then move, except for SLOW of its
-    range in the target, or of the largest in its unit. Within a dead zone, for example, it rests
-    anywhere, not only at the edge; an arm that dry friction holds creeps.
-
-    Args:
-        task: the task.
-        stands: states and inputs at rest (n + m,).
-        target: of the states that are not the memory of effects, which may settle.
-    """
-    n, stands, own = task.model.n, stands.copy(), target.shape[1]
-    ranges = np.nan_to_num(np.ptp(target, axis=0))
-    units = np.array([*task.model.states.values()][:own])
-    alike = np.array([ranges[units == unit].max() for unit in units])  # one may stay, or be free
-    ranges = np.where(ranges > 0, ranges, alike)
-    rates = np.array([unit.endswith("/s") for unit in units])
-    by = np.where(ranges > 0, SLOW * ranges, np.where(rates & ranges.any(), np.inf, NOTHING))
-    most = _drift(task, stands, own) + by
-    for j, given in enumerate(task.past):
-        other = stands.copy()
-        other[n + j] = given
-        if (_drift(task, other, own) <= most).all():
-            stands = other
-    return stands
-
-
-def _drift(task: Task, stands: Array, own: int) -> Array:
-    """Return how far each of the first `own` states goes from a rest while its inputs are held."""
-    problem, n = task.problem(exact=True), task.model.n
-    x, u = stands[None, :n], stands[None, n:]
-    with np.errstate(all="ignore"):
-        for _ in range(max(SETTLED, math.ceil(1 / task.dt))):
-            x = problem.system.step(x, u, problem.p, problem.dt)
-    return np.abs(np.asarray(task.model.difference(x[0], stands[:n])))[:own]
 
 
 def moves_by(task: Task, free: NDArray[np.bool_]) -> float:

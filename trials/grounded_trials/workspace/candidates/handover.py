@@ -396,13 +396,11 @@ class Check:
     def _coasting(self) -> Finding | None:
         """Return where the robot goes after the run, with the input held then."""
         from grounded.search.safety import coasts_out
-        from grounded_trials.workspace.candidates.rest_at_end import kicked
 
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)
         held = np.clip(made.policy.past, made.policy.low, made.policy.high)
-        out = coasts_out(self.workspace.task, planner.plan, run, held)
-        return out or kicked(planner, run, held)
+        return coasts_out(self.workspace.task, planner.plan, run, held)
 
     @property
     def void(self) -> bool:

@@ -23,12 +23,12 @@ from grounded_trials.workspace.candidates.handover import (
     checked_candidate,
     disowned,
     in_words,
-    outside_limits,
     unmapped,
 )
 from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.last_diagnosis import (
     Since,
     left_out,
@@ -110,7 +110,6 @@ class Status(Result):
 
     standing: Standing
     then: NextCommand
-    again: NextCommand  # runs or exports the best candidate once more; `next` once it is exported
     findings: tuple[Finding, ...] = ()  # on the end of the search, and on trials that don't count
     certainty: tuple[Finding, ...] = ()  # of the last gain, and of what waits
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
@@ -262,7 +261,7 @@ def _told(
         trust.made_how(made, task, now.history),
         trust.predicted(made, cost, whole, begun),
         None if best is None else trust.so_far(made, best, cost),
-        trust.trust(workspace, made, now, cost, whole - cost, status.diagnosis, status.since),
+        trust.trust(workspace, made, now, whole - cost, status.diagnosis, status.since),
         trust.extent_of(made, task),
     )
 
@@ -346,18 +345,10 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[Finding]:
     if (last := _not_run(workspace, before)) is None:
         return []
     made, meta = last
-    model = workspace.base_model
+    why = other_task(workspace.task, made)
     if meta.get("task") == workspace.task.hash:
         same = made.model == workspace.planner.fingerprint
         why = "the trial that it followed was set aside" if same else "the model was changed"
-    elif (made.policy.state_names, made.policy.input_names) != (
-        model.state_names,
-        model.input_names,
-    ):
-        why = "it is for another robot"
-    else:
-        wider = in_words(list(outside_limits(workspace.task, made.policy)))
-        why = wider or "the task was changed"
     return [found("plan.void", made.id, candidate=made.id, why=why)]
 
 
@@ -389,7 +380,6 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     return Status(
         outlook(_asking(workspace, standing, then), then),
         then,
-        again_best(workspace, standing),
         settle(every),
         _certainty(standing),
         workspace.discarded(),
@@ -471,14 +461,6 @@ def undecided(now: Standing, trial: str) -> Standing:
     history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
     waits = replace(now, phase=Phase.AWAIT, outstanding=made, missing=1, history=history)
     return replace(waits, findings=(why,), ending=Ending.NONE)
-
-
-def again_best(workspace: Folder, now: Standing) -> NextCommand:
-    """Return the command for one more trial of the best candidate, see `to_run`."""
-    if now.incumbent is None or workspace.config.system.reachable:
-        return NextCommand("run", ("best",))
-    best = now.incumbent.candidate.id  # "best" may be another one when the log comes in
-    return to_run(workspace, best, best)
 
 
 def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.placing import FromStarts
 
 LAST = 3  # recent predictions whose errors are told
-RIGHT = 0.5  # of a promised gain, which a prediction missed by at most and noise costs at least
 MUCH = 0.2  # share of a cost above which its part due to sensor noise is told
 PLACED = 0.02  # share of a predicted utility: where runs began is told if it changes more
 STATES = 3  # target states whose range is told; final values of models with 8 states at most
@@ -177,7 +176,6 @@ def trust(
     workspace: Folder,
     made: Candidate,
     now: Standing,
-    lacks: float,
     replayed: float,
     diagnosis: Diagnosis | None,
     since: Since | None,
@@ -188,7 +186,6 @@ def trust(
         workspace: the workspace with the model.
         made: what to run next.
         now: where the search stands.
-        lacks: cost of the sensor noise in its log that its prediction lacks.
         replayed: cost of the noise that its prediction has, from the log that it replays.
         diagnosis: the last one, which tells how well the model predicts if no run did.
         since: what changed since then.
@@ -196,7 +193,7 @@ def trust(
     ran = [tried for tried in now.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
     if same:
-        return _tested(workspace, made, now, same, lacks, replayed)
+        return _tested(made, now, same, replayed)
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
     exact = not now.trials and not workspace.config.system.reachable
     measured = _by_diagnosis(workspace.task, diagnosis, since)
@@ -224,20 +221,11 @@ def _by_diagnosis(
     return {}
 
 
-def _tested(
-    workspace: Folder,
-    made: Candidate,
-    now: Standing,
-    same: list[Tried],
-    lacks: float,
-    replayed: float,
-) -> Finding:
+def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) -> Finding:
     """Return by how much the last predictions missed, and the gain that this one promises.
 
-    The gain is one of predictions, which may lack some of the sensor noise in a log (`lacks`), and
-    take the noise of a single log that they replay for what the robot does (`replayed`). Where the
-    model foretold its one run so far, and by itself finds nothing to gain, the promise may be no
-    more than the noise of that run.
+    The gain is one of predictions, which take the noise of a single log that they replay for what
+    the robot does (`replayed`).
     """
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     missed = [abs(one.promised - missed_by_start(one) - one.utility) for one in last]
@@ -256,25 +244,10 @@ def _tested(
     if made.way == "gentler gains" or not gain > 0:  # no model swings, so none tells its gain
         return found("plan.tested", made.id).knowing(facts)
     noise = len(best.trials) == 1 and gain < replayed
-    if len(same) == 1 and not noise and missed[-1] < RIGHT * gain < lacks + replayed:
-        noise = -math.inf < _by_itself(workspace, made, best) <= 0
     doubtful = gain < max(missed[-1], made.likely_off)
     share = made.stake(best) if (doubtful or noise) and not made.doubtful else None
     facts |= {"gain": gain, "less": int(doubtful), "noise": int(noise), "share": share}
     return found("plan.tested", made.id, best=best.candidate.id).knowing(facts)
-
-
-def _by_itself(workspace: Folder, made: Candidate, best: Tried) -> float:
-    """Return a step's gain in the model without the bias of the best one's only run; else NaN."""
-    if len(best.trials) != 1 or made.base != best.candidate.id:
-        return math.nan
-    from grounded.rollout import simulate
-
-    both = (best.candidate.policy, made.policy)
-    planner = workspace.planner.feeding_back(both)
-    problem = planner.plan.problem(exact=True)
-    before, after = (simulate(problem, planner.widened(one)).utility for one in both)
-    return float(after - before)
 
 
 def samples(made: Candidate, now: Standing, task: Task) -> Finding | None:
