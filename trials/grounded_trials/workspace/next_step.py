@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
@@ -35,7 +35,7 @@ TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """What decides what comes next; each property is a condition of `NEXT`, or a command there.
+    """What decides what comes next.
 
     Args:
         workspace: the workspace, whose model may have changed since the diagnosis.
@@ -56,77 +56,6 @@ class Situation:
             return Since()
         return since_diagnosis(self.workspace, self.diagnosis, self.usable)
 
-    # conditions
-
-    always = True
-
-    @property
-    def lacks_what_was_found(self) -> bool:
-        """A better model plans better, at any point of the search."""
-        return bool(self.adopt) and (not self.since.newer or _none_stood(self.now))
-
-    @property
-    def plan_leaves_safety(self) -> bool:
-        """Proposing again would not help: another target does."""
-        return self.now.ending is Ending.NOT_ALLOWED and not self.now.trials
-
-    @property
-    def log_not_stored(self) -> bool:
-        """The log that the workspace was made from was not ingested."""
-        return self.diagnosis is None and bool(not_ingested(self.workspace))
-
-    @property
-    def search_asks(self) -> bool:
-        """The search asks for a command, and trials enough exist to answer it."""
-        unsure = self.now.doubt and not doubted(self.now, None, self.usable)
-        return self.diagnosis is None and bool(self.now.then) and not unsure
-
-    @property
-    def never_diagnosed(self) -> bool:
-        """Logs before the first candidate, or an ended search, were not diagnosed."""
-        logs = not self.now.history or self.now.phase is not Phase.PROPOSE
-        return self.diagnosis is None and bool(self.usable) and logs
-
-    @property
-    def diagnosis_is_old(self) -> bool:
-        """Newer logs, another model or the search's doubt ask for another diagnosis."""
-        if self.diagnosis is None:
-            return False
-        logs = self.adopt is not None and not self.now.history
-        other = _of_another_model(self.workspace, self.diagnosis, self.since)
-        return logs or other or doubted(self.now, self.since, self.usable)
-
-    @property
-    def not_settled(self) -> bool:
-        """An ended search was not diagnosed with all of its trials and its model."""
-        if self.diagnosis is None:
-            return False
-        since = self.since
-        done = since.settled or _came_true(self.workspace, self.now, self.diagnosis)
-        return bool(since.repeats) or not done
-
-    @property
-    def again_tells(self) -> bool:
-        """Another run of the best candidate may settle the doubt that ended the search."""
-        return self.now.asks_again and self.diagnosis is not None
-
-    @property
-    def nothing_known(self) -> bool:
-        """The trials can't identify any cause."""
-        return self.diagnosis is not None and bool(self.diagnosis.no_cause)
-
-    @property
-    def nothing_to_plan(self) -> bool:
-        """The trials can't identify any cause, and no manoeuvre was drawn yet."""
-        return self.nothing_known and undrawn(self.workspace)
-
-    @property
-    def diagnosed(self) -> bool:
-        """There is a diagnosis."""
-        return self.diagnosis is not None
-
-    # commands
-
     @cached_property
     def adopt(self) -> NextCommand | None:
         """The command that acts on the claims of the diagnosis, if it is of this model."""
@@ -137,14 +66,59 @@ class Situation:
         return to_adopt(self.workspace, self.diagnosis)
 
     @property
-    def run(self) -> NextCommand:
-        """One more trial of the candidate that waits, or of the best."""
-        return another_trial(self.workspace, self.now)
+    def none_stood(self) -> bool:
+        """Whether every policy that was run crashed."""
+        return bool(self.now.history) and self.now.incumbent is None
 
     @property
-    def ingest(self) -> NextCommand:
-        """The log that the workspace was made from."""
-        return NextCommand("ingest", ("--data", not_ingested(self.workspace)))
+    def nothing_known(self) -> bool:
+        """Whether the trials can't identify any cause."""
+        return self.diagnosis is not None and self.diagnosis.no_cause
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the search doubts its model, and enough new trials exist to diagnose it.
+
+        A single run would confirm nothing.
+        """
+        new = len(self.usable) if self.diagnosis is None else self.since.newer
+        return bool(self.now.doubt) and new >= LOST
+
+    @property
+    def of_another_model(self) -> bool:
+        """Whether a gap was found in another model, of which nothing is adopted any more.
+
+        That is so after `adopt --undo`, which often precedes a better model.py.
+        """
+        model, found = self.workspace.config.model, self.diagnosis
+        kept = model.effects or model.params
+        gap = found is not None and found.kind != "none"
+        return self.since.changed and not kept and self.since.usable > 0 and gap
+
+    @property
+    def came_true(self) -> bool:
+        """Whether a search has ended as predicted, with all adopted that was found before.
+
+        A diagnosis of that model would then find little.
+        """
+        best, here = self.now.incumbent, self.workspace
+        adopted = {str(effect["name"]) for effect in here.config.model.effects}
+        found = {*self.diagnosis.effects} if self.diagnosis else set[str]()
+        if not found or not found <= adopted or self.now.doubt or self.now.then or best is None:
+            return False
+        missed = abs(best.promised - best.utility)
+        same = best.candidate.model == here.planner.fingerprint
+        return same and missed <= TRUE * abs(best.utility)
+
+    @property
+    def run(self) -> NextCommand:
+        """One more trial: of the candidate that waits, the next or the best."""
+        now, best = self.now, self.now.incumbent
+        if now.phase is Phase.AWAIT and now.outstanding is not None:
+            return to_run(self.workspace, now.outstanding.id)
+        if now.phase is Phase.PROPOSE or best is None:
+            return to_plan(self.workspace)
+        return to_run(self.workspace, best.candidate.id, "best")
 
     @property
     def record(self) -> NextCommand:
@@ -153,36 +127,56 @@ class Situation:
         uncertain = any(one.uncertain for one in params)
         return NextCommand("excite") if uncertain else NextCommand("ingest", ("--data", "LOG"))
 
-    @property
-    def asked(self) -> NextCommand | None:
-        """The command that the search asks for."""
-        return self.now.then
 
-    @property
-    def propose(self) -> NextCommand:
-        """The next candidate; `target` if no manoeuvre was drawn yet."""
-        return to_plan(self.workspace)
-
-    target, diagnose, export = TARGET, DIAGNOSE, EXPORT
-
-
-ANY, ENDED = tuple(Phase), (Phase.CONVERGED, Phase.STOPPED)
+ANY, PLANNING, ENDED = tuple(Phase), (Phase.PROPOSE,), (Phase.CONVERGED, Phase.STOPPED)
+Row = tuple[tuple[Phase, ...], Callable[[Situation], Any], Callable[[Situation], Any]]
 # what comes next: the first row whose phase and condition hold gives the command
-NEXT: tuple[tuple[tuple[Phase, ...], str, str], ...] = (
-    (ANY, "lacks_what_was_found", "adopt"),
-    ((Phase.AWAIT,), "always", "run"),
-    (ANY, "plan_leaves_safety", "target"),
-    (ANY, "log_not_stored", "ingest"),
-    (ANY, "search_asks", "asked"),
-    (ANY, "never_diagnosed", "diagnose"),
-    ((Phase.PROPOSE,), "diagnosis_is_old", "diagnose"),
-    ((Phase.PROPOSE,), "nothing_to_plan", "record"),
-    ((Phase.PROPOSE,), "always", "propose"),
-    (ENDED, "not_settled", "diagnose"),
-    (ENDED, "again_tells", "run"),
-    (ENDED, "nothing_known", "run"),
-    (ENDED, "diagnosed", "export"),
-    (ENDED, "always", "propose"),
+NEXT: tuple[Row, ...] = (
+    # a better model plans better, at any point of the search
+    (ANY, lambda s: s.adopt and (not s.since.newer or s.none_stood), lambda s: s.adopt),
+    ((Phase.AWAIT,), lambda s: True, lambda s: s.run),
+    # proposing again would not help
+    (ANY, lambda s: s.now.ending is Ending.NOT_ALLOWED and not s.now.trials, lambda s: TARGET),
+    # the log that the workspace was made from is not stored
+    (
+        ANY,
+        lambda s: not s.diagnosis and not_ingested(s.workspace),
+        lambda s: NextCommand("ingest", ("--data", not_ingested(s.workspace))),
+    ),
+    # the search asks for a command, and trials enough exist to answer it
+    (
+        ANY,
+        lambda s: not s.diagnosis and s.now.then and not (s.now.doubt and not s.doubted),
+        lambda s: s.now.then,
+    ),
+    # logs before the first candidate, or an ended search, were not diagnosed
+    (
+        ANY,
+        lambda s: (
+            not s.diagnosis and s.usable and (not s.now.history or s.now.phase is not Phase.PROPOSE)
+        ),
+        lambda s: DIAGNOSE,
+    ),
+    # newer logs, another model or the search's doubt ask for another diagnosis
+    (
+        PLANNING,
+        lambda s: (
+            s.diagnosis and ((s.adopt and not s.now.history) or s.of_another_model or s.doubted)
+        ),
+        lambda s: DIAGNOSE,
+    ),
+    (PLANNING, lambda s: s.nothing_known and undrawn(s.workspace), lambda s: s.record),
+    (PLANNING, lambda s: True, lambda s: to_plan(s.workspace)),
+    # an ended search was not diagnosed with all of its trials and its model
+    (
+        ENDED,
+        lambda s: s.diagnosis and (s.since.repeats or not (s.since.settled or s.came_true)),
+        lambda s: DIAGNOSE,
+    ),
+    # another run of the best candidate may settle the doubt that ended the search, or tell a cause
+    (ENDED, lambda s: s.diagnosis and (s.now.asks_again or s.nothing_known), lambda s: s.run),
+    (ENDED, lambda s: s.diagnosis, lambda s: EXPORT),
+    (ENDED, lambda s: True, lambda s: to_plan(s.workspace)),
 )
 
 
@@ -191,11 +185,9 @@ def next_command(
 ) -> NextCommand:
     """Return the command to type next by `NEXT`, see `Situation`."""
     here = Situation(workspace, now, diagnosis, usable)
-    for phases, condition, command in NEXT:
-        if now.phase in phases and getattr(here, condition):
-            then = getattr(here, command)
-            return to_plan(workspace) if then == PROPOSE else then
-    raise AssertionError(now.phase)
+    rows = (row for row in NEXT if now.phase in row[0])
+    then: NextCommand = next(command(here) for _, holds, command in rows if holds(here))
+    return to_plan(workspace) if then == PROPOSE else then
 
 
 def outlook(now: Standing, then: NextCommand) -> Standing:
@@ -216,53 +208,6 @@ def not_ingested(workspace: Folder) -> str:
     return next((str(path) for path in places if path.exists()), "LOG") if log else ""
 
 
-def _of_another_model(workspace: Folder, diagnosis: Diagnosis, since: Since) -> bool:
-    """Return whether a gap was found in another model, of which nothing is adopted any more.
-
-    That is so after `adopt --undo`, which often precedes a better model.py.
-    """
-    model = workspace.config.model
-    kept = model.effects or model.params
-    return since.changed and not kept and since.usable > 0 and diagnosis.kind != "none"
-
-
-def _came_true(workspace: Folder, now: Standing, diagnosis: Diagnosis) -> bool:
-    """Return whether a search has ended as predicted, with all adopted that was found before.
-
-    A diagnosis of that model would then find little.
-    """
-    best, model = now.incumbent, workspace.planner.fingerprint
-    adopted = {str(effect["name"]) for effect in workspace.config.model.effects}
-    found = {*diagnosis.verdict.effects}
-    if not found or not found <= adopted or now.doubt or now.then:
-        return False
-    if best is None or best.candidate.model != model:
-        return False
-    return abs(best.promised - best.utility) <= TRUE * abs(best.utility)
-
-
-def doubted(now: Standing, since: Since | None, usable: Sequence[str]) -> bool:
-    """Return whether the search doubts its model and enough new trials exist to diagnose it.
-
-    Args:
-        now: the standing of the search.
-        since: what changed since the last diagnosis; None without one.
-        usable: the trials that a diagnosis can use now. A single run would confirm nothing.
-    """
-    return bool(now.doubt) and (len(usable) if since is None else since.newer) >= LOST
-
-
-def another_trial(workspace: Folder, now: Standing) -> NextCommand:
-    """Return the command for one more trial: of the outstanding, the next or the best candidate."""
-    waiting = now.phase is Phase.AWAIT
-    if not waiting and (now.phase is Phase.PROPOSE or now.incumbent is None):
-        return PROPOSE
-    if waiting and now.outstanding is not None:
-        return to_run(workspace, now.outstanding.id)
-    assert now.incumbent is not None
-    return to_run(workspace, now.incumbent.candidate.id, "best")
-
-
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
     """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
@@ -279,20 +224,14 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         with suppress(GroundedError):  # a task that can't be planned, of which data say nothing
             handed = any(workspace.candidate_path("c").parent.glob("c*.mcap"))
             ran = handed and any(one.candidate for one in workspace.task_trials())
-            if ran and (now := standing_in(workspace)).phase == "await-trial":
-                return another_trial(workspace, now)
+            if ran and (now := standing_in(workspace)).phase is Phase.AWAIT:
+                return Situation(workspace, now, None, ()).run
         return DIAGNOSE
-    goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not now.doubt
-    if goes_on and not _none_stood(now):
+    none_stood = Situation(workspace, now, None, ()).none_stood
+    if now.phase in (Phase.PROPOSE, Phase.AWAIT) and not (now.doubt or none_stood):
         return PROPOSE
-    return next_command(
-        workspace, now, readable_diagnosis(workspace.reports), usable_ids(workspace)
-    )
-
-
-def _none_stood(now: Standing) -> bool:
-    """Return whether every policy that was run crashed."""
-    return bool(now.history) and now.incumbent is None
+    last, usable = readable_diagnosis(workspace.reports), usable_ids(workspace)
+    return next_command(workspace, now, last, usable)
 
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
@@ -310,7 +249,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
             return REPORT
         return next_command(workspace, _standing_ahead(workspace), found, usable)
     here = Situation(workspace, _standing_ahead(workspace), found, usable)
-    return here.record if here.nothing_to_plan else here.run
+    return here.record if undrawn(workspace) else here.run
 
 
 def left_open(found: Diagnosis) -> bool:

@@ -36,7 +36,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import doubted, next_command, not_ingested, outlook
+from grounded_trials.workspace.next_step import Situation, next_command, not_ingested, outlook
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
@@ -184,9 +184,10 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         notes += left_open(workspace, proposal, held)
     status = status_of(workspace, now)
     lacks = _lacks(workspace, status.diagnosis) if candidate and status.diagnosis else None
-    doubt = now.doubt
-    doubt = doubt if doubt and doubted(now, status.since, usable_ids(workspace)) else None
-    notes += [one for one in (lacks, doubt) if one]
+    unsure = (
+        now.doubt and Situation(workspace, now, status.diagnosis, usable_ids(workspace)).doubted
+    )
+    notes += [one for one in (lacks, now.doubt if unsure else None) if one]
     if candidate is None:
         return _ended(workspace, proposal, status, notes, held)
     # the user should first correct the held input; a second `propose` hands the candidate out

@@ -53,7 +53,7 @@ from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gon
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
-from grounded_trials.workspace.next_step import after_log, another_trial
+from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.target_state import PROPOSE
 from grounded_trials.workspace.unknown_id import refuse_ids
@@ -218,7 +218,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     if any(one.weight is Weight.ASIDE for one in told) and not aside:
         then = NextCommand("discard", (added.id,))
     elif now and waits and aside:
-        then = another_trial(workspace, now)
+        then = Situation(workspace, now, None, ()).run
     else:
         then = after_log(workspace, verdict, now)
     return Ingested(
