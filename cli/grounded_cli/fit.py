@@ -110,18 +110,16 @@ DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 def _errors(found: Fit, model: Model) -> str:
     assert found.before is not None and found.after is not None
-    rows = []
-    for i, name in enumerate(found.before.names):
-        rows.append(
-            (
-                name,
-                number(float(found.before.one_step[i]), 3),
-                number(float(found.after.one_step[i]), 3),
-                number(float(found.before.ahead[i]), 3),
-                number(float(found.after.ahead[i]), 3),
-                shown(model.states.get(name, "")),
-            )
+    before, after = found.before, found.after
+    rows = [
+        (
+            name,
+            *(number(float(e[i]), 3) for e in (before.one_step, after.one_step)),
+            *(number(float(e[i]), 3) for e in (before.ahead, after.ahead)),
+            shown(model.states.get(name, "")),
         )
+        for i, name in enumerate(before.names)
+    ]
     ahead = f"{found.before.horizon_s:.3g} s"
     header = ("held-out error", "1 step before", "after", f"{ahead} before", "after", "unit")
     return table(rows, header)

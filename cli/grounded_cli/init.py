@@ -27,6 +27,7 @@ from grounded_cli.console.terminal import (
 from grounded_cli.console.workspace_option import next_line
 
 if TYPE_CHECKING:
+    from grounded.findings import Finding
     from grounded_trials.formats.tables import Layout
     from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.starting.begin import Begun
@@ -201,25 +202,26 @@ def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> Non
     from grounded_trials.starting.blank import left_open
 
     made = Workspace.create(folder, model=model, dt=dt)
-    notes = left_open(made.base_model)
-    if json_:
-        findings = [one.to_json() for one in notes]
-        show_json({"workspace": folder, "model": model, "findings": findings})
-        return
-    _made(folder, f"{model}:")
-    show("  grounded.toml, target.csv, drive.py")
-    tell(notes)
-    where = f"cd {shlex.quote(folder)} && " * (folder != ".")
-    show(f"\nnext: {where}grounded propose")
+    _created(folder, {"model": model}, left_open(made.base_model), "target.csv, drive.py", json_)
 
 
 def _example(folder: str, name: str, json_: bool) -> None:
     from grounded_trials import Workspace
 
     Workspace.create(folder, example=name)
+    _created(folder, {"example": name}, (), "model.py, target.csv, real.py", json_)
+
+
+def _created(
+    folder: str, of: dict[str, str], notes: Sequence[Finding], files: str, json_: bool
+) -> None:
+    """Say what a workspace was made of, and what is in it."""
     if json_:
-        show_json({"workspace": folder, "example": name, "findings": []})
+        findings = [one.to_json() for one in notes]
+        show_json({"workspace": folder, **of, "findings": findings})
         return
-    _made(folder, f"{name}:")
-    show("  grounded.toml, model.py, target.csv, real.py")
-    show("\nnext: " + f"cd {shlex.quote(folder)} && " * (folder != ".") + "grounded propose")
+    _made(folder, f"{', '.join(of.values())}:")
+    show(f"  grounded.toml, {files}")
+    tell(notes)
+    where = f"cd {shlex.quote(folder)} && " * (folder != ".")
+    show(f"\nnext: {where}grounded propose")

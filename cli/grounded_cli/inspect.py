@@ -110,12 +110,7 @@ def _what(found: Inspected) -> str:
 
 
 def _next(found: Inspected) -> str:
-    """Return the lines that say what to do with the file."""
-    from grounded_trials.store.own_files import TRIAL
-
+    """Return the line that says what to do with the file."""
     if found.log_table:
         return f"# next: {typed(found.then)}"
-    line = next_line(found.then)
-    if found.format != TRIAL or found.report.damage:
-        return line
-    return line
+    return next_line(found.then)

@@ -207,6 +207,9 @@ ENTRIES: dict[str, Entry] = {
     "outdated": Entry(
         "note", "the model was changed since {candidate} was made: its prediction is outdated"
     ),
+    "no_better": Entry(
+        "note", "the model was changed since {about} was planned, and it promises no better plan"
+    ),
     "void": Entry(
         "note",
         "{candidate} was not run and is void[[: {why}]][[: {trials}, which it was made from, "

@@ -220,6 +220,9 @@ def _ended(
             workspace.notes.add(gone_on, again=False)
         vars(workspace).pop("noted", None)
         status = status_of(workspace, proposal.standing)
+    best, converged = proposal.standing.incumbent, status.standing.phase is Phase.CONVERGED
+    if best and converged and best.candidate.model != workspace.planner.fingerprint:
+        notes = [*notes, found("plan.no_better", best.candidate.id)]
     over = replace(proposal, standing=status.standing)
     then = PROPOSE if held else status.then  # after [task] start is changed, as noted
     return Proposed(over, None, then, settle((*proposal.findings, *notes)))
