@@ -24,6 +24,7 @@ import numpy as np
 from grounded.challenge import Case, judge, of_crude, oracle, sealed, task_of
 from grounded.checks import refused, wrong
 from grounded.diagnosis.parts import Diagnosis, Verdict
+from grounded.effects import Library
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded.experiments.jobs import Job, Progress, run_jobs
@@ -218,7 +219,7 @@ def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, A
     """
     begin, case = time.process_time(), Folder(Path(folder) / name)
     try:
-        diagnose_in(case, without=without)
+        diagnose_in(case, without=without, library=Library())
     except GroundedError as error:
         refused = found("gap.refused", why=str(error))
         write_diagnosis(case.reports, Diagnosis(Verdict("unknown"), findings=(refused,)))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
@@ -15,10 +15,12 @@ import numpy as np
 
 from grounded.diagnosis.error_report import furthest
 from grounded.diagnosis.parts import Diagnosis
+from grounded.diagnosis.telling import Told, sentence, told
 from grounded.errors import NextCommand
+from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import measured_alike
+from grounded.result import begun, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import LUCK
 from grounded.search.planner import Planner
@@ -27,7 +29,6 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
-from grounded_trials.workspace.adoption import Better, Settled, lines_since, told_since
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import outlook
@@ -43,7 +44,7 @@ from grounded_trials.workspace.off_target import (
 )
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.telling import Told
+    from grounded_trials.workspace.adoption import Better, Settled
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
@@ -123,15 +124,29 @@ class Findings:
 
     @property
     def told(self) -> Told | None:
-        """What is told of the last diagnosis now; None if there is none."""
-        one = self.diagnosis
-        return None if one is None else told_since(one, self.since, self.settled)
+        """What is told of the last diagnosis now: what was adopted since is not missing."""
+        if self.diagnosis is None:
+            return None
+        said = told(self.diagnosis)
+        if self.settled is not None and self.settled.closed:
+            return replace(said, lines=(), rows=(), findings=(), next="")
+        return replace(said, next="") if self.since.sentence else said
 
     @property
     def lines(self) -> list[str]:
-        """The same as sentences, after what was adopted."""
-        one = self.diagnosis
-        return [] if one is None else lines_since(one, self.since, self.settled)
+        """The same as sentences: what was adopted, why the rest is outdated, and the rest."""
+        if self.told is None:
+            return []
+        first, adopted = list[str](), self.settled
+        if adopted is not None:
+            names = found("model.adopted", *(name for name, _ in adopted.rows))
+            more = (
+                (adopted.gained, adopted.open) if adopted.closed else ()
+            )  # else it says so itself
+            first = [sentence(one) for one in (names, *more) if one]
+        if text := self.since.sentence:
+            first.append(f"{begun(text)}.")
+        return [*first, *self.told.texts()]
 
     @property
     def next_trial(self) -> str:

@@ -108,8 +108,22 @@ def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
     }
 
 
-def report_in(workspace: Folder, *, html: bool, png: bool, rrd: bool) -> Report:
-    """Gather the findings and write the requested files, see `Workspace.report`."""
+def report_in(
+    workspace: Folder, *, html: bool = False, png: bool = False, rrd: bool = False
+) -> Report:
+    """Report utilities, trajectories, model bias and gap of all stored trials.
+
+    A damaged or missing file is left out and listed in `findings.lost`.
+
+    Args:
+        workspace: the workspace.
+        html: write reports/report.html, and layouts for Foxglove and PlotJuggler.
+        png: write the figures of the page as reports/*.png.
+        rrd: write reports/recording.rrd for the Rerun viewer, and the layouts.
+
+    Raises:
+        GroundedError: if an extra that one of them needs is missing; nothing is written then.
+    """
     for module, asked, extra in (
         ("jinja2", html, "report"),
         ("matplotlib", png, "png"),

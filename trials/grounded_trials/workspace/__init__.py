@@ -8,9 +8,9 @@ candidates/  planning the next candidate, handing it over, running it: propose, 
 intake/      logs become stored trials: ingest
 
 One module per further verb: `new_target.py`, `inspecting.py`, `looping.py` (learn and next),
-`fitting.py`, `diagnosing.py`, `adopting.py`, `discarding.py`, `verifying.py`;
+`fitting.py`, `diagnosing.py`, `adoption.py`, `discarding.py`, `verifying.py`;
 `grounded_trials.door` makes them the methods of one class. `next_step.py` chooses the command to
-suggest next, after what `last_diagnosis.py` reads and `adoptable.py` finds in it. `adopted.py`
-plans with adopted effects, `where_to_mend.py` says where to correct a finding about a sensor, and
-`off_target.py` measures errors of a run in units. `settled.py` says what was adopted.
+suggest next, after what `last_diagnosis.py` reads. `adopted.py` plans with adopted effects,
+`where_to_mend.py` says how [log] read the trials and where to correct a finding about a sensor, and
+`off_target.py` measures errors of a run in units.
 """

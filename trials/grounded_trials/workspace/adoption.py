@@ -19,13 +19,13 @@ from grounded.checks import refused, unknown
 from grounded.diagnosis.causes import sign_only
 from grounded.diagnosis.error_report import gain, telling
 from grounded.diagnosis.parts import Diagnosis, Estimate, Made
-from grounded.diagnosis.telling import Told, errors_line, open_line, sentence, told
+from grounded.diagnosis.telling import errors_line, open_line
 from grounded.effects import param_name
 from grounded.effects.joint import like_a_load
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.model import all_at_bounds
-from grounded.result import UNSAID, Document, begun, listed, number
+from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded_trials.plain_file import unreadable
 from grounded_trials.store.documents import read_document, write_document
@@ -218,17 +218,22 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | Non
 # adopting
 
 
-def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
-    """Add diagnosed effects to [model] effects, see `Workspace.adopt`; write nothing on an error.
+def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> Adopted:
+    """Add effects of the last diagnosis to the model in grounded.toml, or raise and write nothing.
 
     If the diagnosis calibrated the model's own parameters together with the effects that it claims,
     these parameters are adopted too. An effect that it does not claim was fitted instead of those,
     without parameters.
+
+    Args:
+        workspace: the workspace.
+        effects: `family:target` names of effects that were claimed together, or of one effect.
+        parameters: also take over the model parameters that were calibrated together with them.
     """
     diagnosis = read_diagnosis(workspace.reports)
     if diagnosis is None:
         raise refused("search.undiagnosed", then=AGAIN)
-    asked = names = _with_curves(diagnosis, list(dict.fromkeys(names)))
+    asked = names = _with_curves(diagnosis, list(dict.fromkeys(effects)))
     before = made_from(diagnosis).effects
     _check(names, diagnosis, workspace, before)
     physics = [name for name in names if name not in diagnosis.late_sensors]
@@ -449,7 +454,7 @@ def _estimated(
 
 
 def undo_adoption(workspace: Folder) -> Undone:
-    """Restore [model] as it was before the last adoption, see `Workspace.undo_adoption`.
+    """Undo the last `adopt`: restore the effects and params of grounded.toml.
 
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
@@ -702,26 +707,6 @@ def _errors(diagnosis: Diagnosis, now: str, before: str) -> Finding | None:
     if row is None or not (getattr(row, now) and getattr(row, before)):
         return None
     return next(errors_line(diagnosis, now, before), None)
-
-
-def told_since(diagnosis: Diagnosis, since: Since, adopted: Settled | None) -> Told:
-    """Return what is told of a diagnosis now: what was adopted since is not missing any more."""
-    said = told(diagnosis)
-    if adopted is not None and adopted.closed:
-        return replace(said, lines=(), rows=(), findings=(), next="")
-    return replace(said, next="") if since.sentence else said
-
-
-def lines_since(diagnosis: Diagnosis, since: Since, adopted: Settled | None) -> list[str]:
-    """Return the same as sentences: what was adopted, why the rest is outdated, and the rest."""
-    first = []
-    if adopted is not None:
-        names = found("model.adopted", *(name for name, _ in adopted.rows))
-        more = (adopted.gained, adopted.open) if adopted.closed else ()  # else it says so itself
-        first = [sentence(one) for one in (names, *more) if one]
-    if text := since.sentence:
-        first.append(f"{begun(text)}.")
-    return [*first, *told_since(diagnosis, since, adopted).texts()]
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:

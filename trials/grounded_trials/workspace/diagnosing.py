@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 def diagnose_in(
     workspace: Folder,
-    *,
     trials: Sequence[str] = (),
+    *,
     max_effects: int | None = None,
     without: Sequence[str] = (),
     library: Library | None = None,
@@ -58,12 +58,23 @@ def diagnose_in(
     """Diagnose the gap between the model and the stored trials; write reports/diagnosis.json.
 
     The model is diagnosed with the effects that were adopted. If two effects are tied, the
-    candidate that would separate them is written too (`.probe`); with `probe`, the most informative
-    one is written even if nothing is tied. `.next_trial` says what to expect of it. For the
-    arguments see `Workspace.diagnose`.
+    candidate that would separate them is written too (`.probe`). `.next_trial` says what to expect
+    of it.
+
+    Args:
+        workspace: the workspace.
+        trials: short names such as t0007; empty: all usable trials.
+        max_effects: largest number of effects in one hypothesis; None: 3, and more if those leave
+            a gap.
+        without: effect families to exclude.
+        library: the effects to consider; None: the installed ones.
+        compare: a second group of trials; the result's `changed` lists what differs from the first.
+        probe: write the most informative probe even if no two explanations tie.
+        engine: workers that fit hypotheses; their number does not change the result.
+        progress: called with each stage.
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-    from grounded.effects import Library
+    from grounded_trials.workspace.adopted import installed_effects
     from grounded_trials.workspace.adoption import diagnosed_again
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
@@ -71,7 +82,7 @@ def diagnose_in(
     delays = {
         n: float(e["d"]) for n, e in zip(names, effects, strict=True) if n.startswith("delay:")
     }
-    library = (library or Library()).without(without)
+    library = (library or installed_effects()).without(without)
     planner = workspace.planner
     share = chosen(workspace, trials)
     second = chosen(workspace, compare) if compare else Share([])

@@ -41,7 +41,7 @@ class SetAside(Document):
 
 
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
-    """Record that trials were discarded or restored, see `Workspace.discard`."""
+    """Record that trials were discarded or restored."""
     for name in trials:
         if not workspace.store.matching(name.lower()):
             raise unknown_trial(workspace, name)
@@ -61,8 +61,19 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     return SetAside(tuple(one.id for one in found), tuple(same), workspace.discarded())
 
 
-def discard_in(workspace: Folder, trials: Sequence[str], why: str) -> SetAside:
-    """Record that trials were discarded, see `Workspace.discard`."""
+def restore_in(workspace: Folder, *trials: str) -> SetAside:
+    """Undo `discard` for some trials."""
+    return set_aside(workspace, "restore", trials, "")
+
+
+def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
+    """Exclude trials from search, fit, diagnosis and report; nothing is deleted.
+
+    Args:
+        workspace: the workspace.
+        trials: short names such as t0004.
+        why: the reason, stored with the note.
+    """
     done = set_aside(workspace, "discard", trials, why)
     with suppress(GroundedError):  # of files that are damaged: `status` names them
         if then := _instead(workspace, done.trials[-1]):

@@ -74,7 +74,7 @@ class Fitted(Result):
 
 def fit_in(
     workspace: Folder,
-    names: Sequence[str] | None,
+    params: Sequence[str] | None = None,
     *,
     trials: Sequence[str] = (),
     latency: bool = False,
@@ -82,7 +82,16 @@ def fit_in(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fitted:
-    """Fit the workspace's model to its trials, see `Workspace.fit`.
+    """Estimate the model's parameters from trials, after correcting sensor errors.
+
+    Args:
+        workspace: the workspace.
+        params: names of the parameters to fit; None: all.
+        trials: short names such as t0007; empty: all usable trials.
+        latency: also fit one transport delay, common to all inputs.
+        apply: write the values to grounded.toml.
+        engine: workers for the trials' likelihoods; their number does not change the result.
+        progress: called with the stage and the time taken.
 
     Raises:
         GroundedError: if `apply` is set but the fit predicts held-out time worse than before;
@@ -91,7 +100,7 @@ def fit_in(
     from grounded.fit import fit
     from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
-    planner, share = workspace.planner, chosen(workspace, trials)
+    planner, share, names = workspace.planner, chosen(workspace, trials), params
     used = share.trials
     adopted = _adopted_delays(workspace)
     rows, early = unsure_times(workspace.whole_trials(), ids_of(used))

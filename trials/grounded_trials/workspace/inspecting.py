@@ -12,6 +12,7 @@ from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.log_table import layout_of
+from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.unknown_id import refuse_ids
@@ -94,6 +95,7 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
     from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
     from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 
+    log = path_of(log)
     refuse_ids(workspace, log, "inspect")
     if layout == AS_IT_SAYS and (workspace.folder / FILE).exists():
         with suppress(GroundedError):  # it is reported where [log] is used

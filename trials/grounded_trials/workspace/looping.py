@@ -13,6 +13,7 @@ from grounded.findings import found as said
 from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase
+from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.candidates.exporting import (
     Exported,
     export_candidate,
@@ -57,11 +58,19 @@ class NextRun(Result):
 
 def learn_in(
     workspace: Folder,
-    trials: int | None,
-    progress: Callable[[str], None] | None,
-    each: Callable[[Candidate, Ingested], None] | None,
+    trials: int | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+    each: Callable[[Candidate, Ingested], None] | None = None,
 ) -> Status:
-    """Propose, run and ingest until the search ends, see `Workspace.learn`."""
+    """Propose, run and ingest until the search ends.
+
+    Args:
+        workspace: the workspace.
+        trials: maximum number of trials in this call; None: until the search ends.
+        progress: called with a description of each step.
+        each: called with every candidate and its trial, once that is stored.
+    """
     from grounded_trials.workspace.candidates.running import run_candidate
 
     if trials is not None:
@@ -94,14 +103,22 @@ def _odd_before(workspace: Folder) -> bool:
     return bool(runs) and bool(log_faults(workspace, runs[-1]))
 
 
-def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:
-    """Ingest a log, propose, and export for the robot, see `Workspace.next`.
+def next_in(
+    workspace: Folder, log: str | Path, *, candidate: str | None = None, runner: bool = True
+) -> NextRun:
+    """Ingest a log, propose the next candidate and export it for the robot, in one call.
 
     Nothing is proposed from a log that should be discarded. The next candidate is exported as the
     one that the log ran was: in C there is no use for an npz.
+
+    Args:
+        workspace: the workspace.
+        log: the log of the run.
+        candidate: the candidate that was run; None: the outstanding one.
+        runner: also write the program that runs the exported candidate.
     """
     try:
-        taken = ingest_log(workspace, log, candidate)
+        taken = ingest_log(workspace, path_of(log), candidate)
     except GroundedError as error:
         if error.then and error.then.verb == "ingest" and "--data" not in error.then.arguments:
             error.then = NextCommand("next", error.then.arguments)

@@ -35,7 +35,11 @@ class Verified(Document):
 
 
 def verify_in(workspace: Folder) -> Verified:
-    """Check every file of a workspace that results depend on."""
+    """Check all stored files for changes, damage, deletion and replacement.
+
+    Trials and notes are checked against their hashes and for completeness; candidates against their
+    checksums, what was handed out, and their predictions; the rest by checksums.
+    """
     broken = [*workspace.store.verify()]
     known = noted(workspace.notes.read(broken))
     broken += known.gone(workspace.store)

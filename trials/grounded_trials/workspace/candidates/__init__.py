@@ -1,7 +1,7 @@
 """The policies to run: planned from the stored trials, checked, and handed over to the robot.
 
 Read `proposing.py` first (propose and status); `search_state.py` derives where the search stands,
-`standing_without.py` what single runs change in it. `handover.py` checks each candidate before it
+also without some trials. `handover.py` checks each candidate before it
 leaves, for `exporting.py` (other programs) and `running.py` (the robot, or a simulated one).
 `first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks;
 `rest_at_end.py` what a plan lacks to end at rest.

@@ -65,12 +65,22 @@ class Ran(Document):
 
 def run_candidate(
     workspace: Folder,
-    candidate: str | None,
+    candidate: str | None = None,
     *,
     anyway: bool = False,
     warn: Callable[[Finding], None] | None = None,
 ) -> Ran:
-    """Run a candidate once and write its trial to runs/cNNNN-K.mcap, see `Workspace.run`."""
+    """Run a candidate on [system] and write its trial to runs/cNNNN-K.mcap, to be ingested.
+
+    The candidate is refused if its file was altered since it was proposed, or if it is void because
+    [limits], [safety], the task or the model have changed.
+
+    Args:
+        workspace: the workspace.
+        candidate: c0003, or `best`; None: the outstanding one.
+        anyway: run it although it is void.
+        warn: called with the finding of each check that is overridden, before the robot moves.
+    """
     system, identity = workspace.config.system, candidate_named(workspace, candidate)
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:

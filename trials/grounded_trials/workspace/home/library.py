@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,13 +81,18 @@ def as_table(one: Estimate) -> dict[str, Any]:
     return {"value": float(f"{one.value:.8g}"), **std, "unit": one.unit or "1"}
 
 
-def export_actuator(workspace: Folder, path: Path, name: str | None = None) -> Shelved:
-    """Write what is known of one actuator, see `Workspace.export_actuator`.
+def export_actuator(workspace: Folder, path: str | Path, actuator: str | None = None) -> Shelved:
+    """Write what is known of one actuator as a YAML file that another workspace begins from.
+
+    Args:
+        workspace: the workspace.
+        path: the file.
+        actuator: the input; None: the only one.
 
     Raises:
         GroundedError: if the model has several inputs and none is named, or nothing is known of it.
     """
-    model = workspace.base_model
+    model, path, name = workspace.base_model, Path(path), actuator
     if name is None and model.m == 1:
         name = model.input_names[0]
     if name not in model.input_names:
@@ -107,12 +112,12 @@ def export_actuator(workspace: Folder, path: Path, name: str | None = None) -> S
     return Shelved(path, name, tables)
 
 
-def begin_with(workspace: Folder, files: Sequence[str]) -> tuple[dict[str, Any], ...]:
-    """Write actuators from files into [model] effects and priors of a workspace.
+def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]:
+    """Begin with actuators that were exported: their values as effects, their +- as priors.
 
     Args:
         workspace: the workspace, just made.
-        files: FILE for the inputs with the unit of its actuator, or FILE:INPUT,INPUT.
+        actuators: FILE for the inputs with the unit of its actuator, or FILE:INPUT,INPUT.
 
     Returns:
         The effects.
@@ -122,7 +127,7 @@ def begin_with(workspace: Folder, files: Sequence[str]) -> tuple[dict[str, Any],
     """
     model, effects, priors = workspace.base_model, list[dict[str, Any]](), dict[str, float]()
     driven = _driven(model)
-    for text in files:
+    for text in actuators:
         file, _, names = text.rpartition(":") if not Path(text).is_file() else (text, "", "")
         path = Path(file or text)
         table = read_yaml(path)

@@ -106,18 +106,27 @@ class Compared(Document):
 
 def compare_models(
     workspace: Folder,
-    first: str,
-    second: str,
+    first: str | Path,
+    second: str | Path,
     trials: Sequence[str] = (),
+    *,
     progress: Callable[[str], None] | None = None,
 ) -> Compared:
-    """Compare two models on the stored trials, see `Workspace.compare`.
+    """Compare two models on the stored trials: which predicts better, where, and which numbers.
+
+    Args:
+        workspace: the workspace.
+        first: a folder (a workspace; "." for this one), a model.py, an MJCF or URDF file, or a YAML
+            file with values of this model.
+        second: likewise.
+        trials: short names such as t0007; empty: all usable trials.
+        progress: called with each stage.
 
     Raises:
         GroundedError: if one can't be read, or has other states or inputs than this workspace.
     """
     tick = progress or (lambda stage: None)
-    one, other = _aligned(workspace, _rival(workspace, first), _rival(workspace, second))
+    one, other = _aligned(workspace, *(_rival(workspace, str(text)) for text in (first, second)))
     used = chosen(workspace, trials).trials
     looked = sound_trials(workspace.task, used, (), None, one_message(workspace)).trials
 

@@ -68,8 +68,15 @@ class TakenHome(Document):
         return str(self.file)
 
 
-def export_model(workspace: Folder, path: Path | None) -> TakenHome:
-    """Write the workspace's model with fitted values and adopted effects, see `Workspace`.
+def export_model(workspace: Folder, path: str | Path | None = None) -> TakenHome:
+    """Write the model as it is now, in the form that it came in, for other programs.
+
+    An MJCF or URDF file, or a model.py, with the values of fitted parameters and of adopted
+    effects; what the form can't hold is among the findings, with its equation.
+
+    Args:
+        workspace: the workspace.
+        path: the file; None: named after the model's, in the current folder.
 
     Raises:
         GroundedError: if the model has no file, or `path` is that file or of another form.
@@ -79,7 +86,7 @@ def export_model(workspace: Folder, path: Path | None) -> TakenHome:
     source = model.step.source if isinstance(model.step, MujocoStepper) else _python_file(workspace)
     if source is None or not source.is_file():
         raise GroundedError(finding("model.other_form", workspace.base_model.name))
-    path = path or Path(f"{source.stem}-found{source.suffix}")
+    path = Path(path or f"{source.stem}-found{source.suffix}")
     if path.suffix != source.suffix or path.resolve() == source:
         raise GroundedError(finding("model.other_form", str(path), source=source.name))
     return (_simulated if simulated else _python)(workspace, source, path)

@@ -29,9 +29,10 @@ from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
-from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
-from grounded_trials.workspace.candidates.standing_without import (
+from grounded_trials.workspace.candidates.search_state import (
+    candidate_named,
     odd_run,
+    standing_in,
     standing_without,
 )
 from grounded_trials.workspace.folder import Folder

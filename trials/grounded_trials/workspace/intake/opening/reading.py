@@ -22,8 +22,7 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.workspace.candidates.search_state import standing_in
-from grounded_trials.workspace.candidates.standing_without import asked_again
+from grounded_trials.workspace.candidates.search_state import asked_again, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,

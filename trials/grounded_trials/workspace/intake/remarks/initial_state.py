@@ -18,7 +18,7 @@ from grounded.search.starts import worth_of_start
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.candidates.at_rest import SAME, standstills
-from grounded_trials.workspace.candidates.standing_without import standing_without
+from grounded_trials.workspace.candidates.search_state import standing_without
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import began_elsewhere
 from grounded_trials.workspace.placing import FEWEST, placing
