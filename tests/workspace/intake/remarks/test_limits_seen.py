@@ -49,16 +49,6 @@ def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
     assert [one.kind for one in preflight(w.task, [clipped]).findings] == ["saturated"]
 
 
-@pytest.mark.parametrize(("most", "far"), [(0.0204, True)])
-def test_limits_far_beyond_all_that_was_sent_are_not_the_range_of_a_log(tmp_path, most, far):
-    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
-    w = Workspace(make(tmp_path / "w", config=seen).folder)
-    write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
-    w.ingest(tmp_path / "d.mcap", data=True)
-    (told,) = (one for one in w.propose().findings if one.code == "plan.limits_of_log")
-    assert told.facts["beyond"] == ("force",) * far and told.facts["log"] == "a.csv"
-
-
 @pytest.mark.parametrize(("limit", "bound"), [(0.3, True), (50.0, False)])
 def test_a_plan_bound_by_the_range_of_a_log_says_so_and_target_names_the_range(
     tmp_path, limit, bound
