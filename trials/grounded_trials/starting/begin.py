@@ -7,9 +7,11 @@ in grounded.toml that was taken from the log is marked as such, and uncertain si
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,11 +49,10 @@ from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.starting.pushed import with_gain
 from grounded_trials.starting.skeletons import Skeleton
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.folder import Folder
+from grounded_trials.toml_table import Table
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
-NONE: Mapping[str, Array] = {}  # no input was read
 SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
 NAMED = 5  # most columns named in an error
 HORIZON = 200  # largest number of steps of a target taken from a recorded run
@@ -167,7 +168,7 @@ def begin(
     given = [str(part) for key, value in options.items() if value for part in (key, value)]
     again = (f"{folder}-2", "--from", str(log), *given)
     with fresh_folder(folder, files):
-        kind = "generic" if inputs else kind
+        kind = "generic" if inputs else kind or ""
         return _begin(folder, log, own, kind, dt, inputs, layout, ask, again)
 
 
@@ -175,7 +176,7 @@ def _begin(
     folder: Path,
     log: str | Path,
     own: OwnModel | None,
-    kind: str | None,
+    kind: str,
     dt: float | None,
     named: Sequence[str],
     layout: Layout,
@@ -184,76 +185,120 @@ def _begin(
 ) -> Begun:
     # What the log has, and the model: the user's, or a skeleton of the kind of robot.
     files, report, notes = _usable(log, layout)
-    joints, stated = joint_names(report), column_units(files[0])
-    chosen, why = (kind, "--kind") if kind else kind_in(report, joints)
-    plain = None if own else skeleton(chosen, report, joints, named, stated)
-    if own:
-        why = "your model"
-    built = own.bring(folder) if own else _model_in(folder, plain)
-    matched = assigned(report, built.states, built.inputs, built, joints)
-    if plain and not (kind or any(g.path for g in matched[0])):
-        why = f"none of {chosen}"
-        chosen, plain = "generic", skeleton("generic", report, joints, named, stated)
-        built = _model_in(folder, plain)
-    if chosen == "generic" and not own:
-        given = {name: one.path for name, one in moving(report).items()}
-        matched = assigned(report, built.states, built.inputs, built, joints, given)
-        driven = any(one.value for name, one in built.params.items() if name.startswith("gain_"))
-        notes = (*notes, *_left_out(report, built), *_undriven(built) * (not driven))
+    drawn = _Draft(folder, report, joint_names(report), column_units(files[0]), own, named)
+    drawn.begin(kind)
 
-    # Which number is which signal.
-    states, inputs = map(list, matched)
-    units = {**built.states, **built.inputs}
-    if chosen == "balance" and not own:
-        states = by_encoders(states, report, joints, built.params["r"].value)
-    states, inputs = ([_asked(g, ask, report, units) for g in some] for some in (states, inputs))
-    if plain is not None:
-        full = with_gain(plain, {g.name: g for g in (*states, *inputs)}, report)
-        built = built if full is plain else _model_in(folder, full)
-
-    # Units, ranges and the control interval.
-    ranges = {g.name: g.extent for g in (*states, *inputs)}
-    odd = perhaps_degrees((*states, *inputs), built, joints)
+    # Which number is which signal, and in which units.
+    units = {**drawn.model.states, **drawn.model.inputs}
+    states, inputs = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
+    drawn.with_gain((*states, *inputs))
+    odd = perhaps_degrees((*states, *inputs), drawn.model, drawn.joints)
     inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
     slow = () if layout.rate or states_time_unit(files[0]) else _in_seconds(report)
-    notes = (*notes, *slow, *(odd[g.name] for g in states if g.name in odd))
+
+    # The control interval, and the ranges: zero is sent after a run, so limits must include it.
     step, note = (dt, too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
-    built = own.in_step(folder, built, step) if own else built
-    if chosen != "drone":  # zero is sent after a run, so the limits must include it
-        ranges |= {
-            g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
-        }
-    notes = (*notes, *(_on_own(report, states, inputs, built) if own else ()))
+    model = own.in_step(folder, drawn.model, step) if own else drawn.model
+    ranges = {g.name: g.extent for g in (*states, *inputs)}
+    for g in inputs if drawn.kind != "drone" else ():
+        if (seen := ranges[g.name]) is not None:
+            ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
 
-    # The files: first without a target, since the log is read as grounded.toml says.
-    rates = rate_states(built)
-    simulated = report.simulated
-    table = mapping_toml(states, inputs, simulated=simulated, rates=rates, layout=layout)
-
-    stood: dict[str, float] | None = None
-
-    def write(columns: Mapping[str, Array], rows: int, sent: Mapping[str, Array] = NONE) -> None:
-        nonlocal stood
-        name, stood = Path(log).name, held_first(built, columns, sent, step, ranges)
-        held = stood or {}
-        write_first(folder, built, step, columns, rows, ranges, table, why, name, held)
-
-    write({built.state_names[0]: np.zeros(2)}, 1)
-    target, horizon, more = _recorded(folder, files, built, states, step, write)
+    # The files: the target is read from the log as its [log] table says.
+    table = mapping_toml(
+        states, inputs, simulated=report.simulated, rates=rate_states(model), layout=layout
+    )
+    columns, sent, odd_run = _recorded(files, tomllib.loads(table), model, states, step)
+    horizon = len(next(iter(columns.values()))) - 1
+    stood = held_first(model, columns, sent, step, ranges) or {}
+    name, why = Path(log).name, drawn.why
+    write_first(folder, model, step, columns, horizon, ranges, table, why, name, stood)
+    doubts = [odd[g.name] for g in states if g.name in odd]
+    more = (
+        *(_on_own(report, states, inputs, model) if own else ()),
+        *[one for one in (note,) if one],
+    )
     return Begun(
         workspace=str(folder),
         log=str(log),
-        kind="" if own else chosen,
+        kind="" if own else drawn.kind,
         why=why,
         dt=step,
         horizon=horizon,
         states=tuple(states),
         inputs=tuple(inputs),
-        target=target,
-        start=_start(stood),
-        findings=(*notes, *[one for one in (note,) if one], *more),
+        target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
+        start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
+        findings=(*notes, *drawn.notes, *slow, *doubts, *more, *odd_run),
         again=again if slow else (),
     )
+
+
+@dataclass(eq=False)
+class _Draft:
+    """The model of a new workspace, and the numbers that its signals are taken from."""
+
+    folder: Path
+    report: LogReport
+    joints: Mapping[str, tuple[str, ...]]
+    stated: Mapping[str, str]  # units of columns by path
+    own: OwnModel | None
+    named: Sequence[str]  # inputs of a generic skeleton
+    kind: str = ""
+    why: str = "your model"
+    plain: Skeleton | None = None
+    model: Model = field(init=False)
+    matched: tuple[Sequence[Guess], Sequence[Guess]] = ((), ())  # states, inputs
+    notes: tuple[Finding, ...] = ()
+
+    def begin(self, kind: str) -> None:
+        """Take the user's model, or a skeleton: the kind's if it has a state of the log."""
+        if self.own:
+            self.model = self.own.bring(self.folder)
+            self._match()
+            return
+        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.report, self.joints)
+        self._take(skeleton(self.kind, self.report, self.joints, self.named, self.stated))
+        if not (kind or any(g.path for g in self.matched[0])):
+            self.kind, self.why = "generic", f"none of {self.kind}"
+            self._take(skeleton("generic", self.report, self.joints, self.named, self.stated))
+        if self.kind == "balance":
+            states, inputs = self.matched
+            wheel = self.model.params["r"].value
+            self.matched = by_encoders(states, self.report, self.joints, wheel), inputs
+
+    def with_gain(self, signals: Sequence[Guess]) -> None:
+        """Write the gain that the log shows into a skeleton that has one."""
+        if self.plain is not None:
+            full = with_gain(self.plain, {g.name: g for g in signals}, self.report)
+            if full is not self.plain:
+                self._write(full)
+
+    def _take(self, plain: Skeleton) -> None:
+        self._write(plain)
+        numbers = moving(self.report)
+        if self.kind != "generic":
+            self._match()
+            return
+        self._match({name: one.path for name, one in numbers.items()})
+        left = [n for n in numbers if n not in {**self.model.states, **self.model.inputs}]
+        odd = [found("start.unused", *reversed(left))] * bool(left)
+        if not set(self.model.inputs) & set(numbers):
+            odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
+        gains = (one for name, one in self.model.params.items() if name.startswith("gain_"))
+        if not any(one.value for one in gains):
+            odd.append(found("plan.without_effect", *self.model.input_names, file="model.py"))
+        self.notes = tuple(odd)
+
+    def _match(self, given: Mapping[str, str] = MappingProxyType({})) -> None:
+        model = self.model
+        self.matched = assigned(self.report, model.states, model.inputs, model, self.joints, given)
+
+    def _write(self, plain: Skeleton) -> None:
+        """Write a skeleton as model.py and load it."""
+        self.plain = plain
+        write_atomically(self.folder / "model.py", plain.source().encode())
+        self.model = model_in(load_module(self.folder, "model.py"))
 
 
 def _usable(
@@ -286,51 +331,17 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[Finding, ...]]:
     return replace(report, topics=(same[0],)), (note,)
 
 
-def _model_in(folder: Path, plain: Skeleton | None) -> Model:
-    """Write a skeleton as model.py and load it."""
-    assert plain is not None
-    write_atomically(folder / "model.py", plain.source().encode())
-    return model_in(load_module(folder, "model.py"))
-
-
-def _left_out(report: LogReport, model: Model) -> tuple[Finding, ...]:
-    """Return notes on the numbers that a generic skeleton leaves out, and on missing inputs."""
-    left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
-    odd = [found("start.unused", *reversed(left))] * bool(left)
-    if not set(model.inputs) & set(moving(report)):
-        odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
-    return tuple(odd)
-
-
-def _undriven(model: Model) -> tuple[Finding, ...]:
-    """Return that no input changes a state of a skeleton yet."""
-    return (found("plan.without_effect", *model.input_names, file="model.py"),)
-
-
-def _on_own(
-    report: LogReport, states: Sequence[Guess], inputs: Sequence[Guess], model: Model
-) -> tuple[Finding, ...]:
-    """Return notes on what the user's own model and the log lack of each other."""
-    without = getattr(model.step, "without", ())
-    unmoved = [found("start.unmoved", *without)] * bool(without)
-    unused = _unused(report, (*states, *inputs))
-    return (*unused, *_turning(model), *unmoved)
-
-
-def _unused(report: LogReport, guesses: Sequence[Guess]) -> tuple[Finding, ...]:
-    """Return a note that names the changing numbers of which the model uses none."""
+def _on_own(report: LogReport, guesses: Sequence[Guess], model: Model) -> Iterator[Finding]:
+    """Yield what the user's own model and the log lack of each other."""
     used = {guess.path for guess in guesses}
     left = [f.path for f in reversed(moving(report).values()) if f.path not in used]
-    left = [path for path in left if not PARTS.search(path)]
-    more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
-    return (found("start.unused", *left[:NAMED], *more),) * bool(left)
-
-
-def _turning(model: Model) -> tuple[Finding, ...]:
-    """Return a note on states that are angles by the model's equations, but not declared so."""
-    if not (names := undeclared_angles(model)):
-        return ()
-    return (found("start.angles", *names, declared=(*model.angles, *names)),)
+    if left := [path for path in left if not PARTS.search(path)]:
+        more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
+        yield found("start.unused", *left[:NAMED], *more)
+    if names := undeclared_angles(model):
+        yield found("start.angles", *names, declared=(*model.angles, *names))
+    if without := getattr(model.step, "without", ()):
+        yield found("start.unmoved", *without)
 
 
 def _in_seconds(report: LogReport) -> tuple[Finding, ...]:
@@ -352,29 +363,24 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)
 
 
-def _start(stood: Mapping[str, float] | None) -> str:
-    """Say what [task] start holds."""
-    return ", ".join(f"{name} = {value:.4g}" for name, value in (stood or {}).items()) or "empty"
-
-
 def _recorded(
-    folder: Path,
     files: Sequence[Path],
+    tables: Mapping[str, Any],
     model: Model,
     states: Sequence[Guess],
     dt: float,
-    write: Callable[..., None],
-) -> tuple[str, int, tuple[Finding, ...]]:
-    """Write target.csv from the run in the log, or a placeholder if that can't be sampled.
+) -> tuple[dict[str, Array], dict[str, Array], tuple[Finding, ...]]:
+    """Return the states (H + 1,) and inputs (H,) of a log's run, and what is odd about it.
 
-    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again.
+    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again. One
+    that can't be sampled has no inputs, and a placeholder for a target.
     """
     from grounded_trials.workspace.intake.opening.foreign import rates_of  # slow
 
-    here = Folder(folder)
     measured = [guess.name for guess in states if guess.path]
-    mapping = log_mapping(here.config.log, model.state_names, model.input_names)
+    log = Table(tables["log"], Path(FILE), "log")
     try:
+        mapping = log_mapping(log, model.state_names, model.input_names)
         if mapping is None or not measured:
             raise refused("given.no_input", "the log", what="state")
         grid = read_log(
@@ -388,9 +394,7 @@ def _recorded(
             rates=rates_of(model),
         )
     except GroundedError as error:
-        write({model.state_names[0]: np.zeros(HORIZON + 1)}, HORIZON)
-        return "zeros", HORIZON, (error.finding.weighing(Weight.NOTE),)
+        zeros = {model.state_names[0]: np.zeros(HORIZON + 1)}
+        return zeros, {}, (error.finding.weighing(Weight.NOTE),)
     columns = dict(zip(measured, grid.states.T, strict=True))
-    horizon = len(grid.states) - 1
-    write(columns, horizon, dict(zip(mapping.inputs, grid.inputs.T, strict=True)))
-    return f"{horizon * dt:.3g} s of the log", horizon, grid.findings
+    return columns, dict(zip(mapping.inputs, grid.inputs.T, strict=True)), grid.findings

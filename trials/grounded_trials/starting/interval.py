@@ -35,7 +35,7 @@ IN_STEP, TOGETHER = 0.6, 40  # coherence of the phases of so many changes, since
 
 def interval_of(
     report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
-) -> tuple[float, Finding | None]:
+) -> tuple[float, tuple[Finding, ...]]:
     """Estimate the control interval of a log.
 
     Args:
@@ -54,9 +54,9 @@ def interval_of(
             rows = 1 / min(rates)
             held = changes_every(_gaps(report, inputs), rows) if guesses is inputs else None
             if held is None:
-                return round_interval(rows), None
-            return held, found("start.interval", every=held, dt=held, rows=rows)
-    return GUESSED, None
+                return round_interval(rows), ()
+            return held, (found("start.interval", every=held, dt=held, rows=rows),)
+    return GUESSED, ()
 
 
 def round_interval(rows: float) -> float:
@@ -74,7 +74,7 @@ def round_interval(rows: float) -> float:
     return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
 
 
-def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> Finding | None:
+def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> tuple[Finding, ...]:
     """Return a note if the commands of a log change more than once in a given interval.
 
     Args:
@@ -84,8 +84,8 @@ def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> Finding
     """
     gaps = _gaps(report, _commanded(inputs))
     if len(gaps) < ENOUGH or dt < APART * (apart := float(np.median(gaps))):
-        return None
-    return found("start.interval", every=round_interval(apart), dt=dt)
+        return ()
+    return (found("start.interval", every=round_interval(apart), dt=dt),)
 
 
 def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:

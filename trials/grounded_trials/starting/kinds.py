@@ -363,10 +363,12 @@ def encoders(log: LogReport, joints: Joints) -> str:
     return "" if driven or not turned else turned[0]
 
 
-def by_encoders(states: Sequence[Guess], log: LogReport, joints: Joints, r: float) -> list[Guess]:
+def by_encoders(
+    states: Sequence[Guess], log: LogReport, joints: Joints, r: float
+) -> Sequence[Guess]:
     """Give x and v of a balancing robot the first wheel's angle and speed, times a radius r [m]."""
     if not (where := encoders(log, joints)):
-        return list(states)
+        return states
     moving = {*log.moving}
     wheel, ends, found = joints[where][0], {"x": "position", "v": "velocity"}, []
     for guess in states:
