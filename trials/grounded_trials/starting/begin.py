@@ -214,10 +214,7 @@ def _begin(
     name, why = Path(log).name, drawn.why
     write_first(folder, model, step, columns, horizon, ranges, table, why, name, stood)
     doubts = [odd[g.name] for g in states if g.name in odd]
-    more = (
-        *(_on_own(report, states, inputs, model) if own else ()),
-        *[one for one in (note,) if one],
-    )
+    more = [*_on_own(report, (*states, *inputs), model)] if own else []
     return Begun(
         workspace=str(folder),
         log=str(log),
@@ -229,7 +226,7 @@ def _begin(
         inputs=tuple(inputs),
         target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
         start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
-        findings=(*notes, *drawn.notes, *slow, *doubts, *more, *odd_run),
+        findings=(*notes, *drawn.notes, *slow, *doubts, *more, *note, *odd_run),
         again=again if slow else (),
     )
 
