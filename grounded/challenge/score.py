@@ -27,7 +27,7 @@ from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.prediction_error import carried, gap_of
+from grounded.diagnosis.validation.measured import carried, gap_of
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.frozen import Array

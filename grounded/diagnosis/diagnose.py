@@ -2,19 +2,15 @@
 
 The stages and their modules:
 
-sound_trials      check and correct the sensors, from their signals alone       (accounts)
-limits            what the data can't determine; which parameters they identify
+limits            correct the sensors; what the data can't determine  (accounts)
 attribution       search for effects by evidence   (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units
 decide            choose the claim by the ruler, among hypotheses proposed by evidence
-measured          table of errors, noise floor, credit of each cause, leftover
-claims            claimed effects with intervals, ties and look-alikes           (lookalike)
-leftover          structure that no effect explains
-correction        a curve that predicts the leftover, if it passes its own test
+measured          errors, noise floor, credit of each cause, leftover; where the gap is
+claims            claimed effects with intervals, ties and look-alikes  (lookalike, certainty)
+leftover          structure that no effect explains, and a curve that predicts it
 agreement         agreement of the trials; changes between two groups of them
-prediction_error  where the gap is, by channel, time and region
-unconfirmed       effects that only few trials show, and where
-writer            the facts of the result; remarks and next_step: its findings; telling: its lines
+writer            the result; remarks: its findings and the next step; telling: its lines
 excitation        the next trial, to separate two explanations that tie
 """
 

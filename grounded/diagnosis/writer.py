@@ -45,8 +45,8 @@ from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, Doubtful
 from grounded.diagnosis.validation.limits import Sound, identifiable
-from grounded.diagnosis.validation.measured import Measured
-from grounded.diagnosis.validation.prediction_error import (
+from grounded.diagnosis.validation.measured import (
+    Measured,
     by_region,
     by_time,
     explained,

@@ -6,11 +6,8 @@ The modules:
     scan          linear estimate of what every candidate effect would gain
     explored      the hypotheses fitted so far, and their evidence
     search        the fits to try next
-    variations    other terms for a set: other effects, fewer inputs, plain friction, other orders
-    orders        other orders in which effects act on a command
-    tuning        the constants of effects, which are no parameters of a fit
+    variations    other terms for a set: other effects, inputs, constants, plain friction
     joint_model   friction and inertia of all joints of an arm at once
     lookalike     effects that these trials, or no trials, tell from a claimed one
-    leftover      structure that no effect explains
-    correction    a curve that predicts the leftover
+    leftover      structure that no effect explains, and a curve that predicts it
 """

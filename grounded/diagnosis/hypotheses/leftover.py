@@ -26,7 +26,7 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.choose import Errors
+from grounded.diagnosis.validation.choose import Errors, jackknife
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects.correction import KNOTS, bells
 from grounded.filter import kalman
@@ -301,7 +301,7 @@ def _judged(
     for k, one in enumerate(curves):
         whole = weights[-1][k * KNOTS : (k + 1) * KNOTS]
         apart = weights[:-1, k * KNOTS : (k + 1) * KNOTS]
-        spread = np.sqrt((len(apart) - 1) * apart.var(axis=0))  # jackknife
+        spread = jackknife(apart)
         places = np.linspace(one.lo, one.hi, KNOTS)
         shapes.append(
             Curve(

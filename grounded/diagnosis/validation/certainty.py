@@ -1,4 +1,6 @@
-"""Values that the data show only in combination, while priors of parameters set each of them.
+"""How certain the claim's values are, beyond what one fit says of itself (`intervals`).
+
+**By priors**: values that the data show only in combination, while priors of parameters set each.
 
 In a horizontal plane nothing moves differently if all torques, inertias and frictions are larger by
 one factor. The standard deviation of a gain is then that of a declared inertia, and if a part of
@@ -12,6 +14,26 @@ their priors, and P = diag(0, 1) that of the priors,
 
 the last since C = C G C + C P C. A value that is at least ALONE times as wide without the priors
 would stay where they put it even if one of them were wrong by as many standard deviations.
+
+**Averaged**: the claim's own interval assumes its noise structure, and exact parameters if they
+were not calibrated. Yet the parameters may be off, if evidence hardly separates the fits or
+calibration was dropped because predictions don't need it. So the variance is averaged, by evidence,
+over all fits of the same effects: other noise structures, parameters held or free (Hoeting,
+Madigan, Raftery & Volinsky, Bayesian model averaging, 1999),
+
+    var = sum_f p_f (var_f + (value_f - value)^2)
+
+about the claim's own value. Fits that predict held-out trials clearly worse are left out.
+
+**Blamed**: the model's own parameters that are off, by forward selection. The log posterior of the
+shifts is approximated by a parabola at the calibrated fit, with curvature H. If only a set S of
+them may differ from nominal, its maximum is lower by
+
+    loss(S) = 1/2 b' (H_rr - H_rS H_SS^-1 H_Sr) b,        r: the others, b: their shifts
+
+Parameters are added to S one by one, each time the one that lowers the loss most, until the loss is
+below NATS. So if the data only determine a combination of two parameters (a gain and a time
+constant), not both are blamed.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
 from grounded.diagnosis.likelihood.joint_memory import remembering
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.validation.ahead import missed
+from grounded.diagnosis.validation.ruler import missed
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
