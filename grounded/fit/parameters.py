@@ -145,7 +145,7 @@ def _identified(data: Data, delayed: Mapping[str, tuple[int, ...]], tick: Stages
         if model is not data.model:
             data = replace(data, model=model)
             continue
-        search, best, crude = _with_all(search, found, late, tick)
+        search, best, crude = _with_all(search, found, tick)
         free = Predictor(replace(search.data, model=given))
         done = Found(search, _centred(search, best), crude, free, delayed)
         # trials that disagree, or a model that is wrong, may show less than the information says
@@ -197,16 +197,14 @@ def _supported(search: Alone, fits: Sequence[Fitted]) -> Fitted:
     return max(near or [best], key=search.score)
 
 
-def _with_all(
-    search: Alone, fit: Fitted, late: Sequence[Effect], tick: Stages
-) -> tuple[Alone, Fitted, Fitted | None]:
+def _with_all(search: Alone, fit: Fitted, tick: Stages) -> tuple[Alone, Fitted, Fitted | None]:
     """Return the fit and that of the model as given, under its noise, on all runs."""
     few, more, own = search.data, entire(search.data), fit.noise.structure
     crude = search.fits.get((own, 0.0, ())) or search.fits.get((Structure(), 0.0, ()))
     if more is few:
         return search, fit, crude
     tick(f"fit to all {more.steps} steps")
-    every = Alone(more, late, tick)
+    every = search.like(more)
     found = [
         every.refined([(one.hypothesis, one.noise, every.fresh(one.hypothesis)[2])], TO_THE_TOP)
         for one in (fit, crude)

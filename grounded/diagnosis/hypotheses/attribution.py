@@ -90,7 +90,7 @@ def attribute(
 
 def _confirmed(search: HypothesisSearch, data: Data, most: int) -> tuple[HypothesisSearch, Fitted]:
     """Return a search on all data with the likeliest sets of another one, and its best fit."""
-    other = HypothesisSearch(data, search.candidates, search.tick, tuple(search.joints.values()))
+    other = search.like(data)
     likely = {f.hypothesis.names for k in range(most + 1) for f in search.of_size(k)[:HOPEFUL]}
     fits = [fit for fit in search.fits.values() if fit.hypothesis.names in likely]
     starts = [(f.hypothesis, f.noise.plain, other.fresh(f.hypothesis)[2]) for f in fits]

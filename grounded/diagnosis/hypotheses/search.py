@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 
@@ -224,13 +225,17 @@ class HypothesisSearch(FittedHypotheses):
         for fit in self.refined(exact[:count], 12):
             self.calibrated(fit)
 
-    def _empty(self) -> HypothesisSearch:
-        """Return a new search with the same candidates."""
-        return HypothesisSearch(self.data, self.candidates, self.tick, tuple(self.joints.values()))
+    def like(self, data: Data | None = None, but: str = "") -> Self:
+        """Return a search without fits, on other data or without one effect."""
+        kept, joints = (
+            [effect for effect in some if effect.name != but]
+            for some in (self.candidates, self.joints.values())
+        )
+        return type(self)(data or self.data, kept, self.tick, joints)
 
     def with_weights(self, clean_fit: Fitted) -> HypothesisSearch:
         """Return a new search on the same data, all with the outlier weights of `clean_fit`."""
-        other = self._empty()
+        other = self.like()
         weights = clean_fit.noise
         starts = []
         for fit in [*self.of_size(0), *self.of_size(1)[:SHORTLIST], clean_fit]:
@@ -333,9 +338,7 @@ class HypothesisSearch(FittedHypotheses):
 
     def lacking(self, name: str) -> HypothesisSearch:
         """Return a search without one effect, with the fits that don't have it."""
-        rest = [effect for effect in self.candidates if effect.name != name]
-        joints = [effect for effect in self.joints.values() if effect.name != name]
-        other = HypothesisSearch(self.data, rest, self.tick, joints)
+        other = self.like(but=name)
         other._prices = self._prices
         other.keep([f for f in self.fits.values() if name not in f.hypothesis.names])
         return other
