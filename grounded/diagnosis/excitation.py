@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.causes import value_called
+from grounded.diagnosis.hypotheses.variations import in_place
 from grounded.diagnosis.levels import NATS, SHOWS, WELL
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
@@ -131,7 +132,10 @@ def probe(
     if not ties:
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
-    task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
+    library = library or Library()
+    task, first = _claim(task, diagnosis, trials, library, group[:2])
+    rival = _effect(library, group[1], task, diagnosis, _scales(task, trials))
+    second = in_place(first, {group[0]: ((rival, diagnosis.values(group[1])),)})
     noise = KnownNoise.of(task.model, diagnosis)
     second = _adapted(task, list(trials[-REPLAYED:]), second, noise)
     again = [_replayed(task, h, policy, trials) for h in (first, second)]
@@ -226,22 +230,17 @@ def _asked(
     They are the values by name, and of each the standard deviation and the value in the unit of its
     column.
     """
-    known, task = _calibrated(task, diagnosis)
-    scales, h = _scales(task, trials), Hypothesis()
-    spreads: dict[str, Estimate] = {}
-    for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
-        row, effect = diagnosis.ranked(name), _effect(library, name, task, diagnosis, scales)
+    (task, h), spreads = _claim(task, diagnosis, trials, library), dict[str, Estimate]()
+    for effect in h.effects:
+        row = diagnosis.ranked(effect.name)
         if row is None:
             return None
-        h = h.plus(effect, row.values)
-        spreads |= {f"{q.name} of {name}": row.params[q.name] for q in effect.free}
+        spreads |= {f"{q.name} of {effect.name}": row.params[q.name] for q in effect.free}
     model = task.model
     sizes = {n: float(s) for n, s in zip(model.param_names, param_scale(model), strict=True)}
-    if known:
-        h = replace(h, shift=np.zeros(model.system.k), spread=1.0)
-        free = [n for n, size in sizes.items() if size > 0]
-        none = {n: Estimate(0.0, 0.0, None, model.params[n].unit) for n in free}
-        spreads |= {n: replace(known.get(n, none[n]), unit=none[n].unit) for n in free}
+    for n in (n for n, size in sizes.items() if size > 0 and h.spread):
+        unit = model.params[n].unit
+        spreads[n] = replace(diagnosis.parameters.get(n, Estimate(0.0, 0.0)), unit=unit)
     each = {
         n: (e.std / size if np.isfinite(e.std) else 0.0, e.value / size)
         for n, e in spreads.items()
@@ -314,27 +313,26 @@ def _calibrated(task: Task, diagnosis: Diagnosis) -> tuple[dict[str, Estimate], 
     return known, task.with_model(task.model.with_values(values))
 
 
-def _rivals(
+def _claim(
     task: Task,
     diagnosis: Diagnosis,
     trials: Sequence[Trial],
     library: Library,
-    pair: Sequence[str],
-) -> tuple[Task, Hypothesis, Hypothesis]:
-    """Return the calibrated task and two hypotheses, calibrated parameters free in both."""
+    pair: Sequence[str] = (),
+) -> tuple[Task, Hypothesis]:
+    """Return the calibrated task and the claim, calibrated parameters free.
+
+    pair: the first of these two effects is claimed, and the second is not.
+    """
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
-    names = [name for name in diagnosis.joining if not name.startswith("parameter:")]
-    names = names if pair[0] in names else [*names, pair[0]]
     if known:
         h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
-    one = other = h
-    for name in (n for n in names if n != pair[1]):
-        rival = pair[1] if name == pair[0] else name  # in the other's place in the order
-        first, second = (_effect(library, n, task, diagnosis, scales) for n in (name, rival))
-        one = one.plus(first, diagnosis.values(name))
-        other = other.plus(second, diagnosis.values(rival))
-    return task, one, other
+    for name in dict.fromkeys((*diagnosis.joining, *pair[:1])):
+        if not name.startswith("parameter:") and name not in pair[1:]:
+            effect = _effect(library, name, task, diagnosis, scales)
+            h = h.plus(effect, diagnosis.values(name))
+    return task, h
 
 
 def _effect(

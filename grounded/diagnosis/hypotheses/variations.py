@@ -80,7 +80,7 @@ def variations(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
     """Yield a set with one effect for several, with fewer inputs, and with plain frictions."""
     own = {effect.name: effect for effect in search.candidates}
     for change in (*merged(own, h), *parted(own, h), *plainer(search, h)):
-        yield _in_place(h, change)
+        yield in_place(h, change)
 
 
 def merged(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
@@ -167,7 +167,7 @@ def _dry(effect: Effect) -> Effect:
     return replace(effect, quantities=tuple(some))
 
 
-def _in_place(h: Hypothesis, change: Change) -> Hypothesis:
+def in_place(h: Hypothesis, change: Change) -> Hypothesis:
     """Replace effects, by name, by others that act in the same place of the order."""
     found = replace(h, effects=(), values=())
     for effect, values in h.pairs:
