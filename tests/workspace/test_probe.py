@@ -14,8 +14,6 @@ from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from reported import copied
 from workspaces import CONFIG, edit, make
 
-worse = pytest.mark.xfail(reason="worse by the one decision: issue 67, open")
-
 FEW = Library(tuple(map(Library().family, ("viscous_friction", "input_gain", "delay"))))
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.02\nv = 0.05\n"
 
@@ -37,7 +35,6 @@ def diagnosed(made, tmp_path, monkeypatch):
     return Workspace(copied(folder, tmp_path / "w")), found
 
 
-@worse
 @pytest.mark.slow
 def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     w, found = diagnosed
