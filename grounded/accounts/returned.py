@@ -258,7 +258,7 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     def gained(left: float, price: float) -> bool:
         return bool(np.log((before + FINE) / (left + FINE)) >= price)
 
-    left, tells = _left(fit), evidence(plain, fit) > DECISIVE
+    left, tells = _left(fit), _tells(plain, fit)
     same = {"names": row.names, "by": row.by}
     if row.log is not None and fit.alike and (tells or unit) and fit.error < EXPLAINED:
         price = row.log + (MARGIN if unit else least)
@@ -270,7 +270,7 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     if row.program is None or plain.beyond:
         return
     share = _moved(own, trial, fit)
-    known = fit.alike and tells and fit.error < EXPLAINED * share and _tells(plain, fit)
+    known = fit.alike and tells and fit.error < EXPLAINED * share
     if known and gained(left / share, row.program + least):
         told = _without_feedback(own, trial, fit, row)
         yield scored(Kind.PROGRAM, told, own, trial, left / share, first, price=row.program, **same)
@@ -755,10 +755,15 @@ class Suspicion:
     ran: Following | None  # the comparison with its candidate
     why: Finding | None = None  # why it is not its candidate's run
     other: str = ""  # the candidate whose run it is instead, or ""
+    stories: tuple[Story, ...] = ()  # what explains it better than that it is as logged
 
 
 def suspicion(
-    task: Task, trial: Trial, own: Ran, others: Sequence[Ran], *, told: bool = True
+    task: Task,
+    trial: Trial,
+    own: Ran,
+    others: Sequence[Ran],
+    logged: Sequence[str] | None = None,
 ) -> Suspicion:
     """Check whether a trial is a run of its candidate, and if not, whose it is.
 
@@ -767,29 +772,28 @@ def suspicion(
         trial: the trial, with gaps bridged; its candidate is `own`.
         own: the candidate that it is said to have run.
         others: candidates that it may have run instead, in order of proposal.
-        told: look for what its program did, if its commands are nobody's.
+        logged: the states that a column holds; None: all.
     """
     trial, late = trial.until(task.horizon), latest(task)
     ran = follows(own.policy, trial, late)
     if ran is None or (ran.alike and ran.error < 1e-5):
         return Suspicion(ran)
     rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
-    alike = [(evidence(ran, f), n, f.error) for f, n in rivals if f is not None and f.alike]
-    nats, name, left = max(alike, default=(-np.inf, "", 0.0))
-    if nats > DECISIVE:
+    alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
+    if sure := [one for one in alike if one[2] > DECISIVE]:
+        left, name, nats = min(sure)
         near = name if left < max(CLEAR, SAME * ran.error) else ""
         return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
+    some = tuple(stories(task, own, trial, ran, logged=logged))
     if ran.alike:
-        return Suspicion(ran)
-    known = told and trial.inputs.any() and not ran.beyond  # else nothing is known, or another unit
-    for story in stories(task, own, trial, ran) if known else ():
-        if story.kind is Kind.PROGRAM:
-            return Suspicion(ran, story.finding)
+        return Suspicion(ran, stories=some)
+    if program := next((one for one in some if one.kind is Kind.PROGRAM), None):
+        return Suspicion(ran, program.finding, stories=some)
     moves = np.ptp(own.policy.feedforward, axis=0) > 0
     silent = moves & ~(trial.inputs != 0).any(axis=0)
     if silent.any():
         names = [n for n, is_ in zip(trial.input_names, silent, strict=True) if is_]
-        return Suspicion(ran, found("log.silent", *names, ran=own.id))
+        return Suspicion(ran, found("log.silent", *names, ran=own.id), stories=some)
     units, facts = task.model.inputs, dict[str, Any]()
     if ran.beyond:
         j = trial.input_names.index(ran.beyond)
@@ -797,6 +801,5 @@ def suspicion(
         facts["limits"] = limits_of(task, j)
     until = Quantity(ran.until_s if ran.opens else 0.0, "s")
     rms = Quantity(ran.rms, units[ran.input])
-    return Suspicion(
-        ran, found("log.not_run", ran.input, ran=own.id, rms=rms, until=until, **facts)
-    )
+    why = found("log.not_run", ran.input, ran=own.id, rms=rms, until=until, **facts)
+    return Suspicion(ran, why, stories=some)

@@ -21,7 +21,7 @@ LEAST = 10  # smallest number of steps that can be judged
 FEW = 5  # smallest number of steps that are alike and not at the limits, in which others are too
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
-DECISIVE = 12.0  # [nats] of evidence that another candidate ran; by chance in 1 of 10^6 runs
+DECISIVE = 8.0  # [nats] of evidence that another candidate ran
 SAME, CLEAR = 0.5, 0.01  # shares: of another difference, and of an input, that count as none
 OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
@@ -51,6 +51,11 @@ class Following:
     foreign: bool  # that input differs by about as much as unrelated commands do
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
     fine: Array  # (m,) resolution of the commands
+
+    @property
+    def apart(self) -> Array:
+        """The differences of the commands (T,), rms over the inputs in units of their size."""
+        return np.asarray(np.sqrt(((self.off / self.fine) ** 2).mean(axis=1)) * FINE)
 
 
 def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
@@ -181,25 +186,28 @@ def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -
     return bool(telling.sum() >= FEW and alike.all())
 
 
-def evidence(own: Following, other: Following) -> float:
-    """Return the log likelihood ratio [nats] of another policy over the own one.
+def evidence(own: Array, other: Array) -> float:
+    """Return the evidence [nats] that another policy sent the commands, not the own one.
 
-    The difference that the other leaves is treated as Gaussian noise with its own size and
-    autocorrelation. If the own policy ran, noise gives the other more than z^2/2 nats at most as
-    often as a normal variable exceeds z, however close the two are. If the robot acted on other
-    samples than the log has, lower gains leave smaller differences, whichever ran: a reduction of
-    the squares by up to half does not count. Steps in which both send exactly what was sent, as at
-    the same limit, don't tell them apart, and make neither more exact.
+    It is the logarithm of the ratio of likelihoods for noise with heavy tails (lost packets), of
+    the size that the other leaves, by the number of steps that count as one. If the robot acted on
+    other samples than the log has, lower gains leave smaller differences, whichever ran: a
+    reduction of the squares by half does not count. Steps in which both send exactly what was
+    sent, as at the same limit, don't tell them apart.
+
+    Args:
+        own: differences of the commands from the own policy's, (T,), relative to their size; NaN
+            where they are not compared.
+        other: the same for the other policy.
     """
-    known = np.isfinite(own.off + other.off).all(axis=1)
-    known &= (own.off != 0).any(axis=1) | (other.off != 0).any(axis=1)
-    if not known.any():
+    T = min(len(own), len(other))
+    known = np.isfinite(own[:T] + other[:T]) & (np.maximum(own[:T], other[:T]) > 0)
+    if known.sum() < LEAST:
         return 0.0
-    a, b = own.off[known], other.off[known]
-    noise = (b**2).mean(axis=0) + own.fine**2
-    return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
-        steps_alike(column) for column in b.T
-    )
+    a, b = own[:T][known] / np.sqrt(2), other[:T][known]
+    usual = float(np.hypot(median(b), FINE))
+    gained = 2 * np.log(np.hypot(a, usual) / np.hypot(b, usual))
+    return float(gained.sum()) / steps_alike(b)
 
 
 def steps_alike(noise: Array) -> float:

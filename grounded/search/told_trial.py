@@ -13,7 +13,7 @@ import numpy as np
 
 from grounded.accounts.finding import UnusableTrials, in_the_log
 from grounded.accounts.reported import scaled
-from grounded.accounts.returned import Kind, stories, suspicion, unit_by_factor
+from grounded.accounts.returned import Kind, suspicion, unit_by_factor
 from grounded.accounts.sound_trials import sound_trials
 from grounded.findings import Finding, found
 from grounded.model import Model
@@ -38,8 +38,7 @@ def odd_trial(
     if whole.finite_steps < 1 and (unknown := _unknown(trial)):
         return found("given.value", *unknown, must="finite")
     seen = suspicion(task, whole, own, candidates)
-    some = [] if seen.other else stories(task, own, whole, seen.ran)
-    units = [(one.names, one.by) for one in some if one.kind is Kind.UNIT]
+    units = [(one.names, one.by) for one in seen.stories if one.kind is Kind.UNIT]
     names, by = units[0] if units else ((), 1.0)
     if unit := unit_by_factor(model, names, by):  # the columns may agree with each other
         return scaled(model, names, 1 / by, unit).also(ran=own.id)

@@ -19,7 +19,7 @@ from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.intake.ingest import ingest_log
 from grounded_trials.workspace.intake.locating.acted_on import acted_on
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.recognising.sender import sender_of
+from grounded_trials.workspace.intake.recognising.look import sender_of
 from recorded import follow
 from workspaces import CONFIG, make
 
@@ -114,8 +114,8 @@ def test_manual_driving_is_refused(ladder, share):
 def test_evidence_is_nats_that_grow_with_the_run_and_are_none_for_the_same_policy(ladder):
     _, by_alpha = ladder
     trial = noisy(by_alpha[1], 0.01, 0, other=False)
-    own, other = (follows(by_alpha[alpha].policy, trial) for alpha in (1 / 4, 1))
-    half = [follows(by_alpha[alpha].policy, trial.until(20)) for alpha in (1 / 4, 1)]
+    own, other = (follows(by_alpha[alpha].policy, trial).apart for alpha in (1 / 4, 1))
+    half = [follows(by_alpha[alpha].policy, trial.until(20)).apart for alpha in (1 / 4, 1)]
     assert evidence(own, other) > evidence(*half) > 0
     assert evidence(other, other) <= 0 and evidence(other, own) < 0
 

@@ -2,6 +2,6 @@
 
 Read `recognise.py` first: the stories of a log, the judge's choice, and how each is refused.
 `grounded.accounts.returned` has the terms by which all are scored. `look.py` cuts the run
-from the log and judges it by its commands; `sender.py` compares the candidates that may have sent
-them; `stories_of_log.py` asks the table wherever the run may begin.
+from the log and judges by its commands which candidate sent them; `stories_of_log.py` asks the
+table wherever the run may begin.
 """

@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from grounded.accounts.returned import Suspicion, suspicion
-from grounded.accounts.sent import LATEST, RESEMBLES
+from grounded.accounts.sent import DECISIVE, FINE, LATEST, RESEMBLES, evidence, follows
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import Trial, interpolate_gaps
+from grounded.trial import interpolate_gaps
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.intake.locating.acted_on import acted_on
+from grounded_trials.workspace.intake.locating.acted_on import ActedOn, acted_on
 from grounded_trials.workspace.intake.locating.fell import fall_in
 from grounded_trials.workspace.intake.locating.run_start import Recording, Start
 from grounded_trials.workspace.intake.opening.cutting import cut_log
 from grounded_trials.workspace.intake.opening.reading import Read
-from grounded_trials.workspace.intake.recognising.sender import sender_of
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
+ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
@@ -59,10 +61,10 @@ class Look:
         self.apart = None if log is read.log else log
         cut = self.apart.cut(read.trial.candidate)[0] if self.apart else read.trial
         self.whole = interpolate_gaps(cut).trial
+        self.log = log.recording if log else None
         seen = self._judged()
         if read.bare and (alone := self._judged(others=())).why:
             seen = alone  # it may be of another workspace: resembling one of these is coincidence
-        self.log = log.recording if log else None
         self.start_of: Callable[[Candidate], Start | None] = cache(partial(_start_of, self.log))
         if self.log and read.log:
             seen = self._located(self.log, read.log, seen)
@@ -75,12 +77,11 @@ class Look:
         self.fell = fall_in(task, own, self.read.trial, seen.ran) if judged else None
         self.suspicion = seen
 
-    def _judged(
-        self, trial: Trial | None = None, others: Sequence[Candidate] | None = None
-    ) -> Suspicion:
-        """Return whose run a trial, or the one that was cut, seems to be by its commands."""
+    def _judged(self, others: Sequence[Candidate] | None = None) -> Suspicion:
+        """Return whose run the one that was cut seems to be by its commands."""
         others = self.candidates if others is None else others
-        return suspicion(self.task, trial or self.whole, self.own, others)
+        logged = self.log.measured if self.log else None
+        return suspicion(self.task, self.whole, self.own, others, logged)
 
     def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
         """Cut the run where it begins in the log; return whose it is then."""
@@ -164,6 +165,76 @@ def _behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) 
             if fit and fit.throughout and round(float(fit.old.max()) / log.dt) == late:
                 return replace(found, seconds=begun, alike=True, exact=True, loose_s=0.0)
     return None
+
+
+@dataclass(frozen=True, eq=False)
+class Sender:
+    """The candidate that sent the commands of a log, judged on the samples that it acted on."""
+
+    own: ActedOn | None  # None if the log is too short
+    why: Finding | None = None  # why it was another candidate
+    other: str = ""  # that candidate
+
+    @property
+    def sure(self) -> bool:
+        """Whether the own candidate sent them throughout, mostly to the last digits."""
+        return self.own is not None and self.own.throughout
+
+
+def sender_of(
+    log: Recording,
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    start_of: Callable[[Candidate], Start | None],
+) -> Sender:
+    """Check whether another candidate than the stated one sent the commands of a log.
+
+    A neighbour of it sends commands that differ by a few percent, so each is computed from the
+    samples of the age that fits best.
+
+    Args:
+        log: the log with the run.
+        own: the candidate that it is said to have run.
+        candidates: candidates that may have been run instead.
+        start_of: returns where a candidate's run seems to begin in the log.
+    """
+
+    def alike(one: Candidate, at: float) -> int | None:
+        """Return by how many steps a candidate's commands are late, None if they are not alike."""
+        trial = log.trial_from(at)
+        ran = follows(one.policy, trial.until(one.policy.horizon), LATEST) if trial else None
+        return ran.late if ran is not None and ran.alike else None
+
+    start = start_of(own)
+    begins = log.first if start is None else start.seconds
+    mine = acted_on(log, own.policy, begins)
+    if mine is None or mine.exact:
+        return Sender(mine)
+    best, name, theirs = DECISIVE, "", mine
+    late = alike(own, begins)  # late commands belong to other steps
+    for one in reversed(candidates):
+        at = begins
+        if (start is None or not start.alike) and (begun := start_of(one)) and begun.opens_alike:
+            at = begun.seconds
+        fit = None if one.id == own.id else acted_on(log, one.policy, at)
+        if fit is None or fit.left > RESEMBLES or _differ(mine, fit) < ONE:
+            continue
+        if (nats := evidence(mine.off, fit.off)) <= best:
+            continue
+        if fit.exact or (not late and alike(one, at) is not None):
+            best, name, theirs = nats, one.id, fit
+        if name and theirs.left < FINE:
+            break
+    if not name:
+        return Sender(mine)
+    left = {"theirs": max(theirs.left, FINE), "mine": max(mine.left, FINE)}
+    return Sender(mine, found("log.another", ran=own.id, other=name, nats=best, **left), name)
+
+
+def _differ(mine: ActedOn, fit: ActedOn) -> float:
+    """Return the rms difference of what two candidates send, relative to its size."""
+    T = min(len(mine.asked), len(fit.asked))
+    return float(np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean()))
 
 
 def _sooner(log: ForeignLog, stored: ForeignLog) -> float:

@@ -25,7 +25,6 @@ from grounded.accounts.returned import (
     likeliest,
     of_full_scale,
     scored,
-    stories,
     unit_by_factor,
 )
 from grounded.accounts.sent import FINE, RESEMBLES, follows, latest
@@ -214,10 +213,12 @@ def _of_trial(case: Case) -> Iterator[Story]:
     """Yield the stories of a trial as it is cut, of another unit or origin of its states."""
     if case.rival:
         return
-    logged = [name for name in case.task.model.state_names if name not in case.guessed]
-    some = stories(case.task, case.own, case.whole, case.seen.ran, logged=logged)
     zeros = case.log and not (case.named or case.seen.why)
-    yield from (one for one in some if one.kind is Kind.UNIT or (zeros and one.kind is Kind.LOG))
+    yield from (
+        one
+        for one in case.seen.stories
+        if one.kind is Kind.UNIT or (zeros and one.kind is Kind.LOG)
+    )
 
 
 def _of_log(case: Case) -> Iterator[Story]:
