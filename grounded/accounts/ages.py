@@ -56,7 +56,6 @@ from grounded.trial import Trial
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
-COPIED = 1e-3  # of a velocity: rounding of a log; a separate sensor would differ by more
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
 ENOUGH = 10  # samples per weight
@@ -118,16 +117,14 @@ class Ages:
                 yield from self.late(relation, clear)
                 yield self.filtered(relation, found)
                 continue
-            copied = relation.exact and differenced(self.model, relation, self.trials)
             if clear:
                 yield from self.scale(relation, clear)
                 if {*log.values()}.isdisjoint((relation.i, relation.j)):
                     yield from self.late(relation, clear)
             if relation.exact or clear:
                 yield from self.constant(relation)
-            over = clear.mean if clear and clear.mean >= SMOOTH * self.dt else copied * self.dt
-            if relation.exact and over > 0:
-                yield self.smoothed(relation, over)
+            if relation.exact and clear and clear.mean >= SMOOTH * self.dt:
+                yield self.smoothed(relation, clear.mean)
         # states whose delay was adopted: their true values are the model's memory
         for one in integrals(self.model):
             relation = replace(one, i=log.get(one.i, one.i), j=log.get(one.j, one.j))
@@ -315,23 +312,6 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
     size = float(changed @ changed)
     late = float(moved @ changed) / size * dt if size > 0 else 0.0
     return late if np.isfinite(late) and abs(late) < dt else 0.0
-
-
-def differenced(model: Model, relation: Integral, trials: Sequence[Trial]) -> bool:
-    """Check whether the velocity is the difference of its position's samples over one step.
-
-    False where the model itself moves the position by exactly that velocity.
-    """
-    dt, rests, sizes = trials[0].dt, np.zeros(2), np.zeros(2)
-    for _, moved, w in _rates(model, relation, trials):
-        for k, known in enumerate((w[1:], w[:-1])):  # at the end of the step, at its start
-            rests[k] += ((moved / dt - known) ** 2).sum()
-            sizes[k] += (known**2).sum()
-    copies = (rests < COPIED**2 * sizes) & (sizes > 0)
-    if not copies.any():
-        return False
-    late = (0.5 if copies[0] else -0.5) * dt
-    return abs(own_lag(model, relation, trials) - late) > 0.25 * dt
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ of that run, not of the robot. Plans stay within them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 
 from grounded.accounts.finding import Finding
-from grounded.accounts.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
+from grounded.accounts.lag import LEAST_S, SURE, Lag, lag_between
 from grounded.accounts.table import OVER
 from grounded.findings import found
 from grounded.frozen import Array
@@ -99,10 +100,7 @@ def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Fin
             yield Finding(name, found("sensor.same", name, values=shown), "constant")
     if isinstance(subject, Task):
         yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
-    longest = max(trials, key=lambda trial: trial.steps).inputs
-    for i, j in alike(longest, reach_of(len(longest), trials[0].dt)):
-        if fixed[i] or fixed[j]:
-            continue
+    for i, j in combinations([j for j in range(len(names)) if not fixed[j]], 2):
         lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
         if lag is not None and lag.coherence > COPY and 0.9 < lag.sign * lag.low < 1.1:
             yield _copy(names[i], names[j], lag)

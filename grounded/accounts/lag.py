@@ -29,7 +29,6 @@ WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samp
 SHORTEST = 24  # samples in the shortest pair used
 CLEAR = 0.9  # coherence below which a window is ignored
 BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
-SCREENED, MAYBE = 4, 0.7  # screening: half window, and correlation for a possible copy
 SURE = 5.0  # standard deviations above which a delay or a bias is reported
 LEAST_S = 0.0005  # [s] the smallest delay reported
 SAME, ROUNDED = 0.01, 0.003  # scale error that matters, and that discretisation may cause
@@ -104,7 +103,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         None if there is too little data.
     """
     longest = max((len(a) for a, _ in pairs), default=0)
-    reach = reach_of(longest, dt)
+    reach = _reach_of(longest, dt)
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
     every = [(p, one) for p in found if (one := _measured(p, reach, dt)) is not None]
     clear = [(p, one) for p, one in every if one.coherence > CLEAR]
@@ -126,30 +125,9 @@ def _steady(pairs: Pairs) -> float:
     return abs(float(b.mean()) / mean) if abs(mean) > a.std() else np.nan
 
 
-def reach_of(steps: int, dt: float) -> int:
+def _reach_of(steps: int, dt: float) -> int:
     """Return the largest shift [samples] tried for a signal of `steps` steps."""
     return max(3, min(int(np.ceil(max(MOST / dt, FEW))), steps // 8))
-
-
-def alike(signals: Array, reach: int) -> list[tuple[int, int]]:
-    """Return the pairs i < j of signals (T, m) that may be shifted or noisy copies, by j, then i.
-
-    A fast screening by correlations of the smoothed signals; `lag_between` decides on each pair.
-    """
-    T, m = signals.shape
-    window = np.hanning(2 * SCREENED + 3)[1:-1]
-    if m < 2 or len(window) >= T:
-        return [(i, j) for j in range(m) for i in range(j)]
-    smooth = np.stack([np.convolve(x, window, "valid") for x in signals.T])
-    smooth = smooth - smooth.mean(axis=1, keepdims=True)
-    smooth /= np.sqrt((smooth**2).sum(axis=1, keepdims=True))
-    waves = np.fft.rfft(smooth, T + reach)
-    found = []
-    for j in range(m):
-        shared = np.fft.irfft(waves[:j] * waves[j].conj(), T + reach)
-        near = np.abs(np.concatenate([shared[:, : reach + 1], shared[:, -reach:]], axis=1))
-        found += [(int(i), j) for i in np.flatnonzero(~(near.max(axis=1, initial=0.0) < MAYBE))]
-    return found
 
 
 @dataclass(frozen=True)

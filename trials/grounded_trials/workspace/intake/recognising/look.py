@@ -227,8 +227,9 @@ def sender_of(
             break
     if not name:
         return Sender(mine)
-    left = {"theirs": max(theirs.left, FINE), "mine": max(mine.left, FINE)}
-    return Sender(mine, found("log.another", ran=own.id, other=name, nats=best, **left), name)
+    told = found("log.another", ran=own.id, other=name, nats=best)
+    told = told.also(theirs=max(theirs.left, FINE), mine=max(mine.left, FINE))
+    return Sender(mine, told, name)
 
 
 def _differ(mine: ActedOn, fit: ActedOn) -> float:
