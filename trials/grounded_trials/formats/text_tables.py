@@ -14,12 +14,12 @@ import csv
 import re
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import islice
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -38,7 +38,6 @@ from grounded_trials.formats.tables import (
 )
 from grounded_trials.within import within
 
-T = TypeVar("T")
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # characters read of a line
@@ -61,6 +60,15 @@ class _Head:
     rows: int  # number of lines before the first row
 
 
+@dataclass(frozen=True)
+class AboutTable:
+    """What the head of a text table says, and what is odd about its rows."""
+
+    units: Mapping[str, str]  # in column names, `x [m]` or `x (m)`, by message path
+    in_time_units: bool  # its times are in seconds (`time_s`, `time [s]`), or times of day
+    findings: tuple[Finding, ...]  # an incomplete last row, a last column without numbers
+
+
 def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of a text table: a row of names, unless the layout has them, then numbers.
 
@@ -68,19 +76,19 @@ def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
         GroundedError: if names or times are missing, or a row has a wrong number of cells.
     """
     with _opened(path) as stream:
-        first = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
-        head = _head_by(layout.columns, first, path) if layout.columns else _head(first, path)
-        width, times = len(head.names), "" if layout.rate else _times_among(head, first, path)
-        _check_widths(stream, head, path)
-        cut = _cut_in(stream, head)
+        table = _Table(stream, path, layout.columns)
+        head = table.head
+        width, times = len(head.names), "" if layout.rate else _times_among(table)
+        table.check_widths()
+        cut = table.cut()
         try:
             with warnings.catch_warnings():  # a table without rows is reported below
                 warnings.simplefilter("ignore")
-                rows = _rows(stream, head, cut)
+                rows = table.rows(cut)
                 values = np.loadtxt(rows, delimiter=head.mark, ndmin=2, usecols=range(width))
             stamps = None
         except ValueError:
-            values, stamps = _with_texts(_rows(stream, head, cut), head, times, path)
+            values, stamps = _with_texts(table.rows(cut), head, times, path)
     if not values.size:
         raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
     named = zip(head.names, head.cells, values.T, strict=True)
@@ -90,102 +98,98 @@ def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     yield from table_records({"/csv": columns}, "csv", path, layout.rate)
 
 
-def column_units(path: Path) -> dict[str, str]:
-    """Return the units in a text table's column names, `x [m]` or `x (m)`, by message path."""
-    return _of_text(path, _column_units) or {}
-
-
-def _of_text(path: Path, function: Callable[[Path], T]) -> T | None:
-    """Return function(path) of a text table that names its columns; None of another file."""
-    if path.suffix.lower() not in SUFFIXES:
-        return None
+def about_table(path: Path) -> AboutTable:
+    """Return what a text table that names its columns says of itself; nothing for another file."""
     try:
-        return within(path, path.stat().st_size, function, path)
+        if path.suffix.lower() in SUFFIXES:
+            return within(path, path.stat().st_size, _about, path)
     except GroundedError as error:
-        if error.finding is not None and error.finding.code in NAMELESS:
-            return None
-        raise
+        if error.finding is None or error.finding.code not in NAMELESS:
+            raise
+    return AboutTable({}, False, ())
 
 
-def _column_units(path: Path) -> dict[str, str]:
+def _about(path: Path) -> AboutTable:
     with _opened(path) as stream:
-        head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
-    said = {
-        name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
-        for name, cell in zip(head.names, head.cells, strict=True)
-    }
-    return {f"/csv.{name}": unit[1] for name, unit in said.items() if unit and '"' not in unit[1]}
-
-
-def states_time_unit(path: Path) -> bool:
-    """Return whether a text table leaves no doubt about its times.
-
-    Its column of times says that they are in seconds (`time_s`, `time [s]`), or holds times of day.
-    """
-    return bool(_of_text(path, _states_time_unit))
-
-
-def _states_time_unit(path: Path) -> bool:
-    with _opened(path) as stream:
-        lines = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]
-    head = _head(lines, path)
-    at = head.names.index(_times_among(head, lines, path))
-    row = next((_cells(row, head.mark) for row in lines[head.rows :] if row.strip()), [])
-    return bool(SECONDS.search(head.cells[at].lower())) or ":" in "".join(row[at : at + 1])
-
-
-def table_remarks(path: Path) -> list[Finding]:
-    """Return what is odd in a text table: an incomplete last row, a last column without numbers."""
-    return _of_text(path, _table_remarks) or []
-
-
-def _table_remarks(path: Path) -> list[Finding]:
-    with _opened(path) as stream:
-        head = _head([stream.readline(LOOK) for _ in range(PREAMBLE + 2)], path)
-        cut, empty = _cut_in(stream, head), _empty_last(stream, head)
-    odd, name = [], str(path)
-    if empty:
-        odd.append(
-            found(
-                "file.empty_column",
-                name,
-                name=head.cells[-1],
-                line=head.line,
-                weight=Weight.WARN,
-            )
-        )
-    if cut is not None:
-        odd.append(found("file.cut", name, line=str(cut.line), text=cut.text[:80]))
-    return odd
-
-
-def _check_widths(stream: TextIO, head: _Head, path: Path) -> None:
-    """Check that no row has more cells than there are names; empty ones at its end don't count.
-
-    Raises:
-        GroundedError: if one has, or if a column without a name has the numbers that the last one
-            lacks, so that it is unclear which cell belongs to which name.
-    """
-    _pass_over(stream, head)
-    for number, line in enumerate(stream, start=head.rows + 1):
-        if line.count(head.mark) >= len(head.names):
-            cells = _cells(line, head.mark)
-            if any(cells[len(head.names) :]):
-                raise _misfit(path, number, cells, head)
-    if "" in head.names and _empty_last(stream, head):
-        facts: dict[str, Any] = {
-            "line": head.line,
-            "name": head.cells[-1],
-            "column": head.names.index("") + 1,
+        table = _Table(stream, path)
+        head = table.head
+        said = {
+            name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
+            for name, cell in zip(head.names, head.cells, strict=True)
         }
-        raise GroundedError(found("file.empty_column", str(path), **facts))
+        units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
+        odd, name = [], str(path)
+        if table.empty_last():
+            facts: dict[str, Any] = {"name": head.cells[-1], "line": head.line}
+            odd.append(found("file.empty_column", name, **facts, weight=Weight.WARN))
+        if (cut := table.cut()) is not None:
+            odd.append(found("file.cut", name, line=str(cut[0]), text=cut[1][:80]))
+        row = next((_cells(row, head.mark) for row in table.lines[head.rows :] if row.strip()), [])
+        at = head.names.index(time) if (time := _time_in(head)) else len(head.names)
+        named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
+    return AboutTable(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
 
 
-def _empty_last(stream: TextIO, head: _Head) -> bool:
-    """Return whether the last column is empty in every row, which then ends with a separator."""
-    _pass_over(stream, head)
-    rows = (line.strip(" \r\n") for line in stream if line.strip())
-    return all(row.endswith(head.mark) and row.count(head.mark) < len(head.names) for row in rows)
+class _Table:
+    """An open text table: its head, and its lines."""
+
+    def __init__(self, stream: TextIO, path: Path, columns: Sequence[str] = ()) -> None:
+        self.stream, self.path = stream, path
+        self.lines = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]  # the first ones
+        self.head = _head_by(columns, self.lines, path) if columns else _head(self.lines, path)
+
+    def rows(self, cut: tuple[int, str] | None = None) -> Iterable[str]:
+        """Return the lines of the rows, without one that is cut off."""
+        self.stream.seek(0)
+        for _ in range(self.head.rows):
+            self.stream.readline()
+        return self.stream if cut is None else islice(self.stream, cut[0] - self.head.rows - 1)
+
+    def numbered(self) -> Iterator[tuple[int, str]]:
+        """Yield the lines of the rows with their numbers, from 1."""
+        yield from enumerate(self.rows(), start=self.head.rows + 1)
+
+    def check_widths(self) -> None:
+        """Check that no row has more cells than names; empty ones at its end don't count.
+
+        Raises:
+            GroundedError: if one has, or if a column without a name has the numbers that the last
+                one lacks, so that it is unclear which cell belongs to which name.
+        """
+        head = self.head
+        for number, line in self.numbered():
+            if line.count(head.mark) >= len(head.names):
+                cells = _cells(line, head.mark)
+                if any(cells[len(head.names) :]):
+                    raise _misfit(self.path, number, cells, head)
+        if "" in head.names and self.empty_last():
+            facts: dict[str, Any] = {"line": head.line, "name": head.cells[-1]}
+            facts["column"] = head.names.index("") + 1
+            raise GroundedError(found("file.empty_column", str(self.path), **facts))
+
+    def empty_last(self) -> bool:
+        """Return whether the last column is empty in every row, which ends with a separator."""
+        mark, width = self.head.mark, len(self.head.names)
+        rows = (line.strip(" \r\n") for _, line in self.numbered() if line.strip())
+        return all(row.endswith(mark) and row.count(mark) < width for row in rows)
+
+    def cut(self) -> tuple[int, str] | None:
+        """Return a last row whose writer was interrupted: its line number, and what is left of it.
+
+        It has too few cells, or, without a line end, half a number.
+        """
+        mark = self.head.mark
+        last = deque[tuple[int, str]](maxlen=BEFORE + 1)
+        last.extend((number, line) for number, line in self.numbered() if line.strip())
+        if not last:
+            return None
+        (number, line), before = last[-1], [_cells(line, mark) for _, line in last][:-1]
+        text = line.strip(" \t\r\n\0")
+        cells = _cells(text if "\0" in line else line.rstrip("\r\n"), mark)
+        whole = line.endswith("\n") or not all(len(row) == len(cells) for row in before)
+        short = len(cells) < len(self.head.names)
+        half = not (whole or _ends(cells[-1], [row[-1] for row in before]))
+        return (number, text) if short or half else None
 
 
 def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
@@ -193,37 +197,8 @@ def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> Grounde
     names, has = len(head.names), len(cells)
     twice = head.mark == "," and names < has <= 2 * names
     comma = twice and all("." not in cell and _share([cell]) == 1 for cell in cells)
-    facts: dict[str, Any] = {
-        "line": line,
-        "has": has,
-        "names": names,
-        "comma": int(comma),
-    }
+    facts: dict[str, Any] = {"line": line, "has": has, "names": names, "comma": int(comma)}
     return GroundedError(found("file.row", str(path), **facts))
-
-
-@dataclass(frozen=True)
-class _Cut:
-    """The last row of a table whose writer was interrupted."""
-
-    line: int  # line number, from 1
-    text: str  # what is left of the row; "" if there are only zero bytes
-
-
-def _cut_in(stream: TextIO, head: _Head) -> _Cut | None:
-    """Find a last row with too few cells, or, without a line end, with half a number."""
-    _pass_over(stream, head)
-    last = deque[tuple[int, str]](maxlen=BEFORE + 1)
-    last.extend((n, line) for n, line in enumerate(stream, head.rows + 1) if line.strip())
-    if not last:
-        return None
-    (number, line), before = last[-1], [_cells(line, head.mark) for _, line in last][:-1]
-    text = line.strip(" \t\r\n\0")
-    cells = _cells(text if "\0" in line else line.rstrip("\r\n"), head.mark)
-    whole = line.endswith("\n") or not all(len(row) == len(cells) for row in before)
-    if len(cells) < len(head.names) or not (whole or _ends(cells[-1], [row[-1] for row in before])):
-        return _Cut(number, text)
-    return None
 
 
 def _ends(cell: str, before: Sequence[str]) -> bool:
@@ -233,12 +208,6 @@ def _ends(cell: str, before: Sequence[str]) -> bool:
     digits = {len(one.partition(".")[2]) for one in before}
     fixed = len(digits) == 1 and len(before) >= BEFORE
     return not np.isnan(_number(cell)) and not (fixed and len(cell.partition(".")[2]) < min(digits))
-
-
-def _rows(stream: TextIO, head: _Head, cut: _Cut | None) -> Iterable[str]:
-    """Return the lines of the rows, without one that is cut off."""
-    _pass_over(stream, head)
-    return stream if cut is None else islice(stream, cut.line - head.rows - 1)
 
 
 class _Spaced:
@@ -283,13 +252,6 @@ def _opened(path: Path) -> TextIO:
     text.seek(0)
     blank = not re.search(r"[\t;,]", head) and re.search(r"[^\s#%] +[^\s]", head)
     return _Spaced(text) if blank else text  # type: ignore[return-value]
-
-
-def _pass_over(stream: TextIO, head: _Head) -> None:
-    """Move the stream to the first row."""
-    stream.seek(0)
-    for _ in range(head.rows):
-        stream.readline()
 
 
 def _head(lines: Sequence[str], path: Path) -> _Head:
@@ -366,20 +328,25 @@ def _share(cells: Sequence[str]) -> float:
     return len(held) / max(len(full), 1)
 
 
-def _times_among(head: _Head, lines: Sequence[str], path: Path) -> str:
+def _time_in(head: _Head) -> str:
+    """Return the name of the column of times, "" for none."""
+    return time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
+
+
+def _times_among(table: _Table) -> str:
     """Return the name of the column of times.
 
     Raises:
         GroundedError: if there is none, suggesting a column whose values increase.
     """
-    named = time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
-    if named:
+    head = table.head
+    if named := _time_in(head):
         return named
-    rows = [_cells(row, head.mark) for row in lines[head.rows :] if row.strip()]
+    rows = [_cells(row, head.mark) for row in table.lines[head.rows :] if row.strip()]
     rising = [n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows])]
     names = tuple(filter(None, head.names[:8]))
     rises = rising[0] if rising else ""
-    raise GroundedError(found("file.no_times", str(path), names=names, rises=rises))
+    raise GroundedError(found("file.no_times", str(table.path), names=names, rises=rises))
 
 
 def _rises(cells: Sequence[Sequence[str]]) -> bool:

@@ -335,7 +335,7 @@ def column_units(log: Path) -> dict[str, str]:
     A text table does in its column names, ArduPilot's log in messages of its own.
     """
     if log.suffix.lower() in SUFFIXES:
-        return text_tables.column_units(log)
+        return dict(text_tables.about_table(log).units)
     if not log.is_file():
         return {}
     with open_log(log) as stream:

@@ -24,7 +24,7 @@ from grounded.model import Model
 from grounded.places import rate_states, undeclared_angles
 from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
-from grounded_trials.formats.text_tables import states_time_unit
+from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
@@ -194,7 +194,7 @@ def _begin(
     drawn.with_gain((*states, *inputs))
     odd = perhaps_degrees((*states, *inputs), drawn.model, drawn.joints)
     inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
-    slow = () if layout.rate or states_time_unit(files[0]) else _in_seconds(report)
+    slow = () if layout.rate or about_table(files[0]).in_time_units else _in_seconds(report)
 
     # The control interval, and the ranges: zero is sent after a run, so limits must include it.
     step, note = (dt, too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)

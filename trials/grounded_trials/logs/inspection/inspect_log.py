@@ -34,7 +34,7 @@ from grounded_trials.formats.path_walk import (
     number_paths,
 )
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
-from grounded_trials.formats.text_tables import table_remarks
+from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.signals import Decoder, decoder_of
 
@@ -140,7 +140,7 @@ class LogReport:
 
 
 def _findings(log: LogReport) -> tuple[Finding, ...]:
-    odd = [one for file in log.files for one in table_remarks(file)]
+    odd = [one for file in log.files for one in about_table(file).findings]
     for topic in log.topics:
         name, bad = topic.topic, [f.path for f in topic.fields if f.not_finite]
         if topic.problem:

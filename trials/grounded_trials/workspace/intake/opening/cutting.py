@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from grounded.errors import GroundedError
 from grounded.findings import Finding
-from grounded_trials.formats.text_tables import table_remarks
+from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import INTERPOLATED, ROWS
@@ -76,7 +76,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     early = grid.interpolated_s / trial.dt > SLIGHT
     facts |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
     encoded = encode(log.workspace, trial, facts, grid.start_ns)
-    remarks = [one for file in log_files(log.path) for one in table_remarks(file)]
+    remarks = [one for file in log_files(log.path) for one in about_table(file).findings]
     return Read(
         trial,
         encoded,
