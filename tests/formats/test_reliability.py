@@ -50,10 +50,6 @@ def test_concurrent_processes() -> None:
     fine(reliability.concurrent(24, 12) if FULL else reliability.concurrent(8, 4))
 
 
-def test_a_full_disk() -> None:
-    fine(reliability.full_disk(), "a small tmpfs can't be mounted here")
-
-
 def test_a_write_that_ends_early() -> None:
     fine(reliability.size_limit(20_011 if FULL else 70_001))
 

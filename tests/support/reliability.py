@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -257,26 +256,6 @@ def judge(folder: str, returncode: int, output: str, says: str) -> list[str]:
     return failures
 
 
-def full_disk() -> Outcome | None:
-    """Add to full disks of several sizes; return None if none can be mounted."""
-    folder = tempfile.mkdtemp()
-    options = "size=300k"
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", folder]).returncode:
-        Path(folder).rmdir()
-        return None
-    try:
-        failures = []
-        for size in (400_000, 320_000, 10_000_000):
-            code, output = run_add(folder, size)
-            failures += judge(folder, code, output, "No space left on device")
-        code, output = run_add(folder, 1000)
-        failures += [output] * (code != 0 or bool(Store(folder).verify()))
-    finally:
-        subprocess.run(["umount", folder], check=True)
-        Path(folder).rmdir()
-    return Outcome(3, tuple(failures), "one message each, and the next small file fits")
-
-
 def size_limit(stride: int = 20_011) -> Outcome:
     """Let writes end early, after any number of bytes."""
     limits = range(0, 200_000, stride)
@@ -412,36 +391,3 @@ def verify_flips(stride: int = 1) -> Outcome:
             if [d.path for d in store.verify()] != [path]:
                 failures.append(what)
     return Outcome(tries, tuple(failures))
-
-
-TABLE: list[tuple[str, Callable[[], Outcome | None]]] = [
-    ("a trial and a candidate cut off at every byte, read", lambda: read_damaged(False)),
-    ("every single bit of both flipped, read", lambda: read_damaged(True)),
-    ("a trial cut off at every byte, recovered", lambda: recover_damaged(False)),
-    ("every single bit of a trial flipped, recovered", lambda: recover_damaged(True)),
-    ("every single bit of a stored file flipped, verified", verify_flips),
-    ("kill -9 at a random moment while files are added", lambda: kills(300)),
-    ("24 processes that add 12 files at once", concurrent),
-    ("a full disk", full_disk),
-    ("a write that ends early", size_limit),
-    ("a folder that may not be written", read_only),
-    ("an I/O error, a full disk, a kill at each system call of an add", fault_injection),
-]
-
-
-def main() -> None:
-    print("| tried | times | failures | |\n|---|---|---|---|")
-    for what, run in TABLE:
-        outcome = run()
-        if outcome is None:
-            print(f"| {what} | – | – | not possible here |")
-            continue
-        print(
-            f"| {what} | {outcome.tries} | {len(outcome.failures)} | {outcome.note} |", flush=True
-        )
-        for failure in outcome.failures[:5]:
-            print("   ", failure, file=sys.stderr)
-
-
-if __name__ == "__main__":
-    main()

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import (
@@ -26,6 +25,7 @@ from grounded_trials.formats.tables import (
     Columns,
     Layout,
     column_name,
+    columns_by_name,
     is_time,
     table_records,
 )

@@ -24,13 +24,13 @@ import numpy as np
 from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import found
-from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Header, Record
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Columns,
     Layout,
     column_name,
+    columns_by_name,
     table_records,
 )
 from grounded_trials.plain_file import read_file

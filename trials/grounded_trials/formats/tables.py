@@ -10,20 +10,20 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import found
-from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 from grounded_trials.formats.messages import Floats
 
+C = TypeVar("C")
 ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps", "tout")
 CANDIDATE = {"candidate", "feedforward", "law"}  # names of arrays in an exported one
@@ -54,6 +54,29 @@ class Layout:
 
 
 AS_IT_SAYS = Layout()
+
+
+def columns_by_name(columns: Iterable[tuple[str, str, C]], path: Path) -> dict[str, C]:
+    """Return columns by their names, which no two may share.
+
+    A name that stands twice would say nothing of which column it means, and the last one would be
+    taken without a word; so would one of two names that are equal without their units.
+
+    Args:
+        columns: (name, the name as the file writes it, column); without a name it is left out.
+        path: the file, for messages.
+
+    Raises:
+        GroundedError: if two have the same name.
+    """
+    by_name: dict[str, C] = {}
+    written: dict[str, str] = {}
+    for name, cell, column in columns:
+        if name in by_name:
+            raise GroundedError(found("given.twice", str(path), name=name))
+        if name:
+            by_name[name], written[name] = column, cell
+    return by_name
 
 
 def npz_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:

@@ -25,13 +25,13 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Weight, found
-from grounded_trials.formats.columns import columns_by_name
 from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Layout,
     column_name,
+    columns_by_name,
     is_time,
     table_records,
     time_among,

@@ -157,13 +157,6 @@ def forecast_table(findings: Findings) -> list[Block]:
     return [title, made]
 
 
-def late_in_vain(findings: Findings) -> list[str]:
-    """Return the states whose delay the diagnosis corrected, and the model does not know."""
-    diagnosis = findings.diagnosis
-    names = [] if diagnosis is None else [*diagnosis.late_sensors]
-    return [name.partition(":")[2] for name in names if name not in findings.effects]
-
-
 def _of_trials(
     trials: Sequence[str], planners: Sequence[str], errors: Sequence[Array], model: Model
 ) -> Block:
