@@ -8,7 +8,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.store.known import KnownTrial
+from grounded_trials.store.index import KnownTrial
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace import folder as folder_module
 from workspaces import CONFIG, make

@@ -33,7 +33,7 @@ from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.candidates.exporting import Exported, format_of
 from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.unknown_id import unknown_candidate, unknown_trial
+from grounded_trials.workspace.identity import unknown_candidate, unknown_trial
 
 FRAME, BODY = "map", "robot"
 BAGS = ("bag", "db3", "mcap")  # endings of a bag's folder

@@ -34,13 +34,18 @@ from grounded_trials.starting.shapes import (
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import figure, misread
-from grounded_trials.workspace.candidates.at_rest import read_at_start, rest_of_trials
+from grounded_trials.workspace.candidates.at_rest import (
+    NOISY,
+    Rest,
+    read_at_start,
+    rest_at_end,
+    rest_of_trials,
+)
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
-from grounded_trials.workspace.candidates.rest_at_end import NOISY, Rest, rest_at_end
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import refuse_ids, unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven, usual_weights
-from grounded_trials.workspace.unknown_id import refuse_ids, unknown_trial
 from grounded_trials.workspace.user_files.config import TaskTable, set_start
 from grounded_trials.workspace.user_files.task_file import read_target, seen_in, without_range
 

@@ -1,7 +1,7 @@
 """A workspace (a folder with a task, its trials and candidates) and what each command does in it.
 
 Read `folder.py` first: how a folder becomes a task, trials and candidates. `identity.py` identifies
-policies by their bytes, `unknown_id.py` explains names that don't exist.
+policies by their bytes, and explains names that don't exist.
 
 user_files/  what the user wrote: grounded.toml, model.py, target.csv
 candidates/  planning the next candidate, handing it over, running it: propose, export, run

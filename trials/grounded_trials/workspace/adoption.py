@@ -42,7 +42,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.target_state import logged_target, to_plan
+from grounded_trials.workspace.new_target import logged_target, to_plan
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
 from grounded_trials.workspace.where_to_mend import changed_since, in_time_now, last_again
 

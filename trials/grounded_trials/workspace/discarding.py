@@ -18,7 +18,7 @@ from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.unknown_id import unknown_trial
+from grounded_trials.workspace.identity import unknown_trial
 from grounded_trials.workspace.where_to_mend import again, read_otherwise
 
 STATUS = NextCommand("status")

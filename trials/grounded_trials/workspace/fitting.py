@@ -22,8 +22,8 @@ from grounded.result import Result
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
+from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
-from grounded_trials.workspace.target_state import to_plan
 from grounded_trials.workspace.user_files.config import set_in_model, set_latency
 
 if TYPE_CHECKING:

@@ -40,8 +40,8 @@ from grounded_trials.workspace.identity import (
     noted,
     sha256,
     stored_candidate,
+    unknown_candidate,
 )
-from grounded_trials.workspace.unknown_id import unknown_candidate
 from grounded_trials.workspace.user_files.config import Config, read_config
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 from grounded_trials.workspace.user_files.task_file import build_task, read_target

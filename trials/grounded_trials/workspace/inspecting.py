@@ -15,7 +15,7 @@ from grounded_trials.logs.log_table import layout_of
 from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.unknown_id import refuse_ids
+from grounded_trials.workspace.identity import refuse_ids
 from grounded_trials.workspace.user_files.config import FILE
 
 

@@ -26,8 +26,7 @@ from grounded_trials.plain_file import unreadable
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.unknown_id import named_trials
+from grounded_trials.workspace.identity import named_trials, sha256
 from grounded_trials.workspace.where_to_mend import changed_since
 
 if TYPE_CHECKING:

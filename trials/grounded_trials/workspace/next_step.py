@@ -21,7 +21,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.target_state import PROPOSE, TARGET, to_plan, undrawn
+from grounded_trials.workspace.new_target import PROPOSE, TARGET, to_plan, undrawn
 from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:

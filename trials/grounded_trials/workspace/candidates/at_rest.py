@@ -16,21 +16,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
-from grounded.places import integrals, true_values
+from grounded.places import integrals, rate_states, true_values
+from grounded.search.candidate import Candidate
+from grounded.search.safety import coasts_out
+from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import tracked, usual_weights
+from grounded_trials.workspace.user_files.config import OFFERED
+from grounded_trials.workspace.user_files.task_file import LEAST
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
-LEAST = 3  # steps of it
+LEAST_STEPS = 3  # of it
 STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
 SAME = 0.25  # of the distance between two starts: within it of one of them, a robot stood there
 
@@ -42,20 +48,14 @@ class Stand:
     Args:
         states: their medians in the second half of that time (n,).
         inputs: the same of the inputs (m,): a controller may sag at first.
-        moved: the drift of the states in that time (n,).
-        seconds: how long it stood there at least.
         steady: changes of the states that count as none (n,).
-        ranges: of the inputs in the whole trial (m,).
         needs: inputs that have to hold it there (m,) bool: constant, or beyond what trembles.
         trial: its id.
     """
 
     states: Array
     inputs: Array
-    moved: Array
-    seconds: float
     steady: Array
-    ranges: Array
     needs: NDArray[np.bool_]
     trial: str
 
@@ -74,7 +74,7 @@ def standstill(
         seconds: how long it has to stand.
         ranges: lowest and highest value of each signal in the whole log; else those of the trial.
     """
-    steps = max(LEAST, round(seconds / trial.dt))
+    steps = max(LEAST_STEPS, round(seconds / trial.dt))
     x, u = trial.states[: steps + 1], trial.inputs[:steps]
     if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
         return None
@@ -95,8 +95,7 @@ def standstill(
         return None
     at, held = np.median(x[steps // 2 :], axis=0), np.median(later, axis=0)
     needs = (held != 0) & ((np.ptp(later, axis=0) == 0) | (np.abs(held) > STEADY * sent))
-    lasted = steps * trial.dt
-    return Stand(at, held, drift(x), lasted, STEADY * whole, sent, needs, trial.id)
+    return Stand(at, held, STEADY * whole, needs, trial.id)
 
 
 def standstills(workspace: Folder) -> list[Stand]:
@@ -323,30 +322,142 @@ def rest_of_trials(workspace: Folder) -> tuple[dict[str, float], str]:
         The values for [task] start that are not zero, inputs that hold it included, and the trial;
         ({}, "") if [task] start has values, or no trial tells.
     """
-    if workspace.config.task.start:
-        return {}, ""
-    try:
-        trials = workspace.task_trials()
-    except GroundedError:  # a damaged file, which other commands report
-        return {}, ""
-    for trial in trials:
-        if found := _rest_of(workspace.base_model, trial):
-            return found, trial.id
+    for stand in [] if workspace.config.task.start else standstills(workspace):
+        if found := _rest_of(workspace, stand):
+            return found, stand.trial
     return {}, ""
 
 
-def _rest_of(model: Model, trial: Trial) -> dict[str, float]:
+def _rest_of(workspace: Folder, stand: Stand) -> dict[str, float]:
     """Return the states in which a robot rests at the start of a trial, and the inputs holding it.
 
-    Empty if it moves there, or rests where all of these are zero.
+    Empty if it rests where all of these are zero.
     """
-    if (stand := standstill(model, trial)) is None:
-        return {}
+    model, dt = workspace.base_model, workspace.config.task.dt
     at, held = stand.states, stand.inputs
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
-    a = model.system.linearise(at[None], held[None], model.values, trial.dt)[0][0]
+    a = model.system.linearise(at[None], held[None], model.values, dt)[0][0]
     needed = np.abs(np.nan_to_num(a) - np.eye(model.n)).max(axis=0) > DEPENDS
     told = needed & ~rates & (np.abs(at) > stand.steady)
     found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
     inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
     return found | {n: v for n, v in inputs.items() if found and v}
+
+
+def ended_at_rest(task: Task, run: Trial, held: Array) -> Trial:
+    """Return a run that ends where a predicted one does, but at rest and under the held input.
+
+    Args:
+        task: says which states are rates of positions.
+        run: the predicted run, with the planning model's states.
+        held: the input that is sent after it (m,).
+    """
+    still = run.states.copy()
+    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
+    return replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
+
+
+HOLD = 1.0  # [s] at rest that are proposed at least
+NOISY = 0.02  # most utility that the noise of a state may cost at the end, by its weight
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What makes the free states of a line rest at its end.
+
+    Args:
+        columns: of these states and their rates, (H + 1,) each; they count at the end only.
+        weights: for [reward] terminal, also of the states that the line has: a ball that arrives
+            too fast leaves a level beam as well.
+        noise: standard deviation of the states whose weight is bounded by it.
+    """
+
+    columns: dict[str, Array]
+    weights: dict[str, float]
+    noise: dict[str, float]
+
+
+def rest_at_end(
+    workspace: Folder, columns: Mapping[str, Array], start: Mapping[str, float]
+) -> Rest | None:
+    """Return columns and weights for the free states of a line; None if it leaves none free.
+
+    These are the states that have a rate, with it; if none has one, the first. A state rests where
+    its sensor shows it at rest with all adopted effects.
+
+    Args:
+        workspace: the workspace with the model.
+        columns: the line.
+        start: [task] start.
+    """
+    model = workspace.base_model
+    rates, free = rate_states(model), [name for name in model.states if name not in columns]
+    if not free:
+        return None
+    last = {name: float(column[-1]) for name, column in columns.items()}
+    last |= {name: 0.0 for name in rates.values() if name in last}
+    rows, found, ranges = len(next(iter(columns.values()))), dict[str, Array](), {}
+    for name in [name for name in free if name in rates] or free[:1]:
+        begins, at = start.get(name, 0.0), rest_value(workspace, last, name)
+        last[name] = at
+        found[name] = np.linspace(begins, at, rows)
+        ranges[name] = np.linspace(min(begins, at - LEAST), at, rows)
+        if (rate := rates.get(name)) is not None and rate not in columns:
+            found[rate], ranges[rate] = np.zeros(rows), ranges[name]  # only for its usual weight
+    usual = usual_weights(model, {**columns, **ranges})
+    weights, noisy = {name: OFFERED * weight for name, weight in usual.items()}, {}
+    each = sensor_noise(workspace.task_trials(), model.n)
+    for name, noise in zip(model.state_names, each.tolist(), strict=True):
+        if name in found and weights[name] * noise**2 > NOISY:
+            weights[name], noisy[name] = NOISY / noise**2, noise
+    return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()}, noisy)
+
+
+def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
+    """Return the `target` command for a line whose plan leaves [safety] after its end, else None.
+
+    It draws the same line so that free states rest at its end, and holds it there for a while.
+    """
+    planner, task = workspace.planner, workspace.task
+    held = np.clip(made.policy.past, made.policy.low, made.policy.high)
+    run = planner.lift(made.predicted_run)
+    if not coasts_out(task, planner.plan, run, held):
+        return None
+    if (line := drawn(task)) is None or line.arguments[0] != "line":
+        return None
+    given = {*tracked(task)}
+    free = [name for i, name in enumerate(task.model.state_names) if i not in given]
+    words, rests = [*line.arguments], _rests(task)
+    seconds = (task.horizon - rests) * task.dt
+    words += ["--seconds", f"{seconds:.6g}"]
+    if not free and rests * task.dt >= HOLD:
+        return None
+    if not free and coasts_out(task, planner.plan, ended_at_rest(task, run, held), held):
+        return None  # an arm falls from rest as well: the input that is sent afterwards lets it go
+    words += ["--hold", f"{max(rests * task.dt, HOLD):.6g}", *["--rest"] * bool(free)]
+    return NextCommand("target", tuple(words))
+
+
+def _rests(task: Task) -> int:
+    """Return the number of steps at the end in which the target does not move."""
+    given = task.target[:, tracked(task)]
+    still = np.all(np.isclose(given, given[-1], atol=1e-9), axis=1)
+    return int(np.argmin(still[::-1])) - 1 if not still.all() else task.horizon
+
+
+def drawn(task: Task) -> NextCommand | None:
+    """Return the `target` command for the line or step that a target appears to be; else None."""
+    names, rates = task.model.state_names, {*rate_states(task.model).values()}
+    given = [i for i in tracked(task) if names[i] not in rates]
+    way = task.model.difference(task.target, task.start)[:, given]
+    if not way.any():
+        return None
+    k = int(np.argmax(np.abs(way[-1])))
+    if not way[-1, k]:
+        return None
+    share = way[:, k] / way[-1, k]
+    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
+        return None
+    shape = "step" if np.allclose(share[1:], 1.0) else "line"
+    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
+    return NextCommand("target", (shape, *(word for pair in to for word in pair)))

@@ -20,10 +20,10 @@ from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import rendered
-from grounded_trials.workspace.candidates.rest_at_end import drawn
+from grounded_trials.workspace.candidates.at_rest import drawn
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.new_target import still_logged
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
-from grounded_trials.workspace.target_state import still_logged
 from grounded_trials.workspace.user_files.config import made_changes
 from grounded_trials.workspace.user_files.task_file import limited_changes, seen_in
 

@@ -193,7 +193,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     # the user should first correct the held input; a second `propose` hands the candidate out
     then = PROPOSE if held else to_run(workspace, candidate.id)
     if not held and proposal.is_new and not now.trials:
-        from grounded_trials.workspace.candidates.rest_at_end import to_end_at_rest
+        from grounded_trials.workspace.candidates.at_rest import to_end_at_rest
 
         if (rest := to_end_at_rest(workspace, candidate)) is not None:
             own = rendered(then, workspace.address)

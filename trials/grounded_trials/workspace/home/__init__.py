@@ -1,6 +1,6 @@
 """What is taken home: the model with the values found, in the form that it came in.
 
 Read `export_model` in `taking_home` first. `xml_text` changes a file and leaves the rest of it to
-the byte; `held` says which effect is which number of a joint or an actuator; `mjcf`, `urdf` and
-`python_file` write these numbers into the three kinds of files.
+the byte; `held` says which effect is which number of a joint or an actuator; `mjcf` writes these
+numbers into MJCF and URDF files.
 """

@@ -9,7 +9,7 @@ model predicts better or worse with the other's value, the trials cannot decide 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,10 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.sound_trials import sound_trials
+from grounded.adapters import mujoco
 from grounded.adapters.mujoco import MujocoStepper
+from grounded.adapters.mujoco_names import FIELDS, identifier
+from grounded.adapters.stepper import library
 from grounded.checks import same_names
 from grounded.diagnosis.error_report import BRIEF
 from grounded.diagnosis.levels import LEAST, SURE
@@ -28,9 +31,10 @@ from grounded.findings import Finding, Quantity
 from grounded.findings import found as finding
 from grounded.model import Model
 from grounded.result import Document
+from grounded_trials.plain_file import unreadable
 from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.home.files_of_others import numbers_of_file, simulated_model
+from grounded_trials.workspace.home.held import value_of
 from grounded_trials.workspace.home.yaml_file import number_in, read_yaml
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
@@ -266,3 +270,75 @@ def _text(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{q} {v:.4g}" for q, v in value.items() if q != "name")
     return f"{value:.4g}"
+
+
+FILTERS = (2, 3)  # mjDYN_FILTER, mjDYN_FILTEREXACT
+AFFINE = 1  # mjBIAS_AFFINE
+
+
+def simulated_model(path: Path) -> tuple[Any, Effects]:
+    """Return a file, compiled without lags, and these as effects.
+
+    Raises:
+        GroundedError: if MuJoCo can't load it.
+    """
+    mj = library("mujoco")
+    try:
+        spec = mj.MjSpec.from_file(str(path))
+        whole = spec.compile()
+    except ValueError as error:
+        raise unreadable(path, str(error), kind="MuJoCo model") from None
+    effects = list[Mapping[str, Any]]()
+    for i, one in enumerate(spec.actuators):
+        name = identifier(one.name or f"actuator{i}")
+        if int(whole.actuator_dyntype[i]) in FILTERS:
+            tau = float(whole.actuator_dynprm[i, 0])
+            effects.append({"name": f"first_order_lag:{name}", "tau": tau})
+            one.dyntype = mj.mjtDyn.mjDYN_NONE
+    return spec.compile(), tuple(effects)
+
+
+def numbers_of_file(
+    compiled: Any, others: Sequence[Any] = (), like: MujocoStepper | None = None
+) -> Model:
+    """Return the Model of a compiled file, with the numbers as parameters that files differ in.
+
+    Args:
+        compiled: the file.
+        others: files that are compared.
+        like: a stepper whose inputs, time step and parameters it has.
+    """
+    each = [dict(_numbers(one)) for one in others]
+    shared = set(each[0]).intersection(*each[1:]) if each else set[str]()
+    specs = {
+        n for n in shared if not math.isclose(min(e[n] for e in each), max(e[n] for e in each))
+    }
+    specs |= {setting.spec for setting in like.settings} if like else set()
+    inputs: str | list[str] = "auto"
+    if like is not None:
+        joints = [name.rpartition("_")[0] for name in like.controls.names]
+        inputs = joints if like.controls.torques else "actuators"
+    known = dict(_numbers(compiled))
+    params = {spec: known[spec] for spec in sorted(specs) if spec in known}
+    step, without = (None, ()) if like is None else (like.timestep, like.without)
+    return mujoco.model(compiled, params=params, inputs=inputs, without=without, timestep=step)
+
+
+def _numbers(compiled: Any) -> Iterator[tuple[str, float]]:
+    """Yield the named numbers of a compiled file."""
+    mj = library("mujoco")
+    counts = {"body": compiled.nbody, "joint": compiled.njnt, "geom": 0, "actuator": compiled.nu}
+    for name_of, about in FIELDS.items():
+        kind = int(getattr(mj.mjtObj, f"mjOBJ_{about.element.upper()}"))
+        for i in range(counts[about.element]):
+            name = mj.mj_id2name(compiled, kind, i)
+            if not name or name == "world" or (name_of == "mass" and not compiled.body_mass[i]):
+                continue
+            servo = about.element == "actuator" and compiled.actuator_biastype[i] == AFFINE
+            if (
+                name_of == "tau"
+                or (name_of in ("kp", "kv") and not servo)
+                or (name_of == "gain" and servo)
+            ):
+                continue
+            yield f"{name}.{name_of}", value_of(compiled, about.element, i, name_of)

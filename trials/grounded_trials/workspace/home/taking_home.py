@@ -7,11 +7,12 @@ listed with its equation, there and as a finding.
 
 from __future__ import annotations
 
+import ast
 import datetime
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,7 @@ from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held, Number, value_of
-from grounded_trials.workspace.home.mjcf import Mjcf
-from grounded_trials.workspace.home.python_file import with_values
-from grounded_trials.workspace.home.urdf import Urdf
+from grounded_trials.workspace.home.mjcf import Mjcf, Urdf
 from grounded_trials.workspace.home.xml_text import XmlText, commented
 
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
@@ -224,3 +223,48 @@ def _comment(
     lines = [f"grounded, {date}: values found in {workspace.folder.resolve().name}"]
     lines += [f"{name} = {one.text} (was {one.was:g})" for name, one in values.items()]
     return date, lines + [one.what for one in told]
+
+
+def with_values(path: Path, values: Mapping[str, float]) -> tuple[str, list[str]]:
+    """Return a model file with other values of its parameters, and the names it does not show.
+
+    A parameter stands as `"L": Param(0.17, ...)` or `params=dict(L=Param(...))`; the expression of
+    its value is replaced by the number.
+
+    Args:
+        path: the file.
+        values: by name of the parameter.
+    """
+    source = path.read_bytes()
+    lines = source.splitlines(keepends=True)
+    starts = [sum(map(len, lines[:i])) for i in range(len(lines))]
+    edits = dict[int, tuple[int, bytes]]()
+    for name, value in _named(ast.parse(source)):
+        if name in values and value.end_lineno and value.end_col_offset is not None:
+            begin = starts[value.lineno - 1] + value.col_offset
+            end = starts[value.end_lineno - 1] + value.end_col_offset
+            edits[begin] = end, f"{values[name]:.8g}".encode()
+            values = {n: v for n, v in values.items() if n != name}
+    for begin, (end, new) in sorted(edits.items(), reverse=True):
+        source = source[:begin] + new + source[end:]
+    return source.decode(), list(values)
+
+
+def _named(tree: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Yield the names of parameters with the expressions of their values."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Dict):
+            keys = (getattr(key, "value", None) for key in node.keys)
+            pairs = [(k, v) for k, v in zip(keys, node.values, strict=True) if isinstance(k, str)]
+        elif isinstance(node, ast.Call):
+            pairs = [(str(keyword.arg), keyword.value) for keyword in node.keywords]
+        else:
+            continue
+        for name, call in pairs:
+            if isinstance(call, ast.Call) and _called(call.func) == "Param":
+                value = [k.value for k in call.keywords if k.arg == "value"] + call.args[:1]
+                yield from ((name, one) for one in value[:1])
+
+
+def _called(function: ast.expr) -> str:
+    return getattr(function, "attr", getattr(function, "id", ""))

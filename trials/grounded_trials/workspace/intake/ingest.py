@@ -36,7 +36,7 @@ from grounded_trials.workspace.candidates.search_state import (
     standing_without,
 )
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.identity import refuse_ids, sha256
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
@@ -54,10 +54,9 @@ from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gon
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
+from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
-from grounded_trials.workspace.target_state import PROPOSE
-from grounded_trials.workspace.unknown_id import refuse_ids
 
 if TYPE_CHECKING:
     from grounded_trials.logs.signal_report import SignalReport
