@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded_cli.console.options import as_json
 from grounded_cli.console.terminal import field, progress, say, show, show_json
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace_option import next_line
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded.errors import NextCommand
     from grounded_trials.logs.recover import Recovery
 
 
@@ -92,28 +91,6 @@ def _steps(found: Recovery) -> str:
     return f"{found.steps}{planned} steps{ran}{', with a hole' * found.hole}"
 
 
-def _of_foreign(found: Recovery, target: str) -> NextCommand:
-    """Return `ingest` for a log that [log] of this workspace can read, else `inspect`.
-
-    It is data, unless a candidate waits for its trial, which this log may be.
-    """
-    from grounded_trials.formats.message_path import parse_path
-    from grounded_trials.logs.log_table import log_mapping
-    from grounded_trials.workspace.candidates.search_state import standing_in
-
-    try:
-        workspace = open_workspace()
-        model = workspace.base_model
-        mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
-        specs = (*mapping.states.values(), *mapping.inputs.values()) if mapping else ()
-        if not specs or any(parse_path(one.path).topic not in found.messages for one in specs):
-            return NextCommand("inspect", (target,))
-        waits = workspace.candidate_ids() and standing_in(workspace).outstanding
-    except GroundedError:  # no workspace here, or one that can't be read
-        return NextCommand("inspect", (target,))
-    return NextCommand("ingest", (target,) if waits else ("--data", target))
-
-
 def _next(found: Recovery) -> str:
     """Return the lines that say what to do with the file."""
     from grounded_trials.store.own_files import CANDIDATE
@@ -122,7 +99,7 @@ def _next(found: Recovery) -> str:
     if found.format == CANDIDATE:
         return next_line(NextCommand("propose"))
     if not _is_trial(found):
-        return next_line(_of_foreign(found, target))
+        return next_line(NextCommand("inspect", (target,)))  # which says how it is ingested
     if found.hole:
         return next_line(NextCommand("run", (found.candidate,) if found.candidate else ()))
     short = found.planned is None or found.steps < found.planned

@@ -95,11 +95,6 @@ ENTRIES: dict[str, Entry] = {
         "[[!fit? adopt what this one lacks]]",
     ),
     # what status tells beside it
-    "no_log": Entry(
-        "note",
-        "no log is stored: with one of your robot (`ingest --data LOG`), `diagnose` finds what the "
-        "model lacks; without, `propose` plans with the model as it is",
-    ),
     "uncounted": Entry(
         "note",
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
@@ -115,8 +110,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "the last diagnosis is outdated[[; [log] reads {reread} in another way now]][[; it had "
         "{used} of {usable} trials]][[; adopted since: {adopted}]][[, but not {missing}]]"
-        "[[changed? ; the model was changed]][[; {repeats} repeat one run: diagnose again to know "
-        "how much of what is left is noise]]",
+        "[[changed? ; the model was changed]]",
     ),
     "stops": Entry(
         "note",

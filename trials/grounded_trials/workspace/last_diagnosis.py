@@ -158,7 +158,6 @@ class Since:
     changed: bool = False  # the diagnosis was made with another model
     reread: tuple[str, ...] = ()  # signals that [log] reads in another way now
     further: bool = False  # it left more to be found than it was allowed to claim
-    repeats: tuple[str, ...] = ()  # runs of one candidate that tell the noise it did not know
 
     @property
     def settled(self) -> bool:
@@ -174,7 +173,7 @@ class Since:
     def findings(self) -> tuple[Finding, ...]:
         """Why the diagnosis is outdated; () if it is not."""
         only = self.changed and not self.adopted
-        if not (self.reread or self.newer or self.adopted or only or self.repeats):
+        if not (self.reread or self.newer or self.adopted or only):
             return ()
         one = found(
             "search.outdated",
@@ -184,7 +183,6 @@ class Since:
             adopted=self.adopted,
             missing=self.missing if self.adopted else (),
             changed=int(only),
-            repeats=self.repeats,
         )
         return (one,)
 
@@ -239,23 +237,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         changed=not same or made.model not in ("", model_print(workspace)),
         reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
-        repeats=_new_repeats(workspace, diagnosis, usable),
     )
-
-
-def _new_repeats(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> tuple[str, ...]:
-    """Return the runs of one candidate that tell the noise, if a diagnosis did not know it."""
-    from grounded.diagnosis.error_report import open_noise
-
-    if not open_noise(diagnosis.prediction_error):
-        return ()
-    runs = dict[str, list[str]]()
-    for trial in workspace.task_trials():
-        if trial.candidate and trial.id in usable:
-            runs.setdefault(trial.candidate, []).append(trial.id)
-    seen = set(made_from(diagnosis).trials)
-    new = (tuple(same) for same in runs.values() if len(seen.intersection(same)) < 2 <= len(same))
-    return next(new, ())
 
 
 def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:

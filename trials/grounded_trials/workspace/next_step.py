@@ -170,7 +170,7 @@ NEXT: tuple[Row, ...] = (
     # an ended search was not diagnosed with all of its trials and its model
     (
         ENDED,
-        lambda s: s.diagnosis and (s.since.repeats or not (s.since.settled or s.came_true)),
+        lambda s: s.diagnosis and not (s.since.settled or s.came_true),
         lambda s: DIAGNOSE,
     ),
     # another run of the best candidate may settle the doubt that ended the search, or tell a cause

@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -35,8 +34,6 @@ from grounded.search.difference import beyond_one_trial
 from grounded.search.feedback.oscillation import quiet_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-from grounded_trials.store.store import Stored
-from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import what_became
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
@@ -327,15 +324,10 @@ class Check:
                 best=best.candidate.id,
                 of=best.utility,
             )
-        for stored in self.workspace.store.list() if aside else ():
-            if stored.id in aside and self._ran(stored) == name:
-                why = aside[stored.id]
-                yield found("search.aside", stored.id, candidate=name, why=why, weight=Weight.NOTE)
-
-    def _ran(self, stored: Stored) -> str:
-        with suppress(GroundedError):
-            return read_trial(self.workspace.store.read(stored))[0].candidate
-        return ""
+        for one in self.workspace.aside_trials():
+            if one.trial.candidate == name:
+                told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
+                yield told.knowing({"why": aside[one.stored.id]})
 
     def _untried(self) -> Finding | None:
         """Return that the first run is predicted to come near bounds of [safety].

@@ -36,7 +36,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
     usable_ids,
 )
-from grounded_trials.workspace.next_step import Situation, next_command, not_ingested, outlook
+from grounded_trials.workspace.next_step import Situation, next_command, outlook
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
@@ -372,7 +372,6 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     gone = () if standing.phase is Phase.PROPOSE else _disowned(standing, workspace.discarded())
     every = [
         *notes,
-        *_nothing_stored(workspace),
         *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
         *_namesakes(workspace),
@@ -420,16 +419,6 @@ def _certainty(now: Standing) -> tuple[Finding, ...]:
     if gain and waiting and waiting.id not in ran and now.incumbent is not None:
         small = beyond_one_trial(waiting, now.incumbent, now.missing)
     return tuple(one for one in (gain and gain.to_finding(), small, now.less_in_log) if one)
-
-
-def _nothing_stored(workspace: Folder) -> list[Finding]:
-    """Return that a log may be stored first, if it is not known which; [] if it is."""
-    if workspace.store.list() or workspace.candidate_ids() or not_ingested(workspace):
-        return []
-    config = workspace.config
-    if not config.log.has("state") or config.system.reachable:
-        return []
-    return [found("search.no_log")]
 
 
 def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
