@@ -22,7 +22,6 @@ import numpy as np
 from grounded.checks import list_of, refused, wrong
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
-from grounded.result import listed
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -327,11 +326,17 @@ def other_task(task: Task, made: Candidate) -> str:
     policy, model = made.policy, task.model
     if (policy.state_names, policy.input_names) != (model.state_names, model.input_names):
         return "another model"
-    limits = np.allclose((policy.low, policy.high), (task.low, task.high))
-    start = np.allclose(made.predicted_states[0], task.start)
-    alike = {"limits": limits, "horizon": policy.horizon == task.horizon, "start": start}
-    other = [f"another {what}" for what, same in alike.items() if not same]
-    return listed(other) or "another target, reward or feedback"
+    own, now = np.stack([policy.low, policy.high], axis=1), np.stack([task.low, task.high], axis=1)
+    told = [
+        f"limits of {name}: [{low:g}, {high:g}] then"
+        for j, (name, (low, high)) in enumerate(zip(model.input_names, own, strict=True))
+        if not np.allclose(own[j], now[j])
+    ]
+    if policy.horizon != task.horizon:
+        told.append(f"a horizon of {policy.horizon} steps then")
+    if not np.allclose(made.predicted_states[0], task.start):
+        told.append("another start then")
+    return "; ".join(told) or "another target, reward or feedback"
 
 
 def unsure_times(stored: Iterable[StoredTrial], trials: Collection[str]) -> tuple[float, float]:
