@@ -8,10 +8,10 @@ motion        what the model predicts, calibrated on the log
 judge         scores each account by both, tells the best, corrects or refuses
 reported      what is said of an account, and what to do about it
 returned      how the commands of a candidate's run came about: the same table, and what its
-              program did; by `sent` (commands beside a policy's) and `predicted`
+              program did; by `sent` (a run beside its policy and its prediction)
 ages          late and filtered sensors, velocities computed from positions, biases; by `lag`
-commands      clocks that differ, inputs that act in reverse; `inputs` copies and limits
-signals       samples of one sensor
+commands      clocks that differ, inputs that act in reverse
+signals       samples of one sensor; copies and limits of commands
 time_step     models and motions that are too fast for the steps
 finding       one fault of a sensor or command, and the corrected trials
 """

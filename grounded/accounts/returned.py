@@ -18,10 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.inputs import limits_of, span
 from grounded.accounts.judge import contradicted
 from grounded.accounts.motion import MARGIN
-from grounded.accounts.predicted import Ran, apart, far
 from grounded.accounts.sent import (
     CLEAR,
     DECISIVE,
@@ -32,12 +30,16 @@ from grounded.accounts.sent import (
     SLIGHT,
     Commanded,
     Following,
+    Ran,
+    apart,
     commanded,
     evidence,
+    far,
     follows,
     latest,
     states_ago,
 )
+from grounded.accounts.signals import limits_of, span
 from grounded.accounts.table import Account, of_commands, unit_named
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array

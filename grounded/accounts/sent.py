@@ -3,12 +3,18 @@
 The commands that the policy sends on the LOGGED states, including feedback and clipping, are
 compared with the logged ones (`follows`). A log may be a little late, noisy or resampled; commands
 of a person or of another candidate differ by more.
+
+A policy's commands alone don't tell which column is wrong: feedback on an angle of the other sign
+sends nearly what it sends on a speed of the other sign. But a run resembles its prediction, even
+by a crude model, since feedback keeps it there: a column in another unit, of the other sign or in
+another's place is far from it (`far`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -31,6 +37,9 @@ LATEST = 3  # steps by which commands may be sent or logged late
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 FOREIGN = 0.5  # of the squared difference of unrelated commands: from here on nothing is alike
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
+# differences from the prediction, of a state's usual size: alike; at most in any state of a run as
+# planned (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
+NEAR, CLOSE, ALIKE = 0.3, 0.6, 1.0
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 
 
@@ -248,3 +257,67 @@ def second_differences(states: Array, angles: Sequence[bool] | Array) -> Array:
     turns = tuple(map(bool, angles))
     change: Array = np.diff(z_difference(states[1:], states[:-1], turns), axis=0)
     return change
+
+
+# --- beside its prediction ------------------------------------------------------------------------
+
+
+class Ran(Protocol):
+    """A candidate: its name, its policy, and the states (H + 1, n) predicted for it."""
+
+    @property
+    def id(self) -> str:
+        """Its name."""
+
+    @property
+    def policy(self) -> Policy:
+        """What it sends."""
+
+    @property
+    def predicted_states(self) -> Array:
+        """The states (H + 1, n) of its run in the model."""
+
+
+def far(own: Ran, trial: Trial, first: int = 0) -> Array:
+    """Return each state's rms difference from its prediction, relative to its size, (n,).
+
+    The size is the geometric mean of the standard deviations, so that a column that is too small is
+    as far as one that is too large. NaN for a state that is predicted not to move, or of which
+    nothing is finite.
+    """
+    predicted = own.predicted_states[first:]
+    T = min(trial.finite_steps, len(predicted) - 1)
+    if T < 0:
+        return np.full(trial.states.shape[1], np.nan)
+    seen, said = trial.states[: T + 1], predicted[: T + 1]
+    off = np.sqrt(((seen - said) ** 2).mean(axis=0))
+    moves, shown = said.std(axis=0), seen.std(axis=0)
+    with np.errstate(all="ignore"):
+        found: Array = off / np.sqrt(np.where(moves > 0, moves, np.nan) * (shown + 1e-6 * moves))
+    return found
+
+
+def apart(own: Ran, trial: Trial, first: int = 0) -> float:
+    """Return how far a trial, from step `first` on, is from its prediction [nats] in all states."""
+    return float(np.nansum(np.log(np.fmax(far(own, trial, first), NEAR))))
+
+
+def like_predicted(own: Ran, trial: Trial) -> bool:
+    """Return whether most states of a trial are near their prediction, as far as one is known."""
+    known = far(own, trial)
+    known = known[np.isfinite(known)]
+    return not len(known) or bool(np.median(known) < ALIKE)
+
+
+def as_planned(own: Ran, trial: Trial) -> bool:
+    """Return whether a run's commands are its candidate's to the last digits, and its motion near.
+
+    Then it came about as it is logged, and no other account is asked for: a column in another unit,
+    of the other sign, dead or in another's place is far from its prediction.
+
+    Args:
+        own: the candidate.
+        trial: its run, with gaps bridged.
+    """
+    known = far(own, trial)
+    return as_sent(own.policy, trial) and bool((known[np.isfinite(known)] < CLOSE).all())

@@ -1,9 +1,9 @@
 """START HERE: all that sensors and commands show before any physics is identified, in one call.
 
-signals      samples of one sensor: missing, stuck, held, wrapped, dropping out
+signals      samples of one sensor: missing, stuck, held, wrapped; copies and limits of commands
 judge        which account of the table tells how each log came about
 ages         late, filtered and computed velocities, biases
-commands     clocks that differ, inputs that act in reverse; `inputs` copies and limits
+commands     clocks that differ, inputs that act in reverse
 time_step    a model, or a motion, that is too fast for the steps
 
 What is certain is corrected in the trials passed on; what can't be is refused, with the remedy.
@@ -19,12 +19,11 @@ import numpy as np
 from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials, put_right
-from grounded.accounts.inputs import judge_inputs
 from grounded.accounts.judge import Verdict, judge
 from grounded.accounts.kinematics import folded, gaps, kinematic_rows
 from grounded.accounts.reported import folded as is_folded
 from grounded.accounts.reported import keys, names_of, reported
-from grounded.accounts.signals import judge_signal, signal_of
+from grounded.accounts.signals import judge_inputs, judge_signal, signal_of
 from grounded.accounts.table import Told
 from grounded.accounts.time_step import judge_resolution, judge_time_step
 from grounded.findings import Quantity

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.accounts.predicted import apart, like_predicted
 from grounded.accounts.returned import Kind, multiplied, stories
-from grounded.accounts.sent import follows
+from grounded.accounts.sent import apart, follows, like_predicted
 from recorded import waiting
 
 

@@ -262,7 +262,7 @@ def _at_limits(
 
     The log itself reaches these limits by construction, and so do other manual drives.
     """
-    from grounded.accounts.inputs import judge_limits
+    from grounded.accounts.signals import judge_limits
 
     if not seen_in(workspace.config):
         return findings

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding, holds, of_code
+from facts import holding, of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.workspace.intake.locating.run_start import recording
 from grounded_trials.workspace.intake.opening import cutting
+from grounded_trials.workspace.intake.recognising.run_start import recording
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 
@@ -92,7 +92,7 @@ def start_in(policy, felt, sent):
     names = {"state_names": policy.state_names, "input_names": policy.input_names}
     model = SimpleNamespace(**names, angles=())
     task = SimpleNamespace(model=model, dt=policy.dt, horizon=policy.horizon, past=policy.past)
-    return recording(series, task, lambda one: one).start_of(policy)
+    return recording(series, task, series).start_of(policy)
 
 
 @pytest.mark.slow
@@ -260,20 +260,6 @@ def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_name
     (begins,) = of_code(found, "log.start_assumed")
     assert of_code(found, "log.not_run") and begins.facts["longer"]
     assert 1.0 <= begins.facts["at"] < 1.1  # not where it was switched on
-
-
-@pytest.mark.parametrize("pace", [2.0])
-def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace):
-    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.2)
-    rows = np.loadtxt(path, delimiter=",", skiprows=1)
-    rows[:, 0] = rows[0, 0] + (rows[:, 0] - rows[0, 0]) / pace
-    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(path)
-    assert holds(str(refused.value), "c0002", "stamps", f"by {pace:g}")
-    assert len(w.trials()) == 1
-    named = w.ingest(path, candidate="c0002")
-    assert of_code(named, "log.pace")[0].facts["by"] == pace
 
 
 def test_one_log_is_one_trial(w, tmp_path):

@@ -29,13 +29,13 @@ from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, StoredTrial
-from grounded_trials.workspace.intake.locating.run_start import Recording, recording
 from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
     with_estimates,
 )
+from grounded_trials.workspace.intake.recognising.run_start import Recording, recording
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.where_to_mend import hashed, read_by
 
@@ -226,7 +226,7 @@ class ForeignLog:
     @cached_property
     def anywhere(self) -> Recording | None:
         """The log in which a run may begin anywhere, ignoring [log.span]; None if unusable."""
-        return recording(self.series, self.workspace.task, self.complete, self.whole)
+        return recording(self.series, self.workspace.task, self.whole)
 
     @property
     def spanned(self) -> bool:

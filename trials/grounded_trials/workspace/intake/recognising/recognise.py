@@ -37,11 +37,11 @@ from grounded.trial import Trial
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
-from grounded_trials.workspace.intake.locating.run_start import Recording
 from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short, read_log_file
 from grounded_trials.workspace.intake.opening.foreign import misread
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.recognising.look import Look
+from grounded_trials.workspace.intake.recognising.run_start import Recording
 from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 
@@ -125,7 +125,7 @@ class Case:
             error = self.seen.ran.error if self.seen.ran else 1.0
             return scored(Kind.UNKNOWN, why, self.own, self.whole, error)
         kind = Kind.EARLIER if rival in self.earlier else kind
-        start = log.start_of(rival.policy, only_alike=True) if log else None
+        start = self.look.start_of(rival)
         run = log.trial_from(start.seconds) if log and start and start.alike else None
         fit = run and follows(rival.policy, run.until(rival.policy.horizon), 0)
         if run and fit:

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.accounts.predicted import apart, like_predicted
 from grounded.accounts.returned import (
     NEARLY_ALL,
     Kind,
@@ -25,23 +24,19 @@ from grounded.accounts.returned import (
     stories,
     stories_of,
 )
-from grounded.accounts.sent import EXACT, SLIGHT, follows, latest
-from grounded.findings import found
+from grounded.accounts.sent import EXACT, SLIGHT, apart, follows, latest
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.intake.locating.acted_on import FEW, acted_on, held_before
-from grounded_trials.workspace.intake.locating.run_start import (
+from grounded_trials.workspace.intake.recognising.acted_on import FEW, acted_on, held_before
+from grounded_trials.workspace.intake.recognising.run_start import (
     BATCH,
     TRIED,
     Recording,
     Start,
     least_of,
-    recording,
 )
 
-PACES = (2.0, 0.5)  # rates of a recording that are tried
 APART = 10 * EXACT  # smallest difference of two commands that exact ones tell apart
 MANY = 300_000  # largest number of commands that are computed for a row, roughly
 EACH, ALL = 2, 24  # numbers of instants that are examined for a row, and in all
@@ -62,7 +57,7 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
         some += _from(log, task, own, begins)
     if min((one.commands for one in some), default=0.0) > np.log(APART):
         some += _wherever(log, task, own)
-    return [*some, *_at_other_rates(log, task, own)]
+    return some
 
 
 def _from(log: Recording, task: Task, own: Candidate, begins: float) -> list[Story]:
@@ -164,24 +159,3 @@ def _as_passed(log: Recording, row: Row) -> Recording:
             scaled = replace(spec, scale=spec.scale * row.by, offset=spec.offset * row.by)
             series[name] = replace(series[name], spec=scaled)
     return replace(log, series=series)
-
-
-def _at_other_rates(log: Recording, task: Task, own: Candidate) -> Iterator[Story]:
-    """Yield the rates of a recording at which it is a run: a second of stamps is another time."""
-    for pace in PACES:
-        paced = {name: _paced(one, pace) for name, one in log.logged.items()}
-        other = recording(paced, task, log.complete)
-        begun = other.start_of(own.policy, only_alike=True) if other else None
-        run = other.trial_from(begun.seconds) if other and begun and begun.alike else None
-        fit = run and follows(own.policy, run.until(own.policy.horizon), 0)
-        if run and fit and like_predicted(own, run):  # slow commands fit many policies
-            yield scored(Kind.LOG, found("log.pace", ran=own.id, by=pace), own, run, fit.error)
-
-
-def _paced(series: Series, pace: float) -> Series:
-    """Scale the time between samples by `pace`."""
-    t, log = (
-        at[:1] + np.round((at - at[:1]) * pace).astype(at.dtype)
-        for at in (series.t, series.log_times)
-    )
-    return replace(series, t=t, log_times=log)

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.accounts.predicted import as_planned, like_predicted
-from grounded.accounts.sent import LEAST
+from grounded.accounts.sent import LEAST, as_planned, like_predicted
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.frozen import median

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.accounts.predicted import as_planned
+from grounded.accounts.sent import as_planned
 from grounded.findings import Finding, found
 from grounded.share import STEPS
 from grounded.task import Task

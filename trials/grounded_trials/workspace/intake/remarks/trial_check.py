@@ -98,7 +98,7 @@ def _still(trial: Trial) -> Iterator[Finding]:
 
 def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
     """Yield logged inputs that exceed [limits], which were taken from another log."""
-    from grounded.accounts.inputs import beyond_limits, in_percent, limits_of, span
+    from grounded.accounts.signals import beyond_limits, in_percent, limits_of, span
 
     task, mapping = workspace.task, workspace.log_mapping
     past = np.any(beyond_limits(task, trial.inputs), axis=0)

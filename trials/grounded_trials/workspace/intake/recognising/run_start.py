@@ -14,7 +14,7 @@ respond to where the robot was then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -38,7 +38,7 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.intake.locating.acted_on import acted_on
+from grounded_trials.workspace.intake.recognising.acted_on import acted_on
 
 TRIED = 5  # number of best-fitting instants that are examined
 MISSED = 5  # largest number of first steps that may not have been sent
@@ -50,10 +50,6 @@ SOUGHT = 24  # number of instants at which samples of different ages are tried
 QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
 SHORT = 4  # at least 1 / SHORT of a run must be in the log
 BATCH = 256  # instants compared at once
-UNRELATED = 0.3  # mean difference, relative to an input's size, above which commands aren't alike
-
-# adds the estimated states to the samples of a log
-Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,6 @@ class Recording:
 
     series: Mapping[str, Series]  # of every state and input
     logged: Mapping[str, Series]  # those that were logged, not estimated
-    complete: Complete
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
     dt: float
@@ -136,33 +131,19 @@ class Recording:
         held = np.diff(self.changes, prepend=-np.inf)
         return [float(at) for at in self.changes[held > HELD * self.dt]]
 
-    def start_of(self, policy: Policy, *, only_alike: bool = False) -> Start | None:
-        """Find where a policy's run begins; return None if the log is too short.
-
-        Args:
-            policy: the policy, for the states and inputs of this log.
-            only_alike: look no further for a start from which only the first commands are alike,
-                which takes as long as all the rest.
-        """
+    def start_of(self, policy: Policy) -> Start | None:
+        """Find where a policy's run begins; return None if the log is too short."""
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        wanted = self._related(policy) if only_alike else None
-        apart, strays = instants_apart(self.whole, self.parts, policy, wanted)
+        apart, strays = instants_apart(self.whole, self.parts, policy)
         whole = self._starts(policy, apart)
         if (found := self._surest(policy, whole)) is None:
             few = np.where(strays < 0.5, strays, np.inf)
             begun = [one for one in self._starts(policy, few) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
-        if not only_alike and (found is None or not found.alike):
+        if found is None or not found.alike:
             found = self._by_its_samples(policy, strays) or found
         return self._before_first(policy, found) or found
-
-    def _related(self, policy: Policy) -> list[int]:
-        """Return the instants from which the first commands are not those of something else."""
-        least, count = least_of(policy.horizon), len(self.whole.inputs)
-        enough = [k for k in range(count) if k + self.parts * (least - 1) < count]
-        begun = _off(self.whole, self.parts, policy.until(least), enough)
-        return [int(k) for ks, off, _ in begun for k in ks[off.mean(axis=1) < UNRELATED]]
 
     def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
         """Choose among likely starts where most commands are the policy's; None if there is none.
@@ -354,18 +335,15 @@ def _close(policy: Policy, trial: Trial) -> bool:
 def recording(
     logged: Mapping[str, Series],
     task: Task,
-    complete: Complete,
-    series: Mapping[str, Series] | None = None,
+    series: Mapping[str, Series],
 ) -> Recording | None:
     """Return a log in which a run may begin anywhere, or None if it can't be sampled.
 
     Args:
         logged: its samples.
         task: the task with the control step and the horizon.
-        complete: adds the estimated states to the samples.
-        series: the completed samples, if they are known already.
+        series: the same with the estimated states.
     """
-    series = complete(logged) if series is None else series
     model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
     every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
@@ -386,7 +364,6 @@ def recording(
     return Recording(
         series,
         logged,
-        complete,
         names,
         model.angles,
         dt,
