@@ -9,7 +9,7 @@ import pytest
 
 from facts import of_code
 from grounded_trials import Workspace
-from grounded_trials.workspace.intake.recognising import run_start
+from grounded_trials.workspace.intake.opening import run_start
 from recorded import RATE, record, waiting
 
 

@@ -17,7 +17,7 @@ from grounded.policy import Policy
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening import cutting
-from grounded_trials.workspace.intake.recognising.run_start import recording
+from grounded_trials.workspace.intake.opening.run_start import recording
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
 

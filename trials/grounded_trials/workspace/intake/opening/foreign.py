@@ -35,7 +35,7 @@ from grounded_trials.workspace.intake.opening.estimating import (
     read_estimate,
     with_estimates,
 )
-from grounded_trials.workspace.intake.recognising.run_start import Recording, recording
+from grounded_trials.workspace.intake.opening.run_start import Recording, recording
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.where_to_mend import hashed, read_by
 

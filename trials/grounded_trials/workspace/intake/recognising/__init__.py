@@ -1,8 +1,7 @@
 """Check whether a log is the run of its candidate, and if not, what it is instead.
 
 Read `recognise.py` first: the stories of a log, the judge's choice, and how each is refused.
-`grounded.accounts.returned` has the terms by which all are scored. `run_start.py` finds where a run
-begins in a log, on the samples that the robot's program had when it sent a command (`acted_on.py`);
-`look.py` cuts it there, judges which candidate sent its commands, and finds falls;
-`stories_of_log.py` asks the table wherever the run may begin.
+`grounded.accounts.returned` has the terms by which all are scored. `look.py` cuts the run from the
+log, judges which candidate sent its commands, and finds falls; `stories_of_log.py` asks the table
+wherever the run may begin.
 """

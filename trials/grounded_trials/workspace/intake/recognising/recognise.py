@@ -40,8 +40,8 @@ from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short, read_log_file
 from grounded_trials.workspace.intake.opening.foreign import misread
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
+from grounded_trials.workspace.intake.opening.run_start import Recording
 from grounded_trials.workspace.intake.recognising.look import Look
-from grounded_trials.workspace.intake.recognising.run_start import Recording
 from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 

@@ -28,8 +28,8 @@ from grounded.accounts.sent import EXACT, SLIGHT, apart, follows, latest
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.intake.recognising.acted_on import FEW, acted_on, held_before
-from grounded_trials.workspace.intake.recognising.run_start import (
+from grounded_trials.workspace.intake.opening.acted_on import FEW, acted_on, held_before
+from grounded_trials.workspace.intake.opening.run_start import (
     BATCH,
     TRIED,
     Recording,

@@ -38,7 +38,7 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.intake.recognising.acted_on import acted_on
+from grounded_trials.workspace.intake.opening.acted_on import acted_on
 
 TRIED = 5  # number of best-fitting instants that are examined
 MISSED = 5  # largest number of first steps that may not have been sent

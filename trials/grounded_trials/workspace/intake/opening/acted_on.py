@@ -28,7 +28,7 @@ from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.samples import Samples, tidy
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.intake.recognising.run_start import Recording
+    from grounded_trials.workspace.intake.opening.run_start import Recording
 
 OLDEST = 2.0  # largest age of a sample, in steps
 AGES = 128  # largest number of ages tried per topic
