@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 BATCH = ("x", "u", "p", "dt", "eps", "N", "out", "f_x", "f_u", "f_p")
+MARCH = (*BATCH, "steps", "lengths")
 ROLLOUT = (
     *("start", "ubar", "K", "zbar", "k", "alphas", "p", "dt", "eps", "bias", "target", "weight"),
     *("shift", "input_target", "R", "S", "low", "high", "now", "past", "H", "runs", "z", "u"),

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer
 from grounded.compile.emit.llvm_transpose import columns_of
-from grounded.compile.kernel_words import BATCH
+from grounded.compile.kernel_words import BATCH, MARCH
 
 
 class Words:
@@ -38,6 +38,15 @@ class Words:
     def double(self, name: str) -> str:
         """A double."""
         return self.f.emit(f"load double, ptr {self._address(name)}, align 8")
+
+    def set(self, name: str, value: str) -> None:
+        """Change a word: a double."""
+        self.f.do(f"store double {value}, ptr {self._address(name)}, align 8")
+
+    def move(self, name: str, by: str) -> None:
+        """Move an array's address on, by a number of bytes."""
+        moved = self.f.integer("add", self.integer(name), by)
+        self.f.do(f"store i64 {moved}, ptr {self._address(name)}, align 8")
 
 
 def start_table(f: Writer, words: Words, d: Dynamics) -> str:
@@ -105,6 +114,22 @@ def step_kernel(d: Dynamics, width: int) -> str:
 
     arrays = [(x, d.n, writer.x), (u, d.m, writer.u)]
     _each_sample(f, arrays, words, width, writer.step, scatter)
+    f.do("ret void")
+    return f.text()
+
+
+def march_kernel(d: Dynamics) -> str:
+    """`void @march(words)`: steps one after the other, out (T, N, n); uses up its words."""
+    f = Writer("void @march(ptr %words)")
+    words = Words(f, MARCH)
+    lengths, rows = words.pointer("lengths"), f.integer("mul", words.integer("N"), 8)
+    sizes = {"x": d.n, "out": d.n, "u": d.m}
+    bytes_of = {name: f.integer("mul", rows, size) for name, size in sizes.items()}
+    with f.loop(words.integer("steps")) as t:
+        words.set("dt", f.load(lengths, t))
+        f.do("call void @step(ptr %words)")
+        for name, size in bytes_of.items():
+            words.move(name, size)
     f.do("ret void")
     return f.text()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from grounded.compile.emit.llvm_batch import linearise_kernel, step_kernel
+from grounded.compile.emit.llvm_batch import linearise_kernel, march_kernel, step_kernel
 from grounded.compile.emit.llvm_box import box_functions
 from grounded.compile.emit.llvm_descent import descent_kernel
 from grounded.compile.emit.llvm_product import sweep_tables
@@ -41,10 +41,10 @@ class Source:
         if isinstance(which, Layout):
             return self._search(d, which, width)
         if not self.derivatives:
-            return _start(d, width) + step_kernel(d, width)
+            return _start(d, width) + step_kernel(d, width) + march_kernel(d)
         columns = k if which == "full" else 0
         text = _start(d, width) + jacobian_function(d, width) + linearise_kernel(d, width, columns)
-        return text if which == "full" else text + step_kernel(d, width)
+        return text if which == "full" else text + step_kernel(d, width) + march_kernel(d)
 
     def _dynamics(self, columns: int) -> Dynamics:
         n, m, _ = self.sizes

@@ -13,6 +13,7 @@ import hashlib
 import struct
 import threading
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from grounded.compile.kernel_words import (
     DESCENT,
     FAILED_AT,
     LANES,
+    MARCH,
     MAX_INPUTS,
     ROLLOUT,
     SWEEP,
@@ -59,7 +61,7 @@ from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
 Words = ctypes.c_int64 * len(BATCH)
-RESULTS, LENGTH = BATCH[6:], BATCH.index("dt")
+RESULTS = BATCH[6:]
 POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
@@ -85,7 +87,7 @@ class Kernels:
     def batch(self) -> jit.Library:
         """Step and, unless derivatives are left out, linearise, of many samples."""
         more = ("linearise", "jacobian") if self._derivatives else ()
-        return self._library("batch", ("step", *more))
+        return self._library("batch", ("step", "march", *more))
 
     def search(self, layout: Layout) -> jit.Library:
         """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
@@ -155,20 +157,15 @@ class CompiledSystem(TracedSystem):
         steps, u, p = len(u), plain(u), plain(p)
         z = np.empty((steps + 1, *x.shape))
         z[0] = x
-        at = {"x": address(z), "u": word(u), "p": word(p), "out": address(z[1:]) if steps else 0}
-        at |= {"eps": word(0.0), "N": len(x)}
-        words = (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH])
-        lengths = np.broadcast_to(dt, steps).tolist() if len(x) else []
-        of_length = {h: (word(h), self._compiled(p, h).batch()["step"]) for h in set(lengths)}
-        each = [
-            (BATCH.index(k), 8 * len(x) * w)
-            for k, w in (("x", self.n), ("out", self.n), ("u", self.m))
-        ]
-        for length in lengths:
-            words[LENGTH], kernel = of_length[length]
-            run(kernel, words)
-            for i, size in each:
-                words[i] += size
+        lengths = plain(np.broadcast_to(dt, steps))
+        each = lengths.tolist() if len(x) else []
+        of_length, t = {h: self._compiled(p, h) for h in set(each)}, 0
+        for kernels, stretch in groupby(each, of_length.__getitem__):
+            count = sum(1 for _ in stretch)
+            at = {"x": z[t], "u": u[t], "p": p, "out": z[t + 1], "eps": 0.0}
+            at |= {"N": len(x), "steps": count, "lengths": lengths[t:]}
+            run(kernels.batch()["march"], table(MARCH, {}, at))
+            t += count
         return z
 
     def slopes(self, at: Samples) -> tuple[Array, Array]:
