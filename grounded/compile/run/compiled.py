@@ -52,7 +52,6 @@ from grounded.compile.run.arguments import (
     run,
     side_by_side,
     table,
-    word,
     zeros,
 )
 from grounded.compile.run.traced import TracedSystem
@@ -160,8 +159,12 @@ class CompiledSystem(TracedSystem):
         lengths = plain(np.broadcast_to(dt, steps))
         each = lengths.tolist() if len(x) else []
         of_length, t = {h: self._compiled(p, h) for h in set(each)}, 0
-        for kernels, stretch in groupby(each, of_length.__getitem__):
-            count = sum(1 for _ in stretch)
+        of_step = map(of_length.__getitem__, each)
+        if len({*map(id, of_length.values())}) > 1:
+            stretches = [(kernels, len(list(some))) for kernels, some in groupby(of_step)]
+        else:
+            stretches = [(kernels, steps) for kernels in [*of_length.values()][:1]]
+        for kernels, count in stretches:
             at = {"x": z[t], "u": u[t], "p": p, "out": z[t + 1], "eps": 0.0}
             at |= {"N": len(x), "steps": count, "lengths": lengths[t:]}
             run(kernels.batch()["march"], table(MARCH, {}, at))
