@@ -70,10 +70,19 @@ class Loads(NamedTuple):
 
 
 def step_with(
-    pairs: Pairs, s: Any, a: Named, dt: Any, step: Callable[[Named], Any], moved: Integrated
+    pairs: Pairs,
+    s: Any,
+    a: Named,
+    dt: Any,
+    steps: tuple[Callable[[Named], Any], Callable[[Named], Any]],
+    moved: Integrated,
 ) -> dict[str, Any]:
-    """Return the next state by name under losses of the inputs `a`; step(a) -> next state."""
-    at, given = loads(pairs, s, a, step), dict(a)
+    """Return the next state by name under losses of the inputs `a`.
+
+    steps: step(a) -> next state; the same where inputs are held over it, to solve the losses from.
+    """
+    (step, held), given = steps, dict(a)
+    at = loads(pairs, s, a, held)
     losses = solved(pairs, at, dt)
     for (effect, _), loss in zip(pairs, losses, strict=True):
         name = coupled(effect.site)[0]

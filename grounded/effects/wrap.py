@@ -297,13 +297,19 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
     """Add a loss, solved together with those that the model already has."""
     model = effect.site.model
     inner, others = getattr(model.step, "losing", (model, ()))
-    base, effects, moved = plain_step(inner), (*others, effect), integrated(inner)
+    bare = getattr(inner.step, "bare", inner)
+    bases, effects, moved = (
+        [plain_step(inner), plain_step(bare)],
+        (*others, effect),
+        integrated(bare),
+    )
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, given = own_state(inner, s), _replaced(inner, a, {})
         kept = [{z: s[memory_name(e, z)] for z in _loss(e).memory(e.site)} for e in effects]
         pairs = [(e, quantities_of(e, p) | z) for e, z in zip(effects, kept, strict=True)]
-        return step_with(pairs, start, given, dt, lambda u: base(start, u, p, dt), moved)
+        step, held = ((lambda u, base=base: base(start, u, p, dt)) for base in bases)
+        return step_with(pairs, start, given, dt, (step, held), moved)
 
     vars(step)["losing"] = (inner, effects)
     memory = _loss(effect).memory(effect.site)
@@ -373,7 +379,8 @@ def _clocks(effects: Sequence[Effect]) -> list[str]:
 
 def _instant(model: Model) -> Step:
     """Return the model's instantaneous rates: its derivative, or the mean over a short step."""
-    derivative, base = model.derivative, plain_step(model)
+    bare = getattr(model.step, "bare", model)
+    derivative, base = bare.derivative, plain_step(bare)
 
     def rates(s: Any, a: Any, p: Any, dt: Any) -> Any:
         h = 1e-3 * dt

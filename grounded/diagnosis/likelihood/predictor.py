@@ -78,7 +78,7 @@ class Predictor(SentOnce):
     _remembered: Cache = field(default_factory=lambda: Cache(400_000, least=8))
     _weights: dict[str, Cache] = field(default_factory=dict)
     _alike: dict[Any, list[tuple[Any, Array, Array]]] = field(default_factory=dict)
-    marches: dict[tuple[str, ...], March | None] = field(default_factory=dict)
+    marches: dict[Any, March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
     @cached_property

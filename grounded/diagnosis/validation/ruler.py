@@ -495,12 +495,12 @@ def _marched(
 
     x (M, n), sent (steps, M, m or 2 m), t (M,): states, received inputs and times at the start.
     """
-    found, whole = np.empty((len(sent) + 1, *x.shape)), sent.shape[-1] == predictor.data.model.m
+    found = np.empty((len(sent) + 1, *x.shape))
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])
         if z is not None and not (np.abs(z) < FAR).all():
             return None
-        if z is None and whole:
+        if z is None:
             z = marched(predictor, h, x[own], sent[:, own], t[own])
         if z is None:
             return None
