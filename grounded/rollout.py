@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -129,14 +130,7 @@ def stepper(model: Model, p: Array, dt: float) -> Callable[[Array, Array], Array
     together = getattr(model.step, "rows", None)  # simulators step all rows at once
     if together is not None:
         return lambda x, u: np.asarray(together(x, u, p, dt))
-    alike: dict[bytes, list[slice]] = {}
-    edges = np.flatnonzero((p[1:] != p[:-1]).any(axis=1)) + 1
-    for first, end in itertools.pairwise([0, *edges.tolist(), len(p)]):
-        alike.setdefault(p[first].tobytes(), []).append(slice(first, end))
-    groups = [
-        (parts[0] if len(parts) == 1 else np.r_[tuple(parts)], p[parts[0].start])
-        for parts in alike.values()
-    ]
+    groups = equal_rows(p)
 
     def stepped(x: Array, u: Array) -> Array:
         after = np.empty_like(x)
@@ -145,6 +139,18 @@ def stepper(model: Model, p: Array, dt: float) -> Callable[[Array, Array], Array
         return after
 
     return stepped
+
+
+def equal_rows(table: Array) -> list[tuple[Any, Array]]:
+    """Return the different rows (k,) of a table (N, k), each with where it stands."""
+    alike: dict[bytes, list[slice]] = {}
+    edges = np.flatnonzero((table[1:] != table[:-1]).any(axis=1)) + 1
+    for first, end in itertools.pairwise([0, *edges.tolist(), len(table)]):
+        alike.setdefault(table[first].tobytes(), []).append(slice(first, end))
+    return [
+        (parts[0] if len(parts) == 1 else np.r_[tuple(parts)], table[parts[0].start])
+        for parts in alike.values()
+    ]
 
 
 def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:

@@ -62,7 +62,7 @@ from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.places import integrated, outright_states, partner
-from grounded.rollout import each_stepped
+from grounded.rollout import each_stepped, equal_rows
 
 TOGETHER = 6000  # rows of states that are stepped at once
 
@@ -77,7 +77,6 @@ class Predictor(SentOnce):
     _loads: Cache = field(default_factory=lambda: Cache(32_000))
     _remembered: Cache = field(default_factory=lambda: Cache(400_000, least=8))
     _weights: dict[str, Cache] = field(default_factory=dict)
-    _alike: dict[Any, list[tuple[Any, Array, Array]]] = field(default_factory=dict)
     marches: dict[Any, March | None] = field(default_factory=dict)
     _taken: Slopes | None = None
 
@@ -240,8 +239,8 @@ class Predictor(SentOnce):
     def each_next(self, hypotheses: Sequence[Hypothesis], track: Array) -> Array:
         """Return a step of each of K hypotheses with the same effects along a track, (K, L, B, n).
 
-        Those with the same parameters and parts of a step are the rows of one array, as many as fit
-        into the cache: for short logs, calls take longer than what they compute.
+        They are the rows of one array, as many as fit into the cache: for short logs, calls take
+        longer than what they compute.
 
         Args:
             hypotheses: the hypotheses.
@@ -251,24 +250,17 @@ class Predictor(SentOnce):
         x = [self.remembered(h, track)[:-1] for h in hypotheses]
         u = [self.inputs(h) for h in hypotheses]
         found, rows = np.empty((len(x), *data.time.shape, data.model.n)), data.time.size
-        groups = dict[Any, list[int]]()
-        for i, h in enumerate(hypotheses):
-            parts = delayed(self.acting(h), data) if self.divisible else None
-            alike = self.params(h).tobytes(), b"" if parts is None else parts.tobytes()
-            groups.setdefault(i if simulated(data.model) else alike, []).append(i)
-        most = max(1, TOGETHER // rows)
-        for every in groups.values():
-            for some in (every[at : at + most] for at in range(0, len(every), most)):
-                own = by_row([hypotheses[i] for i in some], np.repeat(range(len(some)), rows))
-                if len(some) == 1:
-                    found[some[0]] = self.advance(own, x[some[0]], u[some[0]], data.time)
-                    continue
-                starts = np.concatenate([self.widened(hypotheses[i], x[i]) for i in some])
-                sent = np.concatenate([u[i] for i in some])
-                starts, sent = (a.reshape(-1, a.shape[-1]) for a in (starts, sent))
-                after = self.advance(own, starts, sent, np.tile(data.time.reshape(-1), len(some)))
-                after = after[:, : data.model.n]
-                found[some] = after.reshape(len(some), *found.shape[1:])
+        most = 1 if simulated(data.model) else max(1, TOGETHER // rows)
+        for some in (range(at, min(at + most, len(x))) for at in range(0, len(x), most)):
+            own = by_row([hypotheses[i] for i in some], np.repeat(range(len(some)), rows))
+            if len(some) == 1:
+                found[some[0]] = self.advance(own, x[some[0]], u[some[0]], data.time)
+                continue
+            starts = np.concatenate([self.widened(hypotheses[i], x[i]) for i in some])
+            sent = np.concatenate([u[i] for i in some])
+            starts, sent = (a.reshape(-1, a.shape[-1]) for a in (starts, sent))
+            after = self.advance(own, starts, sent, np.tile(data.time.reshape(-1), len(some)))
+            found[some] = after[:, : data.model.n].reshape(len(some), *found.shape[1:])
         return found
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
@@ -397,22 +389,11 @@ class Predictor(SentOnce):
         if parts.ndim == p.ndim == 1:
             return self.logged(h, x, self._in_parts(x, u, p, parts))
         found = np.empty_like(x)
-        for own, its_p, its_parts in self._groups(p, parts, len(x)):
-            found[own] = self._in_parts(x[own], u[own], its_p, its_parts)
+        k, rows = p.shape[-1], len(x)
+        each = np.hstack([np.broadcast_to(one, (rows, one.shape[-1])) for one in (p, parts)])
+        for own, row in equal_rows(each):
+            found[own] = self._in_parts(x[own], u[own], row[:k], row[k:])
         return self.logged(h, x, found)
-
-    def _groups(self, p: Array, parts: Array, rows: int) -> list[tuple[Any, Array, Array]]:
-        """Return the rows with the same parameters and parts of a step, with these; cached."""
-        key = (rows, p.tobytes(), parts.tobytes())
-        if key not in self._alike:
-            self._alike.clear()
-            both = np.hstack([np.broadcast_to(one, (rows, one.shape[-1])) for one in (p, parts)])
-            each, which = np.unique(both, axis=0, return_inverse=True)
-            k = p.shape[-1]
-            self._alike[key] = [
-                (np.flatnonzero(which == i), row[:k], row[k:]) for i, row in enumerate(each)
-            ]
-        return self._alike[key]
 
     def _in_parts(self, x: Array, u: Array, p: Array, parts: Array) -> Array:
         """Step with inputs u (..., 2 m) that change once within it, after `parts` of it (m,)."""
