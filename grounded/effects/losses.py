@@ -37,7 +37,7 @@ import numpy as np
 
 from grounded.compile import System, system_of
 from grounded.compile.names import Named
-from grounded.effects.drive import speed
+from grounded.effects.drive import push, speed
 from grounded.effects.family import Effect, LossFamily, coupled
 from grounded.effects.plain_step import param_name
 from grounded.frozen import Array
@@ -90,11 +90,23 @@ def step_with(
     after = dict(step(Named("input", tuple(given), list(given.values()))))
     more = ahead(pairs, at, losses, dt, moved)
     after |= {q: after[q] + by for q, by in more.items()}
-    for i, (effect, c) in enumerate(pairs):
-        end, gain = speed(effect, after), at.gain[i][i]
-        kept = _family(effect).later(at.w[i], end, gain, at.u[i], c, dt)
-        after |= {memory_name(effect, name): value for name, value in kept.items()}
-    return after
+    return after | remembered(pairs, s, after, a, dt)
+
+
+def remembered(pairs: Pairs, s: Any, after: Any, a: Any, dt: Any) -> dict[str, Any]:
+    """Return the memories of losses by name after a step from s to `after`; `pairs` has those of s.
+
+    They follow from how the speeds went, whatever moved them. What a unit of the input adds to a
+    speed is a median: it only tells how the speed went within the step.
+    """
+    found = dict[str, Any]()
+    for effect, c in pairs:
+        if names := _family(effect).memory(effect.site):
+            gain = push(effect.site.model, effect.site.joined) * dt
+            ends, u = (speed(effect, s), speed(effect, after)), a[coupled(effect.site)[0]]
+            kept = _family(effect).later(*ends, gain, u, c, dt)
+            found |= {memory_name(effect, name): kept[name] for name in names}
+    return found
 
 
 def loads(

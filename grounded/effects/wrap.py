@@ -51,7 +51,7 @@ from grounded.effects.family import (
     braked,
     coupled,
 )
-from grounded.effects.losses import memory_name, step_with
+from grounded.effects.losses import memory_name, remembered, step_with
 from grounded.effects.medium import medium_of, over_ground, through_it
 from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
@@ -306,14 +306,19 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, given = own_state(inner, s), _replaced(inner, a, {})
-        kept = [{z: s[memory_name(e, z)] for z in _loss(e).memory(e.site)} for e in effects]
-        pairs = [(e, quantities_of(e, p) | z) for e, z in zip(effects, kept, strict=True)]
+        pairs = _remembering(effects, s, p)
         step, held = ((lambda u, base=base: base(start, u, p, dt)) for base in bases)
         return step_with(pairs, start, given, dt, (step, held), moved)
 
     vars(step)["losing"] = (inner, effects)
     memory = _loss(effect).memory(effect.site)
     return step, {memory_name(effect, z): unit for z, unit in memory.items()}
+
+
+def _remembering(effects: Sequence[Effect], s: Any, p: Any) -> list[tuple[Effect, dict[str, Any]]]:
+    """Return losses with their quantities and memories."""
+    each = ((e, quantities_of(e, p), _loss(e).memory(e.site)) for e in effects)
+    return [(e, c | {z: s[memory_name(e, z)] for z in names}) for e, c, names in each]
 
 
 def _loss(effect: Effect) -> LossFamily:
@@ -343,6 +348,7 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     soft, dry = ([e for e in rates if _family(e).dry == one] for one in (False, True))
     needs_own = any(_family(e).needs_own for e in rates)
     tied = {n: k for n in model.state_names if (k := partner(model, n))}
+    losing = getattr(model.step, "losing", (model, ()))[1]
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, now = own_state(model, s), {z: s[z] for z in clocks}
@@ -357,7 +363,7 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
             for n, rate in _added(dry, after, a, own, then, p, dt).items():
                 last[n] = last[n] + rate if n in last else rate
         final = _kicked(after, last, dt)
-        result = dict(final)
+        result = dict(final) | remembered(_remembering(losing, start, p), start, final, a, dt)
         for n, k in tied.items():  # a carried heading rate is the heading's, effects included
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)
             before = _added(effects, start, a, first, now, p, dt).get(n, 0.0)
