@@ -153,31 +153,22 @@ def errors_line(d: Diagnosis, now: str, before: str) -> Iterator[Finding]:
 def open_line(d: Diagnosis) -> Iterator[Finding]:
     """What no known effect explains, or else where the gap is."""
     if d.leftover:
-        left, others = d.leftover[0], len(d.leftover) - 1
-        place = None if left.region is None else left.region.told
+        left, place = d.leftover[0], None
+        if left.region is not None and not left.part:
+            place = left.region.told
+        facts: dict[str, Any] = {"others": len(d.leftover) - 1, "place": place}
         if not math.isfinite(left.error) or (not left.above and math.isfinite(left.size)):
             size = Quantity(left.size, left.unit) if math.isfinite(left.size) else None
-            yield found("gap.left", left.channel, rate=left.channel, size=size, place=place,
-                        others=others)  # fmt: skip
-            return
-        noise = Quantity(left.floor, left.error_unit) if 0 < left.floor < math.inf else None
-        facts: dict[str, Any] = (
-            {} if left.part is None else {"part": left.part.share, "trial": left.part.trial}
-        )
-        yield found(
-            "gap.left",
-            left.channel,
-            state=left.channel,
-            error=Quantity(left.error, left.error_unit),
-            ahead=left.horizon_s,
-            noise=noise,
-            bound="yes" if left.floor_at_most else "no",
-            place=None if left.part else place,
-            others=others,
-            **facts,
-        )
+            facts |= {"rate": left.channel, "size": size}
+        else:
+            noise = Quantity(left.floor, left.error_unit) if 0 < left.floor < math.inf else None
+            facts |= {"error": Quantity(left.error, left.error_unit), "ahead": left.horizon_s}
+            facts |= {"state": left.channel, "noise": noise}
+            facts |= {"bound": "yes" if left.floor_at_most else "no"}
+            if left.part is not None:
+                facts |= {"part": left.part.share, "trial": left.part.trial}
+        yield found("gap.left", left.channel, **facts)
         return
-    # NaN: only noise
     channels = [one for one in d.where.channels if SHOWS <= one.share < math.inf]  # NaN: only noise
     if not channels:
         return

@@ -47,7 +47,6 @@ AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
 AGAIN = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
-ANSWER_S = 1.0  # [s] most time for errors of predictions in the answer to Ctrl-C
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 

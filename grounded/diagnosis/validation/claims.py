@@ -179,27 +179,21 @@ class Claims:
         that are equivalent with other values of these. For parameters that are off, they are
         effects that are equivalent or as likely alone.
         """
-        found = []
-        for blame in self.blamed[:2]:
-            own = f"parameter:{self.data.model.param_names[blame.index]}"
-            related_ = (e.name for e in self.search.candidates if related(self._effect(own), e))
-            if same := [name for name in related_ if self._twins(own, name)]:
-                found.append((own, *same[:2]))
+        names, found = self.data.model.param_names, list[tuple[str, ...]]()
+        for own in (f"parameter:{names[blame.index]}" for blame in self.blamed[:2]):
+            near = (e.name for e in self.search.candidates if related(self._effect(own), e))
+            found.append((own, *[name for name in near if self._twins(own, name)][:2]))
         said = {name for group in found for name in group}
-        as_likely = [
-            names[0]
-            for (_, spread, names), f in self.search.fits.items()
-            if self.blamed and len(names) == 1 and spread == 0 and not parametric(f)
-            if names[0] not in said and self._as_likely(f)
+        exact = [
+            f
+            for (_, spread, some), f in self.search.fits.items()
+            if len(some) == 1 and spread == 0 and some[0] not in said and not parametric(f)
         ]
-        if as_likely:
-            first = self.data.model.param_names[self.blamed[0].index]
-            found.append((f"parameter:{first}", *dict.fromkeys(as_likely[:2])))
-        for name in self.names:
-            others = [other for other, _ in self.rivals(name)]
-            if others:
-                found.append((name, *others))
-        return tuple(found)
+        for blame in self.blamed[:1]:
+            same = dict.fromkeys(f.hypothesis.names[0] for f in exact if self._as_likely(f))
+            found.append((f"parameter:{names[blame.index]}", *list(same)[:2]))
+        found += [(name, *(other for other, _ in self.rivals(name))) for name in self.names]
+        return tuple(group for group in found if len(group) > 1)
 
     def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
         """Return the groups that are equivalent in the model, which no trial can separate."""
@@ -252,35 +246,24 @@ class Claims:
         Equivalent effects differ only in the integration of a step, but over hundreds of steps that
         adds up to nats. They tie if their priors (mainly those of the parameters) do.
         """
-        score, best = self.search.score, self.best
+        score, best, b = self.search.score, self.best, self.search.tempering.factor
         if score(best) - score(fit) < NATS:
-            return self._not_refused(fit)
-        b = self.search.tempering.factor
+            return self._as_likely(fit)
         known, other_known = (score(f) - b * f.loglik for f in (best, fit))
-        return abs(known - other_known) < NATS and self._one_thing(name, other)
+        alike = (name, other) in {(one.effect, one.like) for one in self.alike}
+        return alike and abs(known - other_known) < NATS and self._twins(name, other)
 
     def _as_likely(self, fit: Fitted) -> bool:
         """Check whether a fit is as likely as the claim, or likelier and predicts as well."""
-        return self.search.score(self.best) - self.search.score(fit) < NATS and self._not_refused(
-            fit
-        )
-
-    def _not_refused(self, fit: Fitted) -> bool:
-        """Check that a fit is no likelier than the claim, or that predictions don't refuse it."""
-        likelier = self.search.score(fit) - self.search.score(self.best) > NATS
-        refused = likelier and self.ruler.held_out
-        return not (refused and self.ruler.gain(fit, self.best).clear)
-
-    def _one_thing(self, name: str, other: str) -> bool:
-        """Check whether two effects are equivalent with other values of the free parameters."""
-        return (name, other) in {(o.effect, o.like) for o in self.alike} and self._twins(
-            name, other
-        )
+        more = self.search.score(fit) - self.search.score(self.best)
+        refused = more > NATS and self.ruler.held_out and self.ruler.gain(fit, self.best).clear
+        return more > -NATS and not refused
 
     def _twins(self, name: str, other: str) -> bool:
-        """Check the same of two that explain the data, though their own signals may be opposite.
+        """Check whether two effects are equivalent with other values of the free parameters.
 
-        A weaker right thruster is a stronger left one with less thrust of both.
+        Their own signals may be opposite: a weaker right thruster is a stronger left one with less
+        thrust of both.
         """
         key = name, other
         if key not in self._same:
