@@ -25,7 +25,6 @@ WILD = 10.0  # times what others miss, or what was measured: no repeat, no predi
 
 # shares
 HALF = 0.5  # of a whole, from which a part is most of it ("Leftover")
-SAME = 0.95  # of a signal, from which two effects can't be told apart ("Look-alikes")
 ALIKE = 0.2  # relative difference of numbers that may be one, of lengths of repeats ("Values")
 WELL = 0.02  # +- relative to a value, below which it is well known ("Values")
 ROUNDING = 1e-9  # relative difference that is none

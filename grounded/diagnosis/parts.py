@@ -116,7 +116,7 @@ class Ranked(Document):
 
 @dataclass(frozen=True, eq=False)
 class Likeness(Document):
-    """A candidate that reproduces a share of a claimed effect's signal."""
+    """A candidate that gains a share of what a claimed effect gains; 1: no log tells them apart."""
 
     effect: str
     like: str

@@ -16,7 +16,7 @@ from grounded.diagnosis.causes import (
     value_called,
 )
 from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most, open_noise
-from grounded.diagnosis.levels import ALIKE, HALF, SAME, SURE
+from grounded.diagnosis.levels import ALIKE, HALF, SURE
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.findings import Finding, Quantity, Weight, found
@@ -51,11 +51,8 @@ def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterat
         own = not first.startswith("parameter:")  # a fit writes these
         yield found(code, *group, effect=first, others=tuple(others), own=own)
     for one in d.lookalikes:
-        if one.share > SAME:
-            nearly = one.share < 1.0
-            yield found(
-                "gap.equivalent", one.effect, effect=one.effect, others=(one.like,), nearly=nearly
-            )
+        if one.share == 1.0:
+            yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
     for seen in d.unconfirmed:
         yield found(
             "gap.unconfirmed",

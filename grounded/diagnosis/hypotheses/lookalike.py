@@ -2,18 +2,13 @@
 
 **Look-alikes** produce nearly the same signal in these trials. Evidence may come from a few
 moments: a dead zone and a dry friction are the same constant force while the car rolls, and differ
-only where it stands. So in addition to ties (explanations within a few nats), the look-alikes of
-each claimed effect are compared by their signals. The signal of an effect is
-
-    s = whitened (f with the effect - f without it)
-
-with the part that the other effects can absorb projected out, at the calibrated parameters. A
-candidate whose best values reproduce most of |s|^2 is named with that share, whatever its evidence.
+only where it stands. So in addition to ties (explanations within a few nats), a candidate is named
+that by the scan would gain most of what a claimed effect gains, in its place.
 
 **Twins** equal it with other values of free parameters: (c - w)/0.137 - 0.97 w is
 (0.88 c - w)/0.121. The search gives up losing hypotheses before they converge, and often fits them
 under another noise. So each look-alike is put in its effect's place, starting from the noise and
-the shifts of the best fit, and fitted to convergence before ties are decided (`swap`). Twins still
+the shifts of the best fit, and fitted to convergence before ties are decided. Twins still
 differ by some nats because of the time discretisation: half of a friction acts before a step and
 half after it, while a gain acts during the whole step. So two effects whose rates are equal at all
 states and inputs, and which predict equally well, tie whatever their evidence (`Claims.rivals`),
@@ -32,15 +27,12 @@ from dataclasses import replace
 import numpy as np
 
 from grounded import places
-from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.hypotheses.scan import scan_candidates
-from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch
-from grounded.diagnosis.levels import ROUNDING
+from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSearch, Start
+from grounded.diagnosis.levels import NATS, ROUNDING
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
-from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.parts import Likeness
@@ -53,31 +45,50 @@ from grounded.effects import (
     SensorFamily,
     one_friction,
 )
-from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model
 
-NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
+NEARLY = 0.75  # share of an effect's gain from which a look-alike is named
 IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects may differ
 MOST = 3  # most look-alikes named per effect
 
 
-def lookalikes(
-    predictor: Predictor, fit: Fitted, candidates: Sequence[Effect]
-) -> tuple[Likeness, ...]:
-    """Return the look-alikes that reproduce nearly all of a claimed effect's signal, best first.
+def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
+    """Return the look-alikes of each effect of a fit, best first.
+
+    If parameters are free, each is fitted in its effect's place, unless it already converged there.
 
     Args:
-        predictor: evaluates hypotheses on the data.
-        fit: the fit with the claimed effects.
-        candidates: effects that may be look-alikes.
+        search: has the candidates, and stores the fits.
+        best: the fit with the claimed effects.
     """
-    found: list[Likeness] = []
-    for effect in fit.hypothesis.effects:
-        own = [c for c in candidates if related(effect, c) and c.name not in fit.hypothesis.names]
-        if fit.hypothesis.spread > 0:
+    h, found, starts = best.hypothesis, list[Likeness](), list[Start]()
+    for effect in h.effects:
+        own = [c for c in search.candidates if related(effect, c) and c.name not in h.names]
+        if h.spread > 0:
             own = [c for c in own if not isinstance(c.family, ParamFamily)]
-        found += _likely(predictor, fit, effect, own)
+        if not own:
+            continue
+
+        # what each would gain beside the other effects, as a share of what this one does
+        rest, less = h.minus(effect.name), search.without(best, effect.name)
+        whole, *looks = scan_candidates(search.predictor, less, [effect, *own])
+        shares = [look.gain / max(whole.gain, NATS) for look in looks]
+        near = sorted(zip(shares, looks, strict=True), key=lambda pair: -pair[0])[:MOST]
+        for share, look in near:
+            if not (share > NEARLY and look.values):
+                continue
+            found.append(Likeness(effect.name, look.effect.name, min(share, 1 / share)))
+            names = tuple(sorted((*rest.names, look.effect.name)))
+            known = search.fits.get((best.noise.structure, h.spread, names))
+            alike = any(one_friction(look.effect, other) for other in rest.effects)
+            if not alike and (known is None or not known.settled):
+                starts.append((rest.plus(look.effect, look.values), best.noise, best.track))
+    if moving(search.data, h):
+        fits = search.refined(starts, TO_THE_TOP)
+        far = [fit for fit in fits if 0 < fit.hypothesis.spread < CRUDE and search.far(fit)]
+        crude = [(replace(f.hypothesis, spread=CRUDE), f.noise, f.track) for f in far]
+        search.refined(crude, TO_THE_TOP)
     return tuple(found)
 
 
@@ -89,83 +100,9 @@ def related(one: Effect | None, other: Effect) -> bool:
     return b.name in a.lookalikes or a.name in b.lookalikes
 
 
-def _likely(
-    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect]
-) -> list[Likeness]:
-    """Return the candidates that reproduce more than NEARLY of an effect's signal, best first."""
-    shares = _shares(predictor, fit, effect, own) if own else []
-    likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
-    near = sorted((one for one in likely if one.share > NEARLY), key=lambda one: -one.share)
-    return near[:MOST]
-
-
-def _shares(
-    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect]
-) -> list[float]:
-    """Return the share of an effect's signal that each candidate reproduces at its best values."""
-    h, data = fit.hypothesis, predictor.data
-    if h.shift is not None:
-        moved = dict(zip(data.model.param_names, data.model.values + h.shift, strict=True))
-        data = replace(data, model=data.model.with_values(moved))
-        h = replace(h, shift=None, spread=0.0)
-    predictor, without = Predictor(data), h.minus(effect.name)
-    # all with the filter of the hypothesis without the effect, as its look-alikes are scanned
-    gains = filter_of(predictor, replace(fit, hypothesis=without))
-    delays = delays_of(without, data)
-    x, model = fit.track[:-1], data.model
-    bare, full = predictor.next(without, x), predictor.next(h, x)
-    d = model.difference(bare, full)
-    track = np.concatenate([fit.track[:1], full])
-    r = np.zeros_like(track) + predictor.offset(h, track) - predictor.offset(without, track)
-    r = r if delays is None else delays.aligned(r)
-    signal = kalman.innovations(gains, d[..., None], r[..., None])[0][..., 0]
-    other = replace(fit, hypothesis=without, white=signal)
-    columns, of_log = base_columns(predictor, other)
-    W = np.zeros((signal.size, columns.shape[-1]))
-    if W.shape[1]:
-        W = kalman.innovations(gains, columns, of_log)[0].reshape(W.shape)
-    other = replace(other, gram=(W.T @ W)[None], score=np.zeros((1, W.shape[1])))
-    flat = signal.reshape(-1)
-    taken = W.T @ flat
-    power = 0.5 * float(flat @ flat - taken @ other.covariance @ taken)
-    looks = scan_candidates(predictor, other, own)
-    return [float(np.clip(look.gain / max(power, 1e-12), 0.0, 1.0)) for look in looks]
-
-
 # -- twins
 MOMENT = 1e-5  # fraction of a step over which an instantaneous rate is computed
 SIDE = 1e-4  # half the finite-difference step, in units or a parameter's scale
-
-
-def swap(search: HypothesisSearch, best: Fitted, alike: Sequence[Likeness]) -> None:
-    """Fit look-alikes in place of the effects of a fit whose parameters are free.
-
-    Args:
-        search: stores the fits.
-        best: the claimed fit; if none of its parameters is free, nothing is fitted.
-        alike: look-alikes of its effects; those already converged are left as they are.
-    """
-    if not moving(search.data, best.hypothesis):
-        return
-    fits = search.refined(
-        [start for one in alike for start in _start(search, best, one)], TO_THE_TOP
-    )
-    far = [fit for fit in fits if 0 < fit.hypothesis.spread < CRUDE and search.far(fit)]
-    crude = [(replace(f.hypothesis, spread=CRUDE), f.noise, f.track) for f in far]
-    search.refined(crude, TO_THE_TOP)
-
-
-def _start(search: HypothesisSearch, best: Fitted, one: Likeness) -> list[tuple]:  # type: ignore[type-arg]
-    """Return the start of a look-alike in place of its effect; none if it already converged."""
-    names = tuple(sorted({*best.hypothesis.names} - {one.effect} | {one.like}))
-    known = search.fits.get((best.noise.structure, best.hypothesis.spread, names))
-    (effect,) = (e for e in search.candidates if e.name == one.like)
-    rest = best.hypothesis.minus(one.effect)
-    if (known is not None and known.settled) or any(one_friction(effect, e) for e in rest.effects):
-        return []
-    less = search.without(best, one.effect)
-    (look,) = scan_candidates(search.predictor, less, [effect])
-    return [(rest.plus(effect, look.values), best.noise, best.track)] if look.values else []
 
 
 def moving(data: Data, h: Hypothesis) -> list[int]:

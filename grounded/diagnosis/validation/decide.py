@@ -25,7 +25,7 @@ import numpy as np
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, swap
+from grounded.diagnosis.hypotheses.lookalike import lookalikes
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
@@ -134,10 +134,7 @@ def beside_lookalikes(decision: Decision) -> Decision:
 
     So ties are told between converged fits, and the report fits nothing.
     """
-    search = decision.search
-    alike = lookalikes(search.predictor, decision.fit, search.candidates)
-    swap(search, decision.fit, alike)
-    return replace(decision, alike=alike)
+    return replace(decision, alike=lookalikes(decision.search, decision.fit))
 
 
 class Options:

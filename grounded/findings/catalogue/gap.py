@@ -57,8 +57,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "equivalent": Entry(
         "note",
-        "[[nearly? hardly any]][[!nearly? no]] log can tell {effect} from {others} in this model; "
-        "plans are the same for all",
+        "no log can tell {effect} from {others} in this model; plans are the same for all",
     ),
     "worse": Entry(
         "warn",
