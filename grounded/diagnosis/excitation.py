@@ -138,7 +138,9 @@ def probe(
     second = in_place(first, {group[0]: ((rival, diagnosis.values(group[1])),)})
     noise = KnownNoise.of(task.model, diagnosis)
     second = _adapted(task, list(trials[-REPLAYED:]), second, noise)
-    again = [_replayed(task, h, policy, trials) for h in (first, second)]
+    latest = trials[-REPLAYED:]
+    replayed = ([_run(task, h, policy, trial) for trial in latest] for h in (first, second))
+    again = [[run for run in runs if run is not None] for runs in replayed]
     ways = [_Way(task, noise, first, second, again[0]), _Way(task, noise, second, first, again[1])]
     told = ways[0].known * len(trials) / max(len(again[0]), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
@@ -306,13 +308,6 @@ def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
     return own or list(range(model.m))
 
 
-def _calibrated(task: Task, diagnosis: Diagnosis) -> tuple[dict[str, Estimate], Task]:
-    """Return the calibrated parameters, and the task with their values."""
-    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
-    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
-    return known, task.with_model(task.model.with_values(values))
-
-
 def _claim(
     task: Task,
     diagnosis: Diagnosis,
@@ -324,7 +319,9 @@ def _claim(
 
     pair: the first of these two effects is claimed, and the second is not.
     """
-    known, task = _calibrated(task, diagnosis)
+    known = {n: e.value for n, e in diagnosis.parameters.items() if n in task.model.params}
+    finite = {n: value for n, value in known.items() if np.isfinite(value)}
+    task = task.with_model(task.model.with_values(finite))
     scales, h = _scales(task, trials), Hypothesis()
     if known:
         h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
@@ -401,12 +398,6 @@ def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -
             return None
         states.append(z[: task.model.n])
     return Trial(np.array(states), inputs, task.dt, *names, start_inputs=held)
-
-
-def _replayed(task: Task, h: Hypothesis, policy: Policy, trials: Sequence[Trial]) -> list[Trial]:
-    """Return runs in the model with a hypothesis, with the commands of the latest trials."""
-    runs = (_run(task, h, policy, trial) for trial in trials[-REPLAYED:])
-    return [run for run in runs if run is not None]
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -68,13 +67,6 @@ def _values(fit: Fitted, data: Data, blamed: Sequence[str]) -> list[_Value]:
     return found
 
 
-def _by_group(fit: Fitted, group: Any, count: int) -> tuple[Array, Array]:
-    """Return the scores (g, C) and the information (g, C, C) of groups of runs (B,)."""
-    s = np.array([fit.score[group == g].sum(axis=0) for g in range(count)])
-    G = np.array([fit.gram[group == g].sum(axis=0) for g in range(count)])
-    return s, G
-
-
 def by_trial(
     fit: Fitted, data: Data, blamed: Sequence[str]
 ) -> tuple[tuple[TrialValue, ...], tuple[Agreement, ...]]:
@@ -91,7 +83,8 @@ def by_trial(
         return (), ()
     rows: list[TrialValue] = []
     tests: list[Agreement] = []
-    s, G = _by_group(fit, data.trial_of, data.count)
+    each = [data.trial_of == trial for trial in range(data.count)]
+    s, G = (np.array([own[k].sum(axis=0) for k in each]) for own in (fit.score, fit.gram))
     for one in _values(fit, data, blamed):
         k = one.column
         some = np.flatnonzero(G[:, k, k] > 1e-9 * G[:, k, k].max())
