@@ -60,8 +60,9 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     for i, name in enumerate(data.model.state_names):
         if i in data.hidden:
             continue
-        gain, step_gain, correction = _channel(predictor, fit, gains, features, i)
+        gain, step_gain, weights = held_out_columns(predictor, fit, gains, features, i)
         if gain > PICKED:
+            correction = held_out_rate(data, features, weights)
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
             found.append(Leftover(name, gain, size, per_second(unit), correction, step_gain))
@@ -130,14 +131,6 @@ def _bins(value: Array, count: int) -> list[Array]:
     return [column for column in inside if column.mean() > 0.01]
 
 
-def _channel(
-    predictor: Predictor, fit: Fitted, gains: kalman.Gains, features: Array, i: int
-) -> tuple[float, Array, Array]:
-    """Return the held-out gain in one channel (total, by step (L, B)) and its correction (L, B)."""
-    gain, by_step, weights = held_out_columns(predictor, fit, gains, features, i)
-    return gain, by_step, held_out_rate(predictor.data, features, weights)
-
-
 def held_out_rate(data: Data, features: Array, weights: Array) -> Array:
     """Return the rate (L, B) of features (L, B, K), in each fold with the weights of the others."""
     of_run = np.unique(data.folds, return_inverse=True)[1]
@@ -201,23 +194,20 @@ def filter_of(predictor: Predictor, fit: Fitted, *, covariances: bool = False) -
     return gains_of(predictor, h, fit.noise, fit.track, F, covariances=covariances)
 
 
-def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
-    """Return the Ljung-Box p-value of each channel's whitened innovations, {index: p}, 10 lags."""
+def whiteness(fit: Fitted, seen: Array) -> Array:
+    """Return the Ljung-Box p-value of each state's whitened innovations, (n,), 10 lags."""
     from scipy.special import chdtrc
 
-    found = {}
     L, _, n = fit.white.shape
-    lags = min(RHO_LAGS, L // 4)
-    for i in range(n):
-        e = fit.white[..., i] * seen[1:, :, i]
-        count, power = float(seen[1:, :, i].sum()), float((e**2).sum())
-        q = 0.0
-        for k in range(1, lags + 1):
-            rho = float((e[k:] * e[:-k]).sum()) / max(power, 1e-300)
-            q += rho**2 / max(count - k, 1.0)
-        q *= count * (count + 2)
-        found[str(i)] = float(chdtrc(lags, q)) if lags else 1.0
-    return found
+    lags, e = min(RHO_LAGS, L // 4), fit.white * seen[1:]
+    if not lags:
+        return np.ones(n)
+    count, power = (np.sum(a, axis=(0, 1)) for a in (seen[1:], e**2))
+    q = np.zeros(n)
+    for k in range(1, lags + 1):
+        rho = (e[k:] * e[:-k]).sum(axis=(0, 1)) / np.maximum(power, 1e-300)
+        q += rho**2 / np.maximum(count - k, 1.0)
+    return np.asarray(chdtrc(lags, q * count * (count + 2)))
 
 
 MOST = 2  # most variables

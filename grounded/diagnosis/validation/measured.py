@@ -148,7 +148,7 @@ class Measured:
         delays = delays_of(self.best.hypothesis, self.data)
         seen = self.data.seen if delays is None else delays.samples()[1]
         found = whiteness(self.best, seen)
-        return {n: found[str(i)] for i, n in zip(self.ruler.shown, self.units, strict=True)}
+        return {n: float(found[i]) for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def gap(self, fit: Fitted) -> float:
         """Return the gap that a fit leaves, relative to the noise of the decision."""
