@@ -261,7 +261,7 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
         return bool(np.log((before + FINE) / (left + FINE)) >= price)
 
     left, tells = _left(fit), _tells(plain, fit)
-    same = {"names": row.names, "by": row.by}
+    same: dict[str, Any] = {"names": row.names, "by": row.by}
     if row.log is not None and fit.alike and (tells or unit) and fit.error < EXPLAINED:
         price = row.log + (MARGIN if unit else least)
         if gained(left, price) and apart(own, run, first) <= motion:
@@ -274,8 +274,9 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     share = _moved(own, trial, fit)
     known = fit.alike and tells and fit.error < EXPLAINED * share
     if known and gained(left / share, row.program + least):
-        told = _without_feedback(own, trial, fit, row)
-        yield scored(Kind.PROGRAM, told, own, trial, left / share, first, price=row.program, **same)
+        yield scored(
+            Kind.PROGRAM, row.told, own, trial, left / share, first, price=row.program, **same
+        )
 
 
 def _left(ran: Following) -> float:
@@ -302,22 +303,6 @@ def _tells(plain: Following, fit: Following) -> bool:
         told = np.abs(plain.off[:T] - fit.off[:T]) > EXPLAINED * size
         nearer = np.abs(fit.off[:T]) < np.abs(plain.off[:T]) / 2
     return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
-
-
-def _without_feedback(own: Ran, trial: Trial, fit: Following, row: Row) -> Finding | None:
-    """Return the finding of a row; of a policy without feedback, whether other states were fed.
-
-    Commands without feedback depend on time alone, which may be off by one step.
-    """
-    if row.policy.gain is not None or own.policy.gain is None:
-        return row.told
-    asked = trial.inputs[: len(fit.off)] - fit.off
-    around = np.stack([np.roll(asked, k, axis=0)[1:-1] for k in (-1, 0, 1)])
-    known = np.isfinite(around).all(axis=(0, 2))
-    sent, around = trial.inputs[1 : len(fit.off) - 1][known], around[:, known]
-    off = sent - np.clip(sent, around.min(axis=0), around.max(axis=0))
-    beside = (np.abs(off) <= CLEAR * fit.fine / FINE).all(axis=1).mean() >= NEARLY_ALL
-    return row.told if beside else found("run.other_states", ran=own.id)
 
 
 def _by_motion(

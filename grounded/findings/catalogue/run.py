@@ -26,13 +26,6 @@ ENTRIES: dict[str, Entry] = {
         "(`runner.blind` counts the calls without), and run {ran} again",
         hides=SPOILT,
     ),
-    "other_states": Entry(
-        "aside",
-        OF + "its commands are near the feed-forward of {ran}, with feedback on states nearer to "
-        "its plan than those of the log: does the program read another message or estimate?",
-        "pass `runner.action` the signals that are logged, and run {ran} again",
-        hides=SPOILT,
-    ),
     "origin": Entry(
         "aside",
         OF + "its commands are what {ran} sends on states from another origin: {off} beside those "
@@ -163,20 +156,17 @@ ENTRIES: dict[str, Entry] = {
     "start": Entry(
         "warn",
         "the run started with {state} = {began}, the task's start is {start}: {off} off[[, as "
-        "those of {runs} other runs, off by {rms} (rms)]][[, and so did {others}]][[; by the model "
+        "those of {runs} other runs, off by {rms} (rms)]][[; by the model "
         "that changes its utility by {change:+.3g}]]: the run counts[[, and is to be run once "
         "{again:True=more}]]",
-        "[[!values? place the robot nearer to the start next time]][[if the robot always starts "
-        "there, write {values} in [task] start and propose again: the search begins again, all "
-        "logs "
-        "stay for fit and diagnose]]",
+        "place the robot nearer to the start next time, or write in [task] start where it always "
+        "starts, and propose again",
     ),
     # its end
     "safety": Entry(
         "warn",
-        "[[{after} after its end ]]the run left [safety] {about} = {bound}[[ at {at}]]: it came to "
-        "{most}[[, where {predicted} was predicted]]",
-        "[[after? stop it in time, or let the target end at rest inside]]",
+        "the run left [safety] {about} = {bound} at {at}: it came to {most}, where {predicted} was "
+        "predicted",
     ),
     # the command of [system]
     "by_hand": Entry(

@@ -13,7 +13,7 @@ from grounded import Model, Reward, Task
 from grounded.policy import Policy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening.run_start import recording
-from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
+from grounded_trials.workspace.intake.recognising.recognise import stories_of_log
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])
@@ -107,16 +107,6 @@ def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed)
     assert found.alike and found.exact
     assert found.seconds == pytest.approx(WAITS * DT, abs=0.004)
     assert found.loose_s == 0.0 and found.rival_s is None  # each command has its own stamp
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_degrees_are_named_though_somebody_else_drove_first(seed):
-    own = candidate(HAND)
-    task, log = log_of(balanced(own, seed, 180 / np.pi))
-    told = min(stories_of_log(log, task, own, None), key=lambda one: one.left)
-    assert told.finding.code == "run.passed"
-    assert told.finding.facts["states"] == ("tilt", "rate")
-    assert told.finding.facts["unit"] == "degrees"
 
 
 @pytest.mark.parametrize("seed", [0, 3])

@@ -11,7 +11,6 @@ from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
-from recorded import record, waiting
 from workspaces import CONFIG, make
 
 NARROW = CONFIG.replace("force = [-5.0, 5.0]", "force = [0.0, 1.17]")
@@ -87,25 +86,3 @@ def test_an_angle_far_beyond_safety_that_degrees_would_explain_is_told(tmp_path,
     told = of_code(w.ingest(tmp_path / "d.mcap", data=True), "log.unit")
     assert [one.about for one in told] == [("theta",)] * said
     assert all(one.facts["writes"] == ("rad",) and one.facts["trials"] for one in told)
-
-
-def driven_on(w, folder):
-    """A run of c0002 that is logged for 1.5 s longer: file, table, seconds after its end."""
-    policy, file = w.candidate("c0002")[0].policy, folder / "t.csv"
-    record(w, file, policy, 1.0, after=1.5)
-    table = np.loadtxt(file, delimiter=",", skiprows=1)
-    return file, table, table[:, 0] - table[0, 0] - 1.0 - policy.horizon * policy.dt
-
-
-@pytest.mark.parametrize("rolls", [0.0, 0.4])
-def test_a_robot_that_leaves_safety_after_its_run_is_seen_to(tmp_path, rolls):
-    w = waiting(tmp_path)
-    file, table, beyond = driven_on(w, tmp_path)
-    most = table[beyond <= 0.1, 1].max()
-    table[beyond > 0, 1] = np.minimum(table[beyond > 0, 1], most)
-    table[:, 1] += rolls * np.clip(beyond - 0.1, 0.0, None)
-    np.savetxt(file, table, "%.5f", ",", header="t,x,v,force", comments="")
-    config = w.folder / "grounded.toml"
-    config.write_text(f"{config.read_text()}\n[safety]\nx = [-9.0, {most + 0.1:.3f}]\n")
-    told = of_code(Workspace(w.folder).ingest(file), "run.safety")
-    assert [one.about for one in told] == [("x",)] * (rolls > 0)

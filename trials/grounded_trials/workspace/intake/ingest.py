@@ -22,9 +22,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Tried
-from grounded.search.safety import COASTS
 from grounded.search.standing import Standing
-from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
@@ -53,7 +51,7 @@ from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
-from grounded_trials.workspace.intake.remarks.trial_check import checked, left_afterwards
+from grounded_trials.workspace.intake.remarks.trial_check import checked
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -256,13 +254,10 @@ def _of_run(
     history: Sequence[Tried],
 ) -> Iterator[Finding | None]:
     """Yield how a candidate was run, and how its run went."""
-    task = workspace.task
     if not read.doubted:
         yield ran_otherwise(workspace, trial)
     yield gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
     yield ended_early(workspace, trial, read.silent)
-    if trial.candidate and (whole := _whole(read, task)):
-        yield left_afterwards(task, whole)
 
 
 def _of_search(workspace: Folder, read: Read, added: Added, now: Standing) -> Iterator[Finding]:
@@ -285,15 +280,6 @@ def _ask(workspace: Folder, read: Read, added: Added) -> None:
     with suppress(GroundedError):  # a folder that can't be written
         workspace.notes.add(note, again=False)
     vars(workspace).pop("noted", None)
-
-
-def _whole(read: Read, task: Task) -> Trial | None:
-    """Return a complete run of a foreign log with the seconds that follow it, else None."""
-    log = read.log.recording if read.log else None
-    if log is None or read.cut is None or read.trial.steps < task.horizon:
-        return None
-    more = replace(log, steps=task.horizon + math.ceil(COASTS / task.dt))
-    return more.trial_from(1e-9 * (read.cut.start_ns - log.whole.origin_ns))
 
 
 def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:

@@ -115,19 +115,6 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size, old)
 
 
-def held_before(log: Recording, start: float, steps: int) -> Array:
-    """Return the last samples of the states before each command was sent, (steps, n).
-
-    Args:
-        log: the log.
-        start: the time of the first step, seconds after the log's first sample.
-        steps: the number of steps.
-    """
-    samples = _Samples.of(log, round(start * 1e9), steps)
-    now = np.zeros(1)
-    return np.stack([samples._aged(i, now, True)[0] for i in range(len(samples.states))], axis=1)
-
-
 @dataclass(frozen=True, eq=False)
 class _Samples:
     """The samples of a log's states around the times at which commands were sent."""

@@ -2,6 +2,5 @@
 
 Read `recognise.py` first: the stories of a log, the judge's choice, and how each is refused.
 `grounded.accounts.returned` has the terms by which all are scored. `look.py` cuts the run from the
-log, judges which candidate sent its commands, and finds falls; `stories_of_log.py` asks the table
-wherever the run may begin.
+log, judges which candidate sent its commands, and finds falls.
 """

@@ -25,6 +25,7 @@ from grounded.accounts.returned import (
     likeliest,
     of_full_scale,
     scored,
+    stories,
     unit_by_factor,
 )
 from grounded.accounts.sent import FINE, RESEMBLES, follows, latest
@@ -40,9 +41,8 @@ from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short, read_log_file
 from grounded_trials.workspace.intake.opening.foreign import misread
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
-from grounded_trials.workspace.intake.opening.run_start import Recording
+from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 from grounded_trials.workspace.intake.recognising.look import Look
-from grounded_trials.workspace.intake.recognising.stories_of_log import stories_of_log
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 
 if TYPE_CHECKING:
@@ -241,6 +241,29 @@ def _of_log(case: Case) -> Iterator[Story]:
     earlier = None if case.read.bare else of_earlier_task(case.workspace, log, case.whole)
     if earlier:
         yield earlier
+
+
+def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | None) -> list[Story]:
+    """Return the stories of a log that explain its commands as its candidate's.
+
+    The commands don't tell where its run begins: so the table is asked at the start found, at the
+    first command, and at the instants at which commands begin to change.
+
+    Args:
+        log: a log whose commands are not the candidate's.
+        task: the task with the control step.
+        own: the candidate.
+        start: the start that fits best, if any.
+    """
+    at = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
+    acts = not np.allclose(log.whole.inputs, own.policy.past, rtol=0, atol=1e-9)
+    how: dict[str, Any] = {"acts": acts, "logged": log.measured, "waits": log.waits}
+    some = list[Story]()
+    for begins in dict.fromkeys(log.on_step(own.policy, one) for one in at):
+        if trial := log.trial_from(begins):
+            run = trial.until(min(trial.finite_steps, task.horizon))
+            some += stories(task, own, run, follows(own.policy, run, latest(task)), **how)
+    return some
 
 
 def _of_motion(case: Case, story: Story) -> Iterator[Story]:

@@ -17,17 +17,14 @@ from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.workspace.candidates.at_rest import SAME, standstills
 from grounded_trials.workspace.candidates.search_state import standing_without
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import began_elsewhere
 from grounded_trials.workspace.placing import FEWEST, placing
 
 SURE = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
 # share of the run's cost by which the start changes it: told, and too much to count; and that
 # while too few other runs tell how the robot is placed
 TOLD, SPOILT, UNKNOWN = 0.05, 0.2, 0.5
-ALWAYS = 3  # runs that begin alike, from which on they always do
 
 
 def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
@@ -46,8 +43,6 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     if not trial.candidate or trial.finite_steps < 0:
         return None
     off = task.model.difference(trial.began, task.start)
-    if always := _always_there(workspace, trial, off):
-        return always
     own, _ = workspace.candidate(trial.candidate)
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     noise = sample_noise(trial.until(len(states) - 1), own.predicted_states)
@@ -88,40 +83,6 @@ def _placed(task: Task, trial: Trial, i: int, off: float) -> dict[str, Any]:
     name, unit = list(task.model.states.items())[i]
     began, start = (Quantity(float(x), unit) for x in (trial.began[i], task.start[i]))
     return {"state": name, "began": began, "start": start, "off": Quantity(float(off), unit)}
-
-
-def _always_there(workspace: Folder, trial: Trial, off: Array) -> Finding | None:
-    """Return that the robot never begins at a value that [task] start has; or None.
-
-    All other logs of runs, and of driving from a standstill, then begin where this run did. One in
-    which it stood is enough to show that, else `ALWAYS` runs are: two may begin alike by chance.
-
-    Args:
-        workspace: the workspace with the other logs.
-        trial: the run.
-        off: its first state less s_0 (n,).
-    """
-    task, given = workspace.task, workspace.config.task.start
-    others = [one for one in workspace.task_trials() if one.id != trial.id]
-    began = {one.id: one.began for one in others if one.candidate}
-    stood = {one.trial: one.states for one in standstills(workspace) if one.trial not in began}
-    stood.pop(trial.id, None)
-    if not stood and len(began) + 1 < ALWAYS:
-        return None
-    first = trial.began
-    apart = [task.model.difference(x, first) for x in (*began.values(), *stood.values())]
-    same = np.all(np.abs(apart) <= SAME * np.abs(off), axis=0).tolist()
-    predicted = workspace.candidate(trial.candidate)[0].predicted_states
-    clearly = began_elsewhere(task, [trial.until(task.horizon)], predicted)
-    names = task.model.state_names
-    odd = [i for i, name in enumerate(names) if same[i] and name in clearly and name in given]
-    if not odd:
-        return None
-    whole = {**given, **{names[i]: float(first[i]) for i in odd}}
-    values = tuple(f"{name} = {value:.4g}" for name, value in whole.items())
-    facts = _placed(task, trial, odd[0], off[odd[0]])
-    others_too = (*stood, *began)
-    return found("run.start", *(names[i] for i in odd), others=others_too, values=values, **facts)
 
 
 def _inside(task: Task, states: Array) -> Array:

@@ -109,24 +109,3 @@ def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
             how = "percent" if in_percent(task, trial.inputs, i) else "flip" if turned else "widen"
             logged, limits = span(trial.inputs[:, i]), limits_of(task, i)
             yield found("log.limits", name, logged=logged, limits=limits, how=how)
-
-
-def left_afterwards(task: Task, whole: Trial) -> Finding | None:
-    """Return that the robot left [safety] after a run that stayed inside, or None.
-
-    Args:
-        task: with [safety] and the horizon.
-        whole: the run with the seconds that follow it.
-    """
-    assert task.safety_low is not None and task.safety_high is not None
-    states = whole.states[: whole.finite_steps + 1]
-    out = np.maximum(task.safety_low - states, states - task.safety_high)
-    if (out[: task.horizon + 1] > 0).any() or not (out > 0).any():
-        return None
-    t, i = np.unravel_index(int(np.argmax(out)), out.shape)
-    first = int(np.argmax((out > 0).any(axis=1))) - task.horizon
-    name, unit = list(task.model.states.items())[int(i)]
-    most = float(states[t, i])
-    bound = Quantity(float(np.clip(most, task.safety_low[i], task.safety_high[i])), unit)
-    after = Quantity(first * whole.dt, "s")
-    return found("run.safety", name, after=after, bound=bound, most=Quantity(most, unit))
