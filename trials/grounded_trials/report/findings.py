@@ -5,7 +5,6 @@ Text, page, pictures and recording show the same findings and read no files them
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,7 +21,6 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import begun, measured_alike
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.difference import LUCK
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -34,13 +32,10 @@ from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import outlook
 from grounded_trials.workspace.off_target import (
     UNSURE,
+    OffTarget,
     by_runs,
-    rates_among,
-    reaches,
-    reading_noise,
-    std_at_end,
+    off_target_of,
     tracking_error,
-    weighed_groups,
 )
 
 if TYPE_CHECKING:
@@ -48,9 +43,8 @@ if TYPE_CHECKING:
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
-FAR = "distance from target"
 ESTIMATED = "not measured: an estimate"  # note at a panel
-MOVED = 0.02  # share of the change in cost below which a row is left out
+NOWHERE = OffTarget("", "")  # without a first trial
 TERMS = {  # tables of [reward]
     "state": "states",
     "terminal": "end",
@@ -248,123 +242,44 @@ def compared(findings: Findings) -> list[tuple[str, Run]]:
 
 @dataclass(frozen=True)
 class Improved:
-    """An rms error of the first and of the best trial; `before` is NaN if there is only one."""
+    """An error of the first and of the best trial; `before` is NaN if there is only one."""
 
     what: str
     unit: str
     before: float
     after: float
-    distance: bool = False  # of several states
-    at_end: bool = False
 
     @property
     def text(self) -> str:
         """`170 mm → 5.0 mm`: both in one unit, lengths below 1 m in mm."""
-        return " → ".join(measured_alike(self._known, self.unit))
-
-    @property
-    def is_same(self) -> bool:
-        """Whether both are equal as displayed."""
-        return len(set(measured_alike((self.before, self.after), self.unit))) == 1
-
-    @property
-    def _known(self) -> list[float]:
-        return [v for v in (self.before, self.after) if np.isfinite(v)]
+        known = [v for v in (self.before, self.after) if np.isfinite(v)]
+        return " → ".join(measured_alike(known, self.unit))
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
-    """Return the rms errors from the target of the model's own policy and of the best trial.
+    """Return the errors from the target of the model's own policy and of the best trial.
 
-    Errors of the last state are added if the reward weighs it, or if the target is to be reached.
-    Rates come after the states whose rates they are, as in `off_target_of`, and only if they
-    changed the utility. Apart from that, errors that changed come first: the position's, then those
-    that changed the utility most.
+    They are those of `status`: rms over the run, and at the end where that is to be reached.
     """
-    task, runs, found = findings.task, compared(findings), []
-    if not runs:
-        return []
-    each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
-    short = [one.label for one in each if one.trial.finite_steps < task.horizon]
-    note = f"; {', '.join(short)} ended early" if short else ""
-    arrives = reaches(task)
-    groups, role = weighed_groups(task), task.model.roles.get("position", ())
-    place = {role} if isinstance(role, str) else {*role}
-    for (names, what), rate in zip(groups, rates_among(task, groups), strict=True):
-        states = [task.model.state_names.index(name) for name in names]
-        errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
-        unit = shown(task.model.states[names[0]])
-        far = FAR if len(names) > 1 else what
-        running, terminal = task.reward.state[states], task.reward.terminal[states]
-        views = [(errors, running, False)] * bool(running.any() or not terminal.any())
-        if (terminal.any() or arrives) and not short:
-            last = [[e[[task.horizon]] for e in own] for own in errors]
-            views.append((last, terminal + arrives * running, True))
-        for parts, weights, at_end in views:
-            missed = [float(np.linalg.norm(rms(part))) for part in parts]
-            costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
-            before = missed[0] if len(missed) > 1 else float("nan")
-            moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
-            paid = ""
-            noise = float(np.linalg.norm(reading_noise([run.trial for run in each], states)))
-            lost = at_end and missed[-1] < noise
-            if lost:  # a single sample can't show a smaller error
-                before, missed[-1] = max(before, noise), noise
-                paid = f", noise {measured_alike([noise], unit)[0]}"
-            elif at_end:
-                paid = _at_end_told(findings, parts, missed, states, unit)
-            words = f"{far}, {'end' if at_end else 'rms'}{paid}{note}"
-            several = len(names) > 1
-            one = Improved(words, unit, before, missed[-1], several, at_end)
-            found.append((rate, one.is_same, names[0] not in place, -moved, one))
-    found.sort(key=lambda each: each[:4])
-    least = MOVED * sum(abs(moved) for *_, moved, _ in found)
-    large = [one for rate, *_, moved, one in found if not rate or -moved >= least]
-    firsts = (
-        next((one for *_, one in found if test(one)), None)
-        for test in (_of_position, *(_of_end,) * arrives)
-    )
-    asked = [one for one in firsts if one is not None and one not in large[:SHOWN]]
-    return [*large[: SHOWN - len(asked)], *asked]  # what was asked for, if it changed or not
-
-
-def _of_position(one: Improved) -> bool:
-    return one.distance and not one.at_end
-
-
-def _of_end(one: Improved) -> bool:
-    return one.at_end
-
-
-def _at_end_told(
-    findings: Findings,
-    parts: Sequence[Sequence[Array]],
-    missed: Sequence[float],
-    states: Sequence[int],
-    unit: str,
-) -> str:
-    """Return the standard errors of errors at the end, as a clause; "" if they are small.
-
-    Args:
-        findings: with the runs.
-        parts: of each compared candidate, the errors at the end of its runs (1, k).
-        missed: the rms of these.
-        states: indices of the k states.
-        unit: their unit.
-    """
+    task, found = findings.task, list[Improved]()
     runs = [findings.runs_of(run.candidate.id) for _, run in compared(findings)]
-    std = [
-        std_at_end([e[0] for e in own], reading_noise([one.trial for one in some], states))
-        for own, some in zip(parts, runs, strict=True)
+    short = [one.label for own in runs for one in own if one.trial.finite_steps < task.horizon]
+    note = f"; {', '.join(short)} ended early" if short else ""
+    errors = [
+        {one.what: one for one in off_target_of(task, [run.trial for run in own])} for own in runs
     ]
-    if not any(error > UNSURE * value for error, value in zip(std, missed, strict=True)):
-        return ""
-    told, counts = measured_alike(std, unit), [len(own) for own in parts]
-    if len({*counts}) == 1:
-        told = [f"{' and '.join(dict.fromkeys(told))} {by_runs(counts[0], each=len(counts) > 1)}"]
-    else:
-        told = [f"{error} {by_runs(count)}" for error, count in zip(told, counts, strict=True)]
-    same = len(std) > 1 and abs(missed[0] - missed[-1]) < LUCK * math.hypot(std[0], std[-1])
-    return f"; +- {' and '.join(told)}{', luck' * same}"
+    for what, last in errors[-1].items() if errors else ():
+        first, unit = errors[0].get(what, NOWHERE) if len(errors) > 1 else NOWHERE, shown(last.unit)
+        if np.isfinite(last.rms):
+            found.append(Improved(f"{what} off target, rms{note}", unit, first.rms, last.rms))
+        if np.isfinite(last.end):
+            least = last.noise  # a single sample can't show a smaller error
+            noise, std = (measured_alike([one], unit)[0] for one in (least, last.end_std))
+            unsure = f"; +- {std} {by_runs(last.runs)}" * (last.end_std > UNSURE * last.end)
+            doubt = f", noise {noise}" if last.end < least else unsure
+            ends = max(first.end, least), max(last.end, least)
+            found.append(Improved(f"{what} off target, end{doubt}{note}", unit, *ends))
+    return found[:SHOWN]
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
