@@ -103,6 +103,11 @@ def unit_in_name(path: str) -> str:
     return ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
 
 
+def command_unit(name: str, path: str, units: Mapping[str, str]) -> str:
+    """Return the unit of a command: stated by the log, in its name, else "1", or V of a voltage."""
+    return units.get(path) or unit_in_name(path) or ("V" if "volt" in name.lower() else "1")
+
+
 def without_unit(path: str) -> str:
     """Return a message path without the unit at the end of its last name, unless ambiguous."""
     bare, ending = _parts(path)

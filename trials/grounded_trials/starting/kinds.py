@@ -17,7 +17,7 @@ from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, 
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
 from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
 from grounded_trials.logs.inspection.relations import rates_among
-from grounded_trials.logs.stated_units import bare_command, unit_in_name
+from grounded_trials.logs.stated_units import bare_command, command_unit, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
@@ -289,14 +289,13 @@ def _hung(log: LogReport, joints: Joints) -> str:
 
 def _crane(log: LogReport, units: Units) -> Skeleton:
     """Return the crane skeleton with the log's command; unless it is a force, in V or unitless."""
-    found = moving(log)
-    sent = [name for name, one in found.items() if called_input(name, one.path)]
-    plain = fixed("crane")
-    if len(sent) != 1 or sent[0] in plain.inputs:
+    sent, plain = sent_in(log), fixed("crane")
+    if len(sent) != 1 or {*sent} <= {*plain.inputs}:
         return plain
-    unit = "V" if _in_volts(sent[0], found[sent[0]].path, units) else "1"
+    ((name, path),) = sent.items()
+    unit = "V" if command_unit(name, path, units).endswith("V") else "1"
     gain = plain.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
-    return driven_by(plain, {"force": (sent[0], unit)}, gain=gain)
+    return driven_by(plain, {"force": (name, unit)}, gain=gain)
 
 
 def _headed(log: LogReport) -> bool:
@@ -340,13 +339,8 @@ def _balancing(log: LogReport) -> str:
     words = {word for name in found for word in (name.lower(), *name.lower().split("_"))}
     if not words & PITCHES or not words & ROLLS_ON or words & FLIES:
         return ""
-    sent = [name for name, one in found.items() if called_input(name, one.path)]
+    sent = [*sent_in(log)]
     return sent[0] if len(sent) == 1 else ""
-
-
-def _in_volts(name: str, path: str, units: Units) -> bool:
-    """Return whether a command's unit is V, or its name contains "volt" and no unit is known."""
-    return units.get(path, "V" if "volt" in name.lower() else "1").endswith("V")
 
 
 def encoders(log: LogReport, joints: Joints) -> str:
@@ -445,7 +439,7 @@ def skeleton(
         return _crane(log, units or {})
     if kind == "balance" and (command := _balancing(log)):
         plain = fixed("balance_by_encoders" if encoders(log, joints) else kind)
-        if _in_volts(command, moving(log)[command].path, units or {}):
+        if command_unit(command, sent_in(log)[command], units or {}).endswith("V"):
             return driven_by(plain, {"voltage": (command, "V")})
         unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
         return driven_by(plain, {"voltage": (command, "1")}, **unitless)

@@ -17,7 +17,7 @@ from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.inspection.relations import Signals
-from grounded_trials.logs.stated_units import Stated, unit_in_name
+from grounded_trials.logs.stated_units import Stated, command_unit
 from grounded_trials.starting.skeletons import Skeleton, driven_by
 
 SPEED = re.compile(r"speed|veloc|(^|[/._])vel([/._]|$)|cmd_vel|linear|geschw|vitesse")
@@ -49,8 +49,7 @@ def pushed(plain: Skeleton, sent: Mapping[str, str], units: Mapping[str, str]) -
     if len(motors) != 1:
         return plain
     ((name, path),) = motors.items()
-    said = units.get(path) or unit_in_name(path)
-    return pushed_by(plain, name, said or ("V" if "volt" in name.lower() else "1"))
+    return pushed_by(plain, name, command_unit(name, path, units))
 
 
 def pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:

@@ -309,8 +309,8 @@ class _Table:
             angle = first.get(without_role(role.name), "")
             path = first.get(role.name, "")
             if angle and path.endswith("@rpy." + path.rpartition(".")[2]) and angle != path:
-                value = _lagged(signals, angle, path)
-                if value < FOLLOWS:
+                like = signals.lagged([path], [angle], LATEST)
+                if like is not None and like[0, 0] < FOLLOWS:
                     self.add(role.name, path, -2 * CAP)
         for pair in rate_states(model).items():
             if set(pair) <= self.row.keys():
@@ -517,18 +517,6 @@ def _reckons(topic: TopicReport) -> bool:
 def _alike(path: str, other: str) -> bool:
     """Check whether two numbers have the same name in their messages, or units that may agree."""
     return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
-
-
-def _lagged(signals: Signals, angle: str, command: str) -> float:
-    """Return the largest correlation of an angle with its command up to LATEST earlier."""
-    gridded = signals.grid((angle, command))
-    if gridded is None:
-        return 1.0
-    step, (moved, sent) = gridded
-    most = max(min(round(LATEST / step), len(moved) - 20), 0)
-    pairs = [(moved[k:], sent[: len(sent) - k]) for k in range(most + 1)]
-    alive = [(a, c) for a, c in pairs if a.std() > 1e-9 and c.std() > 1e-9]
-    return max((float(np.corrcoef(a, c)[0, 1]) for a, c in alive), default=0.0)
 
 
 @dataclass(frozen=True)

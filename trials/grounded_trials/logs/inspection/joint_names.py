@@ -362,26 +362,16 @@ def by_efforts(
 
 def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -> list[int | None]:
     """Return the index of the command for each effort; all None unless every one is clear."""
-    signals.read([*sent, *measured])
-    gridded = signals.grid((*sent, *measured))
-    none: list[int | None] = [None] * len(measured)
-    if gridded is None:
-        return none
-    step, columns = gridded
-    like = np.full((len(sent), len(measured)), -1.0)
-    for late in range(1 + min(round(LATEST / step), len(columns[0]) // 2)):
-        u = np.array(columns[: len(sent)])[:, : len(columns[0]) - late]
-        y = np.array(columns[len(sent) :])[:, late:]
-        if not (np.ptp(u, axis=1).all() and np.ptp(y, axis=1).all()):
-            return none
-        like = np.maximum(like, np.corrcoef(u, y)[: len(sent), len(sent) :])
+    like, none = signals.lagged(sent, measured, LATEST), [None] * len(measured)
+    if like is None:
+        return [*none]
     best = like.argmax(axis=0)
     others = like.copy()
     others[best, np.arange(len(measured))] = -1.0
     own = like[best, np.arange(len(measured))]
     rest = np.maximum(others.max(axis=0), others[best].max(axis=1))
     if len(set(best.tolist())) < len(best) or (own < ALIKE).any() or (own - rest < CLEARLY).any():
-        return none
+        return [*none]
     return [int(k) for k in best]
 
 

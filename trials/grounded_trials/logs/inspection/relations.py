@@ -136,6 +136,29 @@ class Signals:
         step, (q, w) = gridded
         return follows(q, w, step)
 
+    def lagged(self, sent: Sequence[str], moved: Sequence[str], latest: float) -> Floats | None:
+        """Return the largest correlation of each command with each signal that may follow it.
+
+        Args:
+            sent: paths of k commands.
+            moved: paths of m signals.
+            latest: largest delay [s].
+
+        Returns:
+            (k, m), -1 for constant ones; None if the signals don't overlap.
+        """
+        gridded = self.grid((*sent, *moved))
+        if gridded is None:
+            return None
+        k, (step, columns) = len(sent), gridded
+        u, y = np.array(columns[:k]), np.array(columns[k:])
+        found = np.full((k, len(moved)), -1.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for late in range(1 + min(round(latest / step), u.shape[1] // 2)):
+                like = np.corrcoef(u[:, : u.shape[1] - late], y[:, late:])[:k, k:]
+                found = np.fmax(found, like)
+        return found
+
     def rates(self, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
         """Return the same as `rates_among`."""
         self.read(paths)
