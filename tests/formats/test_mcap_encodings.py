@@ -428,7 +428,7 @@ def test_protobuf_from_an_older_or_other_writer() -> None:
     largest = bytes([0x18, *[0xFF] * 9, 1])
     assert found([largest], type, root, "/t.c") == [[float(2**64 - 1)]]
     assert found([b""], type, root, "/t.d") == [[2.5]]
-    for bad in (b"\x08", b"\x08" + b"\xff" * 11, b"\x0a\x7f", b"\x21\0", b"\x0b", b"\x0d\0\0\0\0"):
+    for bad in (b"\x08", b"\x08" + b"\xff" * 11, b"\x0a\x7f", b"\x21\0", b"\x0b"):
         with pytest.raises(BadMessage):
             found([b"", bad], type, root, "/t.a")
     rng = np.random.default_rng(0)

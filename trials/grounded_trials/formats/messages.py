@@ -3,9 +3,8 @@
 A definition in ROS, IDL or protobuf becomes a `Type`: numbers, texts, structs and arrays of these.
 A `Node` is one place of that tree in many messages at once: row i is a value in message `rows[i]`.
 `field` goes into a struct, `items` into an array (a message then has as many rows as items, or
-none), `keep` drops rows; `numbers` and `equals` read the values. The nodes in `cdr.py` and
-`protobuf.py` decode bytes by array operations. Those for JSON are here: every message has its own
-types, so messages are parsed one by one.
+none), `keep` drops rows; `numbers` and `equals` read the values. The nodes in `cdr.py` decode bytes
+by array operations; those for JSON, here, and in `protobuf.py` hold messages parsed one by one.
 """
 
 from __future__ import annotations
@@ -23,14 +22,9 @@ from grounded_trials.formats.bad import BadMessage, BadPath
 
 @dataclass(frozen=True)
 class Number:
-    """A number of a NumPy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1.
-
-    `coding` is protobuf's encoding of integers: "varint", "zigzag" (sint32, ...) or "fixed"
-    (fixed32, ...).
-    """
+    """A number of a NumPy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1."""
 
     kind: str
-    coding: str = "varint"
 
     @property
     def size(self) -> int:
@@ -65,12 +59,11 @@ class Array:
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A named member of a struct; `number` is that of protobuf, `default` the value if absent."""
+    """A named member of a struct; `number` is that of protobuf."""
 
     name: str
     type: Type
     number: int = 0
-    default: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +72,7 @@ class Struct:
 
     name: str
     fields: tuple[Field, ...]
+    definition: bytes | None = None  # of protobuf, serialised
 
     @cached_property
     def by_name(self) -> dict[str, Field]:
@@ -202,7 +196,7 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
             objects.append(json.loads(buffer[a:b]))
         except (ValueError, RecursionError) as error:
             raise BadMessage(i, "decode", what="JSON", why=str(error)) from None
-    return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
+    return _JsonNode(Dynamic(), np.arange(len(objects)), as_array(objects))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,16 +215,14 @@ class _JsonNode(Node):
 
     def field(self, name: str) -> _JsonNode:
         index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
-        inner = _as_array([self.objects[i][name] for i in index])
+        inner = as_array([self.objects[i][name] for i in index])
         return replace(self, rows=self.rows[np.array(index, dtype=np.int64)], objects=inner)
 
     def items(self, start: int, stop: int) -> _JsonNode:
         lists = [o if isinstance(o, list) else [] for o in self.objects]
         row, index = choose_items(np.array(list(map(len, lists)), dtype=np.int64), start, stop)
         pairs = zip(row.tolist(), index.tolist(), strict=True)
-        return replace(
-            self, rows=self.rows[row], objects=_as_array([lists[i][j] for i, j in pairs])
-        )
+        return replace(self, rows=self.rows[row], objects=as_array([lists[i][j] for i, j in pairs]))
 
     def numbers(self) -> Floats:
         values = np.empty(len(self.objects))
@@ -248,7 +240,8 @@ class _JsonNode(Node):
         return np.array([o == text for o in self.objects], dtype=np.bool_)
 
 
-def _as_array(objects: list[Any]) -> NDArray[np.object_]:
+def as_array(objects: list[Any]) -> NDArray[np.object_]:
+    """Return a list as an array of objects (N,)."""
     return np.fromiter(objects, np.object_, len(objects))
 
 

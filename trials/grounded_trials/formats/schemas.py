@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 from grounded_trials.formats.bad import BadSchema
@@ -66,7 +67,7 @@ def _own_type(data: bytes, name: str) -> Struct | None:
     if own != data or not name.startswith("grounded."):
         return None
     kind = Array(Number("f8")) if repeated else Number("f8")
-    return Struct(name, tuple(Field(field, kind, i) for i, field in enumerate(names, start=1)))
+    return Struct(name, tuple(Field(n, kind, i) for i, n in enumerate(names, start=1)), data)
 
 
 _PROTOBUF: dict[int, Type] = {
@@ -75,17 +76,17 @@ _PROTOBUF: dict[int, Type] = {
     3: Number("i8"),
     4: Number("u8"),
     5: Number("i4"),
-    6: Number("u8", "fixed"),
-    7: Number("u4", "fixed"),
+    6: Number("u8"),
+    7: Number("u4"),
     8: Number("b1"),
     9: Text(),
     12: Text(),
     13: Number("u4"),
     14: Number("i4"),
-    15: Number("i4", "fixed"),
-    16: Number("i8", "fixed"),
-    17: Number("i4", "zigzag"),
-    18: Number("i8", "zigzag"),
+    15: Number("i4"),
+    16: Number("i8"),
+    17: Number("i4"),
+    18: Number("i8"),
 }
 MESSAGE, REPEATED = 11, 3
 NUMBER_LIMIT = 2**29  # largest number of a field, exclusive
@@ -104,7 +105,7 @@ def parse_protobuf(data: bytes, name: str) -> Struct:
     try:
         for file in FileDescriptorSet.FromString(data).file:
             types.collect(file.message_type, file.package)
-        return types.struct(name)
+        return replace(types.struct(name), definition=data)
     except (DecodeError, TypeError, ValueError, RecursionError) as error:
         raise BadSchema("decode", what="definition", why="damaged", at=str(error)[:80]) from None
 
@@ -143,18 +144,7 @@ class _ProtobufTypes:
         kind: Type = _PROTOBUF.get(code) or self.struct(field.type_name.lstrip("."))
         if field.label == REPEATED:
             return Field(field.name, Array(kind), field.number)
-        return Field(field.name, kind, field.number, _default(kind, field.default_value))
-
-
-def _default(kind: Type, text: str) -> float:
-    if not isinstance(kind, Number) or not text:
-        return 0.0
-    if text in ("true", "false"):
-        return float(text == "true")
-    try:
-        return float(text)
-    except ValueError:  # an enum's name; its number would need the enum's definition
-        return 0.0
+        return Field(field.name, kind, field.number)
 
 
 _IDL_FILE = re.compile(r"^={3,}[^\S\n]*\nIDL:[^\n]*$", re.MULTILINE)

@@ -33,7 +33,7 @@ from grounded_trials.formats.messages import (
     json_messages,
 )
 from grounded_trials.formats.path_walk import Bound, NoField, Values, bind, evaluate
-from grounded_trials.formats.protobuf import protobuf_messages
+from grounded_trials.formats.protobuf import message_class, protobuf_messages
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.log_files import log_records, read_apart
@@ -218,8 +218,9 @@ class Decoder:
     root: Callable[[bytes, Ints, Ints], Node] = field(repr=False)
 
     def parts(self, batch: Messages) -> Iterator[Messages]:
-        """Split a batch into pieces to decode at once, since parsed JSON takes much memory."""
-        if not isinstance(self.type, Dynamic) or not len(batch):
+        """Split a batch into pieces to decode at once, since parsed messages take much memory."""
+        parsed = isinstance(self.type, Dynamic) or getattr(self.type, "definition", None)
+        if not parsed or not len(batch):
             yield batch
             return
         piece = np.cumsum(batch.ends - batch.starts) // JSON_PIECE
@@ -248,6 +249,8 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
     if schema is None:
         raise BadSchema("decode", what="schema", at=encoding)
     type, read = struct_of(schema), _READERS[encoding]
+    if encoding == "protobuf":
+        message_class(schema.data, schema.name)
     return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
 
 

@@ -35,7 +35,6 @@ from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
 from grounded_trials.formats.messages import Number, Struct
 from grounded_trials.formats.protobuf import (
-    ProtobufItems,
     double_tag,
     doubles_tag,
     protobuf_messages,
@@ -208,9 +207,11 @@ class OwnFile:
         try:
             root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
             found = root.field(name)
-            if isinstance(found, ProtobufItems):
+            if isinstance(found.type, ArrayType):
                 found = found.items(0, -1)
             return found.numbers(), np.bincount(found.rows, minlength=len(batch))
+        except BadSchema as error:
+            raise unreadable(self.name, error) from None
         except BadMessage as error:
             raise DamagedFile(
                 self.name, 0, "record", f"message {error.message}", str(error)
