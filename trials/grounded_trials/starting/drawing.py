@@ -46,7 +46,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids, unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven, usual_weights
-from grounded_trials.workspace.user_files.config import TaskTable, set_start
+from grounded_trials.workspace.user_files.config import TaskTable, set_numbers
 from grounded_trials.workspace.user_files.task_file import read_target, seen_in, without_range
 
 
@@ -240,7 +240,7 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     path = replace_target(workspace.config, columns, model, *extra)
     ran = bool(workspace.candidate_ids())
     if rest:
-        set_start(workspace.config.file, rest)
+        set_numbers(workspace.config.file, "task", start=rest)
     workspace.forget()
 
     # What is told of it.

@@ -17,6 +17,8 @@ from grounded.diagnosis.telling import NEXT
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
+from grounded.rollout import Rollout, simulate
+from grounded.search.candidate import Candidate
 from grounded.share import Share
 from grounded_trials.workspace.adoption import equivalent_when_adopted, tied_when_adopted
 from grounded_trials.workspace.identity import unsure_times
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.frozen import Array
     from grounded.policy import Policy
-    from grounded.search.candidate import Candidate
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -305,7 +306,9 @@ def _probe(
         asks = offer and not found.contested  # it is the trial that is asked for, if one
         if not (worth and offer):
             return "", made.step if asks else None
-        candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
+        policy = planner.narrowed(made.policy)
+        run = simulate(planner.plan.problem(exact=True), planner.widened(policy))
+        candidate = probe_candidate(workspace, policy, run, best.candidate.id, run.utility)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:
             saved = workspace.save_probe(candidate)
@@ -314,14 +317,19 @@ def _probe(
     return "", finding("gap.no_probe", which="unsafe") if offer else None
 
 
-def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
-    """Return a probe as a candidate with the model's prediction; it is not stored yet."""
-    from grounded.rollout import simulate
-    from grounded.search.candidate import Candidate
+def probe_candidate(
+    workspace: Folder, policy: Policy, run: Rollout | Trial, base: str = "", worth: float = math.nan
+) -> Candidate:
+    """Return a policy that is no step of the search as a candidate; it is not stored yet.
 
-    planner = workspace.planner
-    task = planner.plan
-    predicted = simulate(task.problem(exact=True), planner.widened(policy))
+    Args:
+        workspace: the workspace.
+        policy: in the model's own states.
+        run: its predicted run, in the planning model's states.
+        base: the candidate that it was made from, if any.
+        worth: the predicted utility.
+    """
+    planner, model = workspace.planner, workspace.base_model
     return Candidate(
         id=workspace.next_id(),
         policy=policy,
@@ -329,10 +337,10 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
         alpha=1.0,
         base=base,
         model=planner.fingerprint,
-        predicted_states=predicted.states[:, : planner.task.model.n],
-        predicted_inputs=predicted.inputs,
-        predicted_utility=predicted.utility,
-        units={**planner.task.model.states, **planner.task.model.inputs},
+        predicted_states=run.states[:, : model.n],
+        predicted_inputs=run.inputs,
+        predicted_utility=worth,
+        units={**model.states, **model.inputs},
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,13 +15,12 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.result import UNSAID, Document
-from grounded.search.candidate import Candidate
 from grounded.search.scatter import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting
 from grounded_trials.workspace.candidates.exporting import to_run
-from grounded_trials.workspace.diagnosing import near
+from grounded_trials.workspace.diagnosing import near, probe_candidate
 from grounded_trials.workspace.folder import Folder
 
 LENGTHS = (5.0, 10.0, 20.0, 40.0)  # [s] that are tried until no parameter stays weak
@@ -95,7 +93,8 @@ def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
     if drive is None:
         raise GroundedError(found("plan.no_drive"))
     told = [found("plan.drive_weak", *drive.weak)] if drive.weak else []
-    candidate = _stored(workspace, drive)
+    policy = workspace.planner.narrowed(drive.policy)
+    candidate = workspace.save_probe(probe_candidate(workspace, policy, drive.run))
     slow, quick = drive.cycles
     long = drive.policy.horizon * drive.policy.dt
     params = ((one, share, task.model.params[one]) for one, share in drive.left.items())
@@ -145,22 +144,3 @@ def _as_known(workspace: Folder, model: Model) -> Model:
         if one.uncertain and name in known and 0 < known[name].std < one.spread
     }
     return replace(model, params={**model.params, **told})
-
-
-def _stored(workspace: Folder, drive: Drive) -> Candidate:
-    """Write a drive as a candidate that is none of the search."""
-    planner, n = workspace.planner, workspace.base_model.n
-    model = workspace.base_model
-    candidate = Candidate(
-        id=workspace.next_id(),
-        policy=planner.narrowed(drive.policy),
-        iteration=0,
-        alpha=1.0,
-        base="",
-        model=planner.fingerprint,
-        predicted_states=drive.run.states[:, :n],
-        predicted_inputs=drive.run.inputs,
-        predicted_utility=math.nan,
-        units={**model.states, **model.inputs},
-    )
-    return workspace.save_probe(candidate)

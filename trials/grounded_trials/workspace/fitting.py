@@ -24,7 +24,7 @@ from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
-from grounded_trials.workspace.user_files.config import set_in_model, set_latency
+from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault
@@ -209,7 +209,8 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
     own, effects = settled(values, table.effects)
     if "latency" in found.params and found.params["latency"].identified:
         delays = zip(base.input_names, found.latency, strict=True)
-        set_latency(workspace.config.file, {name: round(float(d), 6) for name, d in delays})
+        late = {name: round(float(d), 6) for name, d in delays}
+        set_numbers(workspace.config.file, "task", latency=late)
         effects = [e for e in effects if not str(e["name"]).startswith("delay:")]
     set_in_model(
         workspace.config.file,

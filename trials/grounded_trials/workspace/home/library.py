@@ -41,7 +41,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held
 from grounded_trials.workspace.home.yaml_file import as_yaml, number_in, read_yaml
 from grounded_trials.workspace.last_diagnosis import usable_ids
-from grounded_trials.workspace.user_files.config import set_in_model, set_priors
+from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
 
 # what each number of the file is: an effect of the input, its quantity
 KEYS = {
@@ -140,7 +140,7 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
         for name in inputs:
             _begin(path, table, name, driven.get(name, ""), effects, priors)
     set_in_model(workspace.config.file, effects=effects)
-    set_priors(workspace.config.file, priors)
+    set_numbers(workspace.config.file, "model", priors=priors)
     workspace.forget()
     _ = workspace.planner  # raises if the model can't be built from them
     return tuple(effects)

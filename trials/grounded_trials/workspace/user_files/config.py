@@ -220,19 +220,9 @@ def as_toml(
     return found
 
 
-def set_priors(file: Path, priors: Mapping[str, float]) -> None:
-    """Replace [model] priors."""
-    _change(file, "model", {"priors": _inline(priors)})
-
-
-def set_latency(file: Path, latency: Mapping[str, float]) -> None:
-    """Replace [task] latency."""
-    _change(file, "task", {"latency": _inline(latency)})
-
-
-def set_start(file: Path, start: Mapping[str, float]) -> None:
-    """Replace [task] start."""
-    _change(file, "task", {"start": _inline(start)})
+def set_numbers(file: Path, table: str, **values: Mapping[str, float]) -> None:
+    """Replace numbers by name, such as start, latency or priors, in a table of grounded.toml."""
+    _change(file, table, {key: _inline(numbers) for key, numbers in values.items()})
 
 
 def set_target(
