@@ -58,19 +58,12 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "sample_age": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
+# of files of earlier versions
+_ABSENT = dict.fromkeys(("way", "slopes", "seen"), "") | {"predicted_gain": "nan", "damping": "1.0"}
+_ABSENT |= dict.fromkeys(("caution", "likely_off", "sample_age"), "0.0")
 T = TypeVar("T")
 MOST_KNOWN = 2**25  # bytes of candidates' files about which something is kept; at least FEW files
 FEW = 4
-_ABSENT = {
-    "predicted_gain": "nan",
-    "damping": "1.0",
-    "caution": "0",
-    "way": "",
-    "slopes": "",
-    "likely_off": "0.0",
-    "sample_age": "0.0",
-    "seen": "",
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,13 +45,26 @@ def read_by(mapping: LogMapping) -> dict[str, str]:
     return {READ_BY: json.dumps(found)}
 
 
+def _keys_by(meta: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Return the path and the numbers by which [log] read each signal of a trial.
+
+    {} if its metadata, which are not trusted, do not say.
+    """
+    try:
+        return {
+            str(name): {"path": str(own.get("path", ""))}
+            | {key: float(own.get(key, usual)) for key, usual in PLAIN.items()}
+            for name, own in json.loads(meta.get(READ_BY, "{}")).items()
+        }
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
 def paths_of(meta: Mapping[str, str], names: Sequence[str]) -> tuple[str, ...]:
     """Return the columns from which [log] read some signals of a trial; () if it does not say."""
-    try:
-        before = json.loads(meta[READ_BY])
-        return tuple(str(before[name]["path"]) for name in names)
-    except (KeyError, ValueError, TypeError, RecursionError):
-        return ()
+    known = _keys_by(meta)
+    found = tuple(known[name]["path"] for name in names if name in known)
+    return found if len(found) == len(names) and all(found) else ()
 
 
 def read_otherwise(
@@ -60,24 +73,17 @@ def read_otherwise(
     """Return the signals of a trial that [log] reads in another way now.
 
     Args:
-        meta: the trial's metadata, which is not trusted.
+        meta: the trial's metadata.
         mapping: the present [log].
         corrected: signals with a key of theirs that may differ.
     """
-    if mapping is None or READ_BY not in meta:
-        return ()
-    try:
-        before = {str(name): dict(keys) for name, keys in json.loads(meta[READ_BY]).items()}
-        was = {n: {k: float(own.get(k, v)) for k, v in PLAIN.items()} for n, own in before.items()}
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return ()
-    found = []
-    for name, spec in {**mapping.states, **mapping.inputs}.items():
-        if name not in before:
+    before, found = _keys_by(meta), list[str]()
+    for name, spec in {**mapping.states, **mapping.inputs}.items() if mapping else ():
+        if (was := before.get(name)) is None:
             continue
-        elsewhere = before[name].get("path", spec.path) != spec.path
         keys = [key for key in PLAIN if (name, key) not in corrected]
-        if elsewhere or not all(np.isclose(was[name][key], getattr(spec, key)) for key in keys):
+        same = all(np.isclose(was[key], getattr(spec, key)) for key in keys)
+        if was["path"] not in ("", spec.path) or not same:
             found.append(name)
     return tuple(found)
 
@@ -293,10 +299,7 @@ def _whole(finding: Finding, meta: Mapping[str, str]) -> Mapping[str, Any]:
 
 
 def _keys(meta: Mapping[str, str], signal: str) -> dict[str, float]:
-    """Return the keys by which a signal was read, {} if unchanged or invalid (untrusted file)."""
-    try:
-        found = json.loads(meta.get(READ_BY, "{}")).get(signal, {})
-        keys = PLAIN | {key: float(found[key]) for key in PLAIN if key in found}
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return {}
-    return keys if all(map(math.isfinite, keys.values())) and keys != PLAIN else {}
+    """Return the keys by which a signal was read, {} if unchanged or not known."""
+    found = _keys_by(meta).get(signal, {})
+    keys = {key: found[key] for key in PLAIN if key in found}
+    return keys if keys != PLAIN and all(map(math.isfinite, keys.values())) else {}

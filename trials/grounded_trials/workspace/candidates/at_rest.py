@@ -212,6 +212,7 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
     return found(
         "plan.not_at_rest",
         states[k],
+        then=NextCommand("propose"),  # after [task] start is changed
         held=held,
         state=states[k],
         rate=Quantity(rate[k], per_second(units[states[k]])),

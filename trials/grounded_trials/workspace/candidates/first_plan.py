@@ -20,7 +20,8 @@ from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import rendered
-from grounded_trials.workspace.candidates.at_rest import drawn
+from grounded_trials.workspace.candidates.at_rest import drawn, held_before, to_end_at_rest
+from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.new_target import still_logged
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
@@ -48,11 +49,13 @@ class Plan:
         workspace: a workspace in which nothing was run yet.
         made: the first candidate; None if it was refused.
         refused: the refused one; None if there is a candidate.
+        again: whether another model was used for an earlier plan.
     """
 
     workspace: Folder
     made: Candidate | None
     refused: Candidate | None
+    again: bool = False
 
     @property
     def task(self) -> Task:
@@ -71,20 +74,24 @@ class Plan:
             yield name, float(np.any(at, axis=0).mean()) if at else 0.0
 
 
-def left_open(workspace: Folder, proposal: Proposal, held: Finding | None) -> list[Finding]:
+def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Finding]:
     """Return what the operator should know of the configuration before the first run.
+
+    If one has a command, that comes first: a second `propose` hands the candidate out.
 
     Args:
         workspace: a workspace in which nothing was run yet.
         proposal: the first plan, or why there is none.
-        held: the result of `at_rest.held_before`.
+        again: whether another model was used for an earlier plan.
     """
-    plan = Plan(workspace, proposal.candidate, proposal.refused)
-    told = [one for check in CHECKS for one in check(plan)]
-    loose = any(one.code == "plan.unguarded" for one in told)
-    if plan.refused is not None and not held and not loose and leaving(plan).any():
+    plan, told = Plan(workspace, proposal.candidate, proposal.refused, again), list[Finding]()
+    for check in CHECKS:
+        asked = any(one.then for one in told)
+        told += [one for one in check(plan) if not (one.then and asked)]
+    unsaid = not {"plan.unguarded", "plan.not_at_rest"} & {one.code for one in told}
+    if plan.refused is not None and unsaid and leaving(plan).any():
         told.append(found("plan.leaves"))
-    return told + ([held] if held else [])
+    return told
 
 
 def no_motion(plan: Plan) -> Iterator[Finding]:
@@ -253,6 +260,21 @@ def unused_rows(plan: Plan) -> Iterator[Finding]:
         yield found("file.rows", name, rows=str(rows), used=used, weight=Weight.NOTE)
 
 
+def not_at_rest(plan: Plan) -> Iterator[Finding]:
+    """The robot is not at rest at its start, but would be under another input."""
+    if one := held_before(plan.workspace, plan.again):
+        yield one
+
+
+def leaves_after_its_end(plan: Plan) -> Iterator[Finding]:
+    """A line's plan leaves [safety] after its end: it can be drawn so that it ends at rest."""
+    if plan.made is None or (rest := to_end_at_rest(plan.workspace, plan.made)) is None:
+        return
+    name = plan.made.id
+    command = rendered(to_run(plan.workspace, name), plan.workspace.address)
+    yield found("plan.draw_again", then=rest, candidate=name, command=command)
+
+
 CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (
     no_motion,
     no_limits,
@@ -263,4 +285,6 @@ CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (
     rough,
     unguarded,
     unused_rows,
+    not_at_rest,
+    leaves_after_its_end,
 )

@@ -50,8 +50,6 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.adoption import Settled
     from grounded_trials.workspace.identity import StoredTrial
 
-PROPOSE = NextCommand("propose")
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposed(Result):
@@ -175,13 +173,13 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if candidate is not None:
         notes = notes + left if not proposal.is_new else notes or left or _void(workspace, before)
         notes = [one.knowing({"instead": candidate.id}) for one in notes]
-    held: Finding | None = None
+    first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
-        from grounded_trials.workspace.candidates.at_rest import held_before
         from grounded_trials.workspace.candidates.first_plan import left_open
 
-        held = held_before(workspace, _other_model(workspace, before))
-        notes += left_open(workspace, proposal, held)
+        first = left_open(workspace, proposal, _other_model(workspace, before))
+        notes += first
+    asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)
     lacks = _lacks(workspace, status.diagnosis) if candidate and status.diagnosis else None
     unsure = (
@@ -189,17 +187,8 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     )
     notes += [one for one in (lacks, now.doubt if unsure else None) if one]
     if candidate is None:
-        return _ended(workspace, proposal, status, notes, held)
-    # the user should first correct the held input; a second `propose` hands the candidate out
-    then = PROPOSE if held else to_run(workspace, candidate.id)
-    if not held and proposal.is_new and not now.trials:
-        from grounded_trials.workspace.candidates.at_rest import to_end_at_rest
-
-        if (rest := to_end_at_rest(workspace, candidate)) is not None:
-            own = rendered(then, workspace.address)
-            note = found("plan.draw_again", then=rest, candidate=candidate.id, command=own)
-            then, notes = rest, [*notes, note]
-    return _told(workspace, proposal, status, notes, then)
+        return _ended(workspace, proposal, status, notes, asked)
+    return _told(workspace, proposal, status, notes, asked or to_run(workspace, candidate.id))
 
 
 def _ended(
@@ -207,14 +196,14 @@ def _ended(
     proposal: Proposal,
     status: Status,
     notes: Sequence[Finding],
-    held: Finding | None,
+    asked: NextCommand | None,
 ) -> Proposed:
     """Return that there is nothing to run; who proposes goes on after a run that was doubted."""
     from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 
-    _, asked = unanswered(workspace)
-    if asked is not None:  # no candidate is handed out to show that the user goes on
-        digest = workspace.store.find(asked.arguments[0]).digest
+    _, doubted = unanswered(workspace)
+    if doubted is not None:  # no candidate is handed out to show that the user goes on
+        digest = workspace.store.find(doubted.arguments[0]).digest
         gone_on = {"note": "restore", "trial": digest, "why": ""}
         with suppress(GroundedError):  # a folder that can't be written
             workspace.notes.add(gone_on, again=False)
@@ -224,8 +213,7 @@ def _ended(
     if best and converged and best.candidate.model != workspace.planner.fingerprint:
         notes = [*notes, found("plan.no_better", best.candidate.id)]
     over = replace(proposal, standing=status.standing)
-    then = PROPOSE if held else status.then  # after [task] start is changed, as noted
-    return Proposed(over, None, then, settle((*proposal.findings, *notes)))
+    return Proposed(over, None, asked or status.then, settle((*proposal.findings, *notes)))
 
 
 def _told(
