@@ -95,8 +95,8 @@ def command(
 def following(log: str, candidate: str | None, details: bool, json_: bool) -> None:
     """Ingest a log, show the verdict, propose, and export for the robot.
 
-    Does the same as `ingest LOG`, `propose` and `export ID --runner`; the candidate is written into
-    the workspace's folder.
+    Does the same as `ingest LOG`, `propose` and `export ID --runner`, or `export` in the format in
+    which the last candidate was exported; the file is written into the workspace's folder.
     """
     from grounded_cli.propose import tell_proposed
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -111,7 +110,7 @@ def replace_target(
     rows = len(next(iter(columns.values())))
     name = config.task.target or "target.csv"
     path = config.file.parent / name
-    befores, given = [dict[str, float]()], dict[str, Array]()
+    usual, given = dict[str, float](), dict[str, Array]()
     old = None
     if path.is_file():
         try:
@@ -121,8 +120,7 @@ def replace_target(
         with suppress(GroundedError, ValueError):  # an unreadable target is replaced
             names, values = read_target(path)
             given = dict(zip(names[1:], values.T[1:], strict=True))
-            plain = replace(model, roles={})  # which may have been added since that target
-            befores = [usual_weights(one, given) for one in (model, plain)]
+            usual = usual_weights(model, given)
         write_atomically(path.with_name(path.name + ".bak"), old)
         write_atomically(config.file.with_name(config.file.name + ".bak"), config.file.read_bytes())
     write_target(path, config.task.dt, columns)
@@ -132,7 +130,7 @@ def replace_target(
             name,
             rows - 1,
             weights,
-            befores,
+            usual,
             limited_changes(config, model),
             terminal,
             [one for one in given if one not in columns],

@@ -230,23 +230,23 @@ def set_target(
     name: str,
     steps: int,
     weights: Mapping[str, float],
-    befores: Sequence[Mapping[str, float]],
+    usual: Mapping[str, float],
     changes: Mapping[str, tuple[float, float]],
     terminal: Mapping[str, float] = MappingProxyType({}),
     left: Sequence[str] = (),
 ) -> None:
     """Replace [task] target and horizon, and the weights of [reward] not chosen by the user.
 
-    [reward] state counts as not chosen if it is empty, equals one of `befores`, or is 1 for each of
-    their states (as `init --blank` writes it). In that case [reward] input_change is replaced too,
-    for the inputs whose weight is still what `init` wrote.
+    [reward] state counts as not chosen if it is empty, equals `usual`, or is 1 for each of its
+    states (as `init --blank` writes it). In that case [reward] input_change is replaced too, for
+    the inputs whose weight is still what `init` wrote.
 
     Args:
         file: grounded.toml.
         name: the file of the target.
         steps: the horizon.
         weights: the new weights of states.
-        befores: the weights that the previous target gave, by the model's roles now, and without.
+        usual: the weights that the previous target gave.
         changes: by input, its weight on changes without [limits], and with them.
         terminal: weights for [reward] terminal of states that have none there.
         left: states that had a column in the previous target and have none now. Weights that they
@@ -259,8 +259,8 @@ def set_target(
     _put(document, "task", {"target": name, "horizon": steps})
     reward = document.get("reward", {})
     own, ends = dict(reward.get("state", {})), dict(reward.get("terminal", {}))
-    given = [{k: w for k, w in one.items() if k in own or k not in ends} for one in befores]
-    given += [dict.fromkeys(one, 1.0) for one in given[:1]]
+    given = [{k: w for k, w in usual.items() if k in own or k not in ends}]
+    given.append(dict.fromkeys(given[0], 1.0))
     alike = [
         one
         for one in given
