@@ -94,32 +94,44 @@ class MessagePath:
     functions: tuple[Function, ...] = ()
 
 
+_NAME = r"[A-Za-z0-9_\-]+"
+_QUOTED = r"""'[^']+'|"[^"]+\""""
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_TOPIC = re.compile(r"[^\s.\[\]{}\"'@=<>!&]+")
+_FIRST = re.compile(rf"{_QUOTED}|{_TOPIC.pattern}")
+_STEP = re.compile(
+    rf"""
+    \.@(?P<function>\w+) (?:\((?P<argument>[^()]*)\))? |
+    \.(?P<field>{_NAME}|{_QUOTED}) |
+    \[(?P<start>-?\d{{1,9}})?(?P<range>:(?P<stop>-?\d{{1,9}})?)?\] |
+    \{{(?P<filters>(?:[^{{}}'"]|'[^']*'|"[^"]*")*)\}}
+    """,
+    re.VERBOSE,
+)
+_CONDITION = re.compile(
+    rf"""\s*(?P<path>{_NAME}(?:\.{_NAME})*)\s*(?P<operator>[=!<>]=|[<>])\s*
+    (?:(?P<text>'[^']*'|"[^"]*")|(?P<value>true|false|{_NUMBER}))\s*(?:&&|$)""",
+    re.VERBOSE,
+)
+_EXPECTED = {  # by the first character of what can't be read
+    ".": "a field's name or '@function'",
+    "[": "'[index]' or '[from:to]'",
+    "{": "'{field == value}', == or != before a text",
+}
+
+
 def parse_path(text: str) -> MessagePath:
     """Parse a message path.
 
     Raises:
         GroundedError: if it is invalid, stating the character.
     """
-    return _parsed(text) if isinstance(text, str) else _Parser(text).path()
-
-
-@lru_cache(maxsize=4096)
-def _parsed(text: str) -> MessagePath:
-    return _Parser(text).path()
-
-
-_NAME = re.compile(r"[A-Za-z0-9_\-]+")
-_TOPIC = re.compile(r"[^\s.\[\]{}\"'@=<>!&]+")
-_INTEGER = re.compile(r"-?\d{1,9}(?!\d)")
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_WORD = re.compile(r"[A-Za-z0-9_]+")
-_OPERATOR = re.compile(r"==|!=|<=|>=|<|>")
-_BLANK = re.compile(r"\s*")
+    return _parsed(text) if isinstance(text, str) else _fail(str(text), 0, "/topic.field")
 
 
 def is_name(text: str) -> bool:
     """Check whether a field's name needs no quotes."""
-    return _NAME.fullmatch(text) is not None
+    return re.fullmatch(_NAME, text) is not None
 
 
 def is_topic(text: str) -> bool:
@@ -127,161 +139,74 @@ def is_topic(text: str) -> bool:
     return _TOPIC.fullmatch(text) is not None
 
 
-class _Parser:
-    def __init__(self, text: str) -> None:
-        self.text, self.pos = text, 0
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> MessagePath:
+    if len(text) > LENGTH_LIMIT:
+        _fail(text, LENGTH_LIMIT, "its end")
+    if (first := _FIRST.match(text)) is None:
+        _fail(text, 0, "a topic" if text.strip() else "/topic.field")
+    steps, functions, at = list[Step](), list[Function](), first.end()
+    while at < len(text):
+        if (seen := _STEP.match(text, at)) is None or (functions and not seen["function"]):
+            usual = "a function or the end" if functions else "'.field', '[index]', '{filter}'"
+            _fail(text, at, usual if seen else _EXPECTED.get(text[at], usual))
+        elif seen["function"]:
+            function, at = _function(text, at, seen)
+            functions.append(function)
+            continue
+        elif seen["field"]:
+            steps.append(Field(_bare(seen["field"])))
+        elif seen["filters"] is not None:
+            steps += _filters(text, at, seen["filters"])
+        elif seen["range"] is None and seen["start"] is None:
+            _fail(text, at, _EXPECTED["["])
+        else:
+            start = int(seen["start"] or 0)
+            stop = start if seen["range"] is None else int(seen["stop"] or -1)
+            steps.append(Slice(start, stop))
+        at = seen.end()
+    return MessagePath(text, _bare(first[0]), tuple(steps), tuple(functions))
 
-    def path(self) -> MessagePath:
-        if not isinstance(self.text, str) or not self.text.strip():
-            self.fail("/topic.field")
-        if len(self.text) > LENGTH_LIMIT:
-            self.pos = LENGTH_LIMIT
-            self.fail("its end")
-        topic = self.name(_TOPIC, "a topic")
-        steps: list[Step] = []
-        functions: list[Function] = []
-        while self.pos < len(self.text):
-            if self.text.startswith(".@", self.pos):
-                functions.append(self.function())
-            elif functions:
-                self.fail("a function or the end")
-            else:
-                steps.extend(self.step())
-        return MessagePath(self.text, topic, tuple(steps), tuple(functions))
 
-    def step(self) -> list[Step]:
-        mark = self.peek()
-        if mark == ".":
-            self.pos += 1
-            return [Field(self.name(_NAME, "a field's name"))]
-        if mark == "[":
-            return [self.slice()]
-        if mark == "{":
-            return list(self.filters())
-        self.fail("'.field', '[index]', '{filter}' or '.@function'")
+def _bare(name: str) -> str:
+    return name[1:-1] if name[0] in "'\"" else name
 
-    def slice(self) -> Slice:
-        self.pos += 1
-        start = self.integer()
-        if self.take("]"):
-            if start is None:
-                self.fail("an index or ':'")
-            return Slice(start, start)
-        self.expect(":", "':' or ']'")
-        stop = self.integer()
-        self.expect("]")
-        return Slice(0 if start is None else start, -1 if stop is None else stop)
 
-    def integer(self) -> int | None:
-        if self.peek() == "$":
-            self.fail("a number")
-        seen = _INTEGER.match(self.text, self.pos)
-        if not seen:
-            return None
-        self.pos = seen.end()
-        return int(seen[0])
+def _filters(text: str, at: int, inside: str) -> list[Filter]:
+    """Return the conditions between braces, joined by &&."""
+    found, pos, goes_on = list[Filter](), 0, True
+    while goes_on:
+        seen = _CONDITION.match(inside, pos)
+        if seen is None or (seen["text"] and seen["operator"] not in ("==", "!=")):
+            _fail(text, at + 1 + pos, _EXPECTED["{"])
+        truth = {"true": 1.0, "false": 0.0}
+        value = truth[seen["value"]] if seen["value"] in truth else float(seen["value"] or 0.0)
+        said = value if seen["text"] is None else seen["text"][1:-1]
+        found.append(Filter(tuple(seen["path"].split(".")), seen["operator"], said))
+        pos, goes_on = seen.end(), seen[0].endswith("&&")
+    return found
 
-    def filters(self) -> list[Filter]:
-        self.pos += 1
-        seen = [self.filter()]
-        while self.take("&&"):
-            seen.append(self.filter())
-        self.expect("}")
-        return seen
 
-    def filter(self) -> Filter:
-        self.blank()
-        names = [self.match(_NAME, "a field's name")]
-        while self.take("."):
-            names.append(self.match(_NAME, "a field's name"))
-        self.blank()
-        operator = self.match(_OPERATOR, "== != < <= > or >=")
-        self.blank()
-        value = self.value()
-        self.blank()
-        if isinstance(value, str) and operator not in ("==", "!="):
-            self.fail("== or != before a text")
-        return Filter(tuple(names), operator, value)
-
-    def value(self) -> float | str:
-        if self.peek() in ("'", '"'):
-            return self.quoted()
-        for word, value in (("true", 1.0), ("false", 0.0)):
-            if self.take(word):
-                return value
-        return float(self.match(_NUMBER, "a value"))
-
-    def function(self) -> Function:
-        at = self.pos
-        self.pos += 2
-        name = self.match(_WORD, "a function's name")
-        if name in _PARTS and self.take("."):
-            parts = _PARTS[name]
-            part = self.match(_WORD, f"{', '.join(parts[:-1])} or {parts[-1]}")
-            if part not in parts:
-                self.fail(f"{' or '.join(parts)}, not '{part}'")
-            return Function(part)
-        if name in _INSTEAD:
-            self.pos = at
-            self.fail(f"{_INSTEAD[name]}, not '@{name}'")
-        if name in BINARY:
-            return Function(name, self.argument(name))
-        if name != "norm" and name not in UNARY:
-            self.pos = at
-            close = alike(name, ["norm", *_PARTS, *UNARY, *BINARY]) or "norm"
-            self.fail(f"@{close}, not '@{name}'")
-        return Function(name)
-
-    def argument(self, name: str) -> float:
-        if not self.take("("):
-            self.fail(f"@{name}(2)")
-        value = float(self.match(_NUMBER, "a number"))
-        self.expect(")")
+def _function(text: str, at: int, seen: re.Match[str]) -> tuple[Function, int]:
+    """Return a function, and where the path goes on."""
+    name, given, end = seen["function"], seen["argument"], seen.end()
+    if name in _PARTS and given is None and (part := re.compile(r"\.(\w+)").match(text, end)):
+        if part[1] not in _PARTS[name]:
+            _fail(text, end, f"{' or '.join(_PARTS[name])}, not '{part[1]}'")
+        return Function(part[1]), part.end()
+    if name in _INSTEAD:
+        _fail(text, at, f"{_INSTEAD[name]}, not '@{name}'")
+    if name in BINARY:
+        value = float(given) if given and re.fullmatch(_NUMBER, given) else math.nan
         if not math.isfinite(value) or (name == "div" and value == 0):
-            self.fail("a finite number" + ", not 0" * (name == "div"))
-        return value
+            _fail(text, end, f"@{name}(2): a finite number" + ", not 0" * (name == "div"))
+        return Function(name, value), end
+    if given is not None or name not in ("norm", *UNARY):
+        close = alike(name, ["norm", *_PARTS, *UNARY, *BINARY]) or "norm"
+        _fail(text, at, f"@{close}, not '@{name}'")
+    return Function(name), end
 
-    def quoted(self) -> str:
-        mark = self.peek()
-        end = self.text.find(mark, self.pos + 1)
-        if end < 0:
-            self.fail(f"a closing {mark}")
-        value = self.text[self.pos + 1 : end]
-        self.pos = end + 1
-        return value
 
-    def name(self, pattern: re.Pattern[str], what: str) -> str:
-        if self.peek() not in ("'", '"'):
-            return self.match(pattern, what)
-        name = self.quoted()
-        if not name:
-            self.fail("a name")
-        return name
-
-    def peek(self) -> str:
-        return self.text[self.pos] if self.pos < len(self.text) else "\0"
-
-    def take(self, mark: str) -> bool:
-        if not self.text.startswith(mark, self.pos):
-            return False
-        self.pos += len(mark)
-        return True
-
-    def expect(self, mark: str, what: str = "") -> None:
-        if not self.take(mark):
-            self.fail(what or repr(mark))
-
-    def blank(self) -> None:
-        self.match(_BLANK, "a blank")
-
-    def match(self, pattern: re.Pattern[str], what: str) -> str:
-        seen = pattern.match(self.text, self.pos)
-        if not seen:
-            self.fail(what)
-        self.pos = seen.end()
-        return seen[0]
-
-    def fail(self, expected: str) -> NoReturn:
-        at = self.pos + 1 if self.pos < len(self.text) else 0
-        shown = str(self.text)[: LENGTH_LIMIT // 10]
-        raise GroundedError(found("file.path", path=shown, at=str(at), expected=expected))
+def _fail(text: str, at: int, expected: str) -> NoReturn:
+    place, shown = at + 1 if at < len(text) else 0, text[: LENGTH_LIMIT // 10]
+    raise GroundedError(found("file.path", path=shown, at=str(place), expected=expected))
