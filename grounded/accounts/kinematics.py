@@ -233,12 +233,11 @@ def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
 
 @dataclass(frozen=True)
 class Turned:
-    """The rates of states i and j rotate with heading k; their size depends on states `speed`."""
+    """The rates of states i and j rotate with heading k."""
 
     i: int
     j: int
     k: int
-    speed: tuple[int, ...]
 
 
 def turned(model: Model) -> Turned | None:
@@ -255,9 +254,7 @@ def turned(model: Model) -> Turned | None:
                 if k in (i, j) or i == j:
                     continue
                 if _near(slopes[:, i, k], -rates[:, j]) and _near(slopes[:, j, k], rates[:, i]):
-                    along = (rates[:, [i, j], None] * slopes[:, [i, j]]).sum(axis=1)
-                    size = np.abs(along).max(axis=0) > 1e-6
-                    return Turned(i, j, k, tuple(int(s) for s in np.flatnonzero(size) if s != k))
+                    return Turned(i, j, k)
     return None
 
 

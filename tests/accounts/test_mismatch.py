@@ -65,12 +65,12 @@ def sailed(seed: int, current: tuple[float, float] = (0.1, -0.06)) -> tuple[Arra
     return np.array(states) + NOISE * rng.normal(size=(301, 6)), np.array(inputs)
 
 
-def logged(model: Model, fault=lambda x: x, trials: int = 3) -> list[Trial]:
+def logged(model: Model, fault=lambda x: x, trials: int = 3, **how) -> list[Trial]:
     """Trials with the states of a model, after a fault (T, 6) -> (T, 6), or less at the start."""
     found = []
     shown = [NAMES.index(name) for name in model.state_names]
     for seed in range(trials):
-        states, inputs = sailed(seed)
+        states, inputs = sailed(seed, **how)
         names = (model.state_names, model.input_names)
         seen = fault(states)[:, shown]
         found.append(Trial(seen, inputs[len(states) - len(seen) :], DT, *names, id=f"t{seed:04}"))
@@ -152,10 +152,30 @@ def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(model, fault, 
     first = error.value.finding
     assert (first.code, first.about) == ("log.unit" if by else "log.exchange", about)
     if by:
-        assert first.facts["by"] == pytest.approx(by)
+        assert first.facts["by"] == pytest.approx(by, rel=1e-5)
         assert first.facts["tables"] == tuple(f"[log.state.{name}]" for name in about)
     assert error.value.then is not None
     assert error.value.then.arguments == ("t0000", "t0001", "t0002")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "names"),
+    [
+        ("knots", 1.943844, ("u", "v")),
+        ("knots", 1.943844, ("u",)),
+        ("km/h", 3.6, ("u", "v")),
+        ("mph", 2.236936, ("u", "v")),
+        ("feet", 3.28084, ("x", "y")),
+    ],
+)
+def test_speeds_and_positions_in_another_unit_are_named_with_it(unit, factor, names):
+    fault = times(**dict.fromkeys(names, factor))
+    for trial in logged(BOAT, fault, current=(0.0, 0.0)):
+        with pytest.raises(UnusableTrials) as stopped:
+            preflight(BOAT, [trial])
+        (one,) = stopped.value.findings
+        assert (one.code, one.about, one.facts["unit"]) == ("log.unit", names, unit)
+        assert one.facts["by"] == pytest.approx(1 / factor, rel=1e-5)
 
 
 def folded(x: Array) -> Array:
@@ -215,3 +235,35 @@ def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
     found = preflight(BOAT, logged(BOAT, positions_late(by)))
     assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
     assert not delayed(preflight(BOAT, found.trials).findings)
+
+
+def in_the_world(x: Array) -> Array:
+    y, (c, s) = np.array(x), (np.cos(x[:, 2]), np.sin(x[:, 2]))
+    y[:, 3], y[:, 4] = c * x[:, 3] - s * x[:, 4], s * x[:, 3] + c * x[:, 4]
+    return y
+
+
+def test_one_trial_with_speeds_in_other_axes_is_named_alone():
+    odd = [*logged(BOAT)[:2], logged(BOAT, in_the_world)[2]]
+    with pytest.raises(UnusableTrials) as stopped:
+        preflight(BOAT, odd)
+    assert stopped.value.finding.code == "log.axes"
+    assert stopped.value.then is not None and stopped.value.then.arguments == ("t0002",)
+
+
+def test_a_compass_heading_is_put_right_in_one_finding():
+    def compass(x: Array) -> Array:
+        return np.where(np.arange(6) == 2, np.pi / 2 - x, x)
+
+    for sound, odd in zip(logged(BOAT), logged(BOAT, compass), strict=True):
+        found = preflight(BOAT, [odd])
+        (one,) = found.findings
+        assert (one.signal, one.kind, one.scale) == ("psi", "sign", -1.0)
+        assert one.log == "scale = -1, offset = 1.5707963"
+        np.testing.assert_allclose(found.trials[0].states, sound.states, atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.08, 1.3, 2.05, 2.4, 3.0, 3.45, 1 / 1.943844])
+def test_a_slip_or_a_scale_of_another_size_is_no_unit(factor):
+    for trial in logged(BOAT, times(u=factor, v=factor)):
+        assert not {f.kind for f in preflight(BOAT, [trial]).findings} - {"mismatch"}

@@ -16,7 +16,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.workspace.intake.opening import cutting
+from grounded_trials.workspace.intake.opening import foreign
 from grounded_trials.workspace.intake.opening.run_start import recording
 from recorded import LOGGED, RATE, record, waiting
 from workspaces import make
@@ -207,7 +207,7 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
     renamed = w.ingest(copy, candidate="c0002")
     assert renamed.known and renamed.trial == first.trial and len(w.trials()) == 2
     with monkeypatch.context() as nothing:  # the search has ended
-        nothing.setattr(cutting, "outstanding", lambda *_: pytest.fail("asked for"))
+        nothing.setattr(foreign, "outstanding", lambda *_: pytest.fail("asked for"))
         assert w.ingest(copy).trial == first.trial
 
 

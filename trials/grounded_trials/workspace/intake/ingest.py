@@ -147,7 +147,7 @@ def ingest_log(
     if kind == TRIAL:
         read = read_own_trial(workspace, path, candidate, data)
     else:
-        from grounded_trials.workspace.intake.opening.cutting import read_log_file
+        from grounded_trials.workspace.intake.opening.foreign import read_log_file
 
         try:
             read = read_log_file(workspace, path, candidate, data, sent_before)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files, log_records, read_apart
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
@@ -28,19 +30,39 @@ from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, READ_BY, StoredTrial
+from grounded_trials.workspace.identity import (
+    ESTIMATED_WITH,
+    INTERPOLATED,
+    LASTED,
+    READ_BY,
+    ROWS,
+    StoredTrial,
+)
 from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
     with_estimates,
 )
+from grounded_trials.workspace.intake.opening.reading import (
+    Read,
+    about,
+    check_candidate,
+    encode,
+    outstanding,
+)
 from grounded_trials.workspace.intake.opening.run_start import Recording, recording
+from grounded_trials.workspace.intake.opening.stored_before import (
+    refuse_as_another,
+    refuse_known_data,
+    set_aside_of,
+)
 from grounded_trials.workspace.user_files.config import FILE
-from grounded_trials.workspace.where_to_mend import hashed, read_by
+from grounded_trials.workspace.where_to_mend import hashed, read_by, twice_in_time
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
+SLIGHT = 0.002  # of a control step, by which interpolated states may be early
 FEW = 12  # largest number of a log's signals that a message lists
 
 
@@ -328,3 +350,74 @@ def misread(log: ForeignLog) -> list[Finding]:
     """Return the signals that are read from each other's column, or angles from something else."""
     model = log.workspace.base_model
     return [*crossed(model, log.mapping), *no_angles(model, log.mapping)]
+
+
+# --- the trial in it ------------------------------------------------------------------------------
+
+
+def read_log_file(
+    workspace: Folder,
+    path: Path,
+    candidate: str | None,
+    data: bool,
+    sent_before: Mapping[str, float] = MappingProxyType({}),
+) -> Read:
+    """Read a foreign log through [log]; `sent_before`: inputs' values until their first samples.
+
+    Raises:
+        GroundedError: if it can't be mapped or sampled, if no candidate is outstanding, or if [log]
+            removes a delay that the model has as well.
+    """
+    if twice := twice_in_time(workspace):
+        raise GroundedError(twice)
+    log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
+    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
+    refuse_as_another(workspace, path, log.stored, "" if data else candidate)
+    if not (data or ran):
+        refuse_known_data(workspace, path, log.stored, None)
+    before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
+    if before and before.candidate in workspace.candidate_ids():
+        ran = before.candidate
+    chosen = "" if data else ran or outstanding(workspace, path)
+    if chosen:
+        refuse_as_another(workspace, path, log.stored, chosen)
+        check_candidate(workspace, path, chosen)
+    read = cut_log(log, chosen)
+    return replace(read, before=before) if before and chosen == ran else read
+
+
+def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
+    """Cut the trial from a log, from `start` [s] on; None: from [log.span] or the first command."""
+    trial, grid = log.cut(candidate, start)
+    facts = about(log.workspace, candidate) | log.source
+    facts |= {ROWS: f"{grid.row_s:.6g}"} if grid.row_s and not candidate else {}
+    early = grid.interpolated_s / trial.dt > SLIGHT
+    facts |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
+    encoded = encode(log.workspace, trial, facts, grid.start_ns)
+    remarks = [one for file in log_files(log.path) for one in about_table(file).findings]
+    return Read(
+        trial,
+        encoded,
+        (
+            *misread(log),
+            *log.unlike_units,
+            *log.unread,
+            *remarks,
+            *grid.findings,
+            *(() if candidate else begun(grid, trial.dt, trial.input_names)),
+        ),
+        grid.reports,
+        log=log,
+        cut=grid,
+        last_s=(grid.last_ns - grid.start_ns) * 1e-9,
+    )
+
+
+def cut_short(read: Read, steps: int, fell: Finding | None = None) -> Read:
+    """Cut a run in a foreign log after `steps`, where it failed, if it is longer."""
+    if read.log is None or read.cut is None or read.trial.steps <= steps:
+        return read
+    trial, workspace = read.trial.until(steps), read.log.workspace
+    facts = about(workspace, trial.candidate) | read.log.source
+    data = encode(workspace, trial, facts, read.cut.start_ns)
+    return replace(read, trial=trial, data=data).telling(*([fell] if fell else []))

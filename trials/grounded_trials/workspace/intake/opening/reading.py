@@ -1,4 +1,4 @@
-"""Read a trial written by grounded, before it is checked what it ran; `cutting` reads logs.
+"""Read a trial written by grounded, before it is checked what it ran; `foreign` reads logs.
 
 A trial written by grounded must have this workspace's model, time grid and task. If it contains the
 policy that it ran, that must equal this workspace's candidate to the last bit.
@@ -11,11 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, Weight, found
+from grounded.findings import Finding, Weight, found
 from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from grounded_trials.logs.resample import Gridded
     from grounded_trials.logs.signal_report import SignalReport
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
-
-HOLE = 10.0  # length of a gap, in usual intervals between samples, that is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +75,6 @@ class Read:
             return ()
         ends = self.cut.start_ns + round(1e9 * self.trial.steps * self.trial.dt)
         return self.log.silent_from(ends)
-
-    @property
-    def hole(self) -> dict[str, Any]:
-        """The longest gap in a log, if it is long, as facts."""
-        longest = max(self.signals, key=lambda one: one.largest_gap_s, default=None)
-        if longest is None or not longest.largest_gap_s * longest.rate_hz > HOLE:
-            return {}
-        return {"unknown": longest.name, "gap": Quantity(longest.largest_gap_s, "s")}
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:

@@ -37,7 +37,7 @@ from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.intake.opening.acted_on import ActedOn, acted_on
-from grounded_trials.workspace.intake.opening.cutting import cut_log
+from grounded_trials.workspace.intake.opening.foreign import cut_log
 from grounded_trials.workspace.intake.opening.reading import Read
 from grounded_trials.workspace.intake.opening.run_start import Recording, Start
 

@@ -38,8 +38,12 @@ from grounded.trial import Trial
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
-from grounded_trials.workspace.intake.opening.cutting import cut_log, cut_short, read_log_file
-from grounded_trials.workspace.intake.opening.foreign import misread
+from grounded_trials.workspace.intake.opening.foreign import (
+    cut_log,
+    cut_short,
+    misread,
+    read_log_file,
+)
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 from grounded_trials.workspace.intake.recognising.look import Look
@@ -371,7 +375,7 @@ def _refusal(case: Case, story: Story) -> GroundedError:
         then, bare = data, ran if case.read.bare else ""
         if bare and told.code == "log.another":  # which may be coincidence
             told = found("log.bare", ran=ran)
-        told = told.also(bare=bare, guessed=tuple(sorted(case.guessed)), **case.read.hole)
+        told = told.also(bare=bare, guessed=tuple(sorted(case.guessed)))
         if case.log and 0 < _lasting_s(case.log) < WHOLE * case.task.horizon * case.task.dt:
             told = told.also(lasts=Quantity(_lasting_s(case.log), "s"))
     return GroundedError(told.also(log=path).weighing(Weight.REFUSE), then)
