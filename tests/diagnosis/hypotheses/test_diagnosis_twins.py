@@ -8,7 +8,7 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import moving, twins
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, moving, twins
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -117,6 +117,18 @@ def search():
         friction = next(f for f in found.of_size(1) if f.hypothesis.names == names[:1])
         found.calibrated(friction)
     return found
+
+
+def test_a_look_alike_is_fitted_in_the_place_of_its_effect(search):
+    own = ("viscous_friction:w",)
+    best = max((f for f in search.fits.values() if f.hypothesis.names == own), key=search.score)
+    assert best.hypothesis.spread > 0
+    with np.errstate(all="ignore"):
+        found = {one.like: one.share for one in lookalikes(search, best)}
+    assert 0.9 < found["input_gain:c"] <= 1.0 and own[0] not in found
+    h = best.hypothesis
+    other = [f for k, f in search.fits.items() if k[1] > 0 and k[2] == ("input_gain:c",)]
+    assert max(map(search.score, other)) > search.score(best) - 3.0 and h.names == own
 
 
 @pytest.mark.slow
