@@ -48,7 +48,7 @@ class FittedHypotheses:
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
         self._cancelling: dict[object, bool] = {}
-        self._sure: dict[int, tuple[Fitted, tuple[Array, Array]]] = {}
+        self._sure: dict[tuple[int, float], tuple[Fitted, tuple[Array, Array]]] = {}
         self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
@@ -121,11 +121,11 @@ class FittedHypotheses:
 
     def sure(self, fit: Fitted) -> tuple[Array, Array]:
         """Return each unknown's standard deviation and half-width of its 95 % interval, (C,)."""
-        if id(fit) not in self._sure:
-            worth = self.tempering.factor
-            found = standard_deviations(self.predictor, fit, self.data.folds, worth)
-            self._sure[id(fit)] = fit, found
-        return self._sure[id(fit)][1]
+        key = id(fit), self.tempering.factor
+        if key not in self._sure:
+            found = standard_deviations(self.predictor, fit, self.data.folds, key[1])
+            self._sure[key] = fit, found
+        return self._sure[key][1]
 
     def calibrates(self) -> bool:
         """Check whether calibrating the parameters explains the data better than noise alone."""
