@@ -83,6 +83,7 @@ def command(
     workspace = open_workspace()
     from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
     from grounded_trials.workspace.last_diagnosis import left_out
+    from grounded_trials.workspace.next_step import BEFORE_TRIALS
 
     if compare and not all(_GROUP.fullmatch(text) for text in compare):
         with stages() as stage:
@@ -119,7 +120,7 @@ def command(
         show_json(found.to_json())
     else:
         _show(found, workspace.base_model.inputs, details=details)
-        before = found.then is not None and found.then.verb in ("adopt", "fit", "discard")
+        before = found.then is not None and found.then.verb in BEFORE_TRIALS
         show("\n" + field("then" if before else "next trial", found.next_trial))
         if found.probe:
             from grounded_cli.propose import show_extent

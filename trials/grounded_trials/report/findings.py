@@ -29,7 +29,7 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.wording import figure, or_zero, rendered, shown
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
-from grounded_trials.workspace.next_step import outlook
+from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
 from grounded_trials.workspace.off_target import (
     UNSURE,
     OffTarget,
@@ -144,8 +144,10 @@ class Findings:
 
     @property
     def next_trial(self) -> str:
-        """The trial that the last diagnosis asks for; "" if it is outdated, see `Since`."""
-        return self.told.next if self.told is not None else ""
+        """The trial that the last diagnosis asks for; "" if it is outdated, or not next."""
+        if self.told is None or self.then.verb in BEFORE_TRIALS:
+            return ""
+        return self.told.next
 
     @property
     def ahead_s(self) -> float:

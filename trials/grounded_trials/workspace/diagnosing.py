@@ -11,16 +11,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.accounts.finding import in_the_log
+from grounded.accounts.kinematics import unheld
+from grounded.accounts.sound_trials import sound_trials
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import gain
+from grounded.diagnosis.excitation import NOTHING, probe
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
+from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
 from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate
+from grounded.search.safety import objections, spread
+from grounded.search.standing import LOST
 from grounded.share import Share
-from grounded_trials.workspace.adoption import equivalent_when_adopted, tied_when_adopted
+from grounded_trials.workspace.adopted import installed_effects
+from grounded_trials.workspace.adoption import (
+    diagnosed_again,
+    equivalent_when_adopted,
+    tied_when_adopted,
+)
+from grounded_trials.workspace.candidates.handover import outside_limits
+from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
     chosen,
@@ -28,6 +42,13 @@ from grounded_trials.workspace.last_diagnosis import (
     made_from,
     model_print,
     write_diagnosis,
+)
+from grounded_trials.workspace.next_step import (
+    DIAGNOSE,
+    EXPORT,
+    REPORT,
+    after_diagnosis,
+    left_open,
 )
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
@@ -74,10 +95,6 @@ def diagnose_in(
         engine: workers that fit hypotheses; their number does not change the result.
         progress: called with each stage.
     """
-    from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-    from grounded_trials.workspace.adopted import installed_effects
-    from grounded_trials.workspace.adoption import diagnosed_again
-
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
     delays = {
@@ -150,15 +167,6 @@ def _with_next(
         wrong: the trials of candidates whose logs are at fault.
         whole: whether all trials could be used, if they had been named.
     """
-    from grounded_trials.workspace.candidates.search_state import candidate_named
-    from grounded_trials.workspace.next_step import (
-        DIAGNOSE,
-        EXPORT,
-        REPORT,
-        after_diagnosis,
-        left_open,
-    )
-
     undo = _in_vain(workspace, found)
     found = found.asking(undo, identity) if undo else found
     if wrong:
@@ -185,8 +193,6 @@ def _not_compared(workspace: Folder) -> Iterator[Finding]:
 
 def _declared(task: Task, found: Diagnosis) -> Iterator[Finding]:
     """Yield a finding for each claimed effect that is another value of a constant of the model."""
-    from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
-
     for name in found.effects:
         row, quantity = found.ranked(name), (RELATIVE | ABSOLUTE).get(name.partition(":")[0])
         if row is None or quantity is None or row.params[quantity].value is None:
@@ -222,10 +228,6 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> Finding | None:
 
     If predictions are better with the adopted effects than before, the losses have another cause.
     """
-    from grounded.search.standing import LOST
-    from grounded_trials.workspace.candidates.search_state import standing_in
-    from grounded_trials.workspace.next_step import left_open
-
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
     paid = gain(found.prediction_error, "outset", "crude") > 0
     claims = found.kind in ("effect", "several")
@@ -241,8 +243,6 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> Finding | None:
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault, ...]:
     """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
-    from grounded.accounts.sound_trials import sound_trials
-
     planner = workspace.planner
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = chosen(workspace, trials).trials
@@ -253,8 +253,6 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault
 
 def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the logged states that no other sensor in the trials can check, see `unheld`."""
-    from grounded.accounts.kinematics import unheld
-
     return unheld(workspace.planner.task.model, chosen(workspace, trials).trials)
 
 
@@ -280,11 +278,6 @@ def _probe(
     """
     if found.no_cause or (found.changed and not write):
         return "", None  # the latter: of one of two robots, which is to be diagnosed alone
-    from grounded.diagnosis.excitation import NOTHING, probe
-    from grounded.search.safety import objections, spread
-    from grounded_trials.workspace.candidates.handover import outside_limits
-    from grounded_trials.workspace.candidates.search_state import standing_in
-
     now = standing_in(workspace)
     best = now.incumbent
     ties = {*found.indistinguishable} - {*found.equivalent}

@@ -19,6 +19,7 @@ from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_trial
+from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
 from grounded_trials.workspace.where_to_mend import again, read_otherwise
 
 STATUS = NextCommand("status")
@@ -84,8 +85,6 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
-
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
     if not workspace.fits(trial):

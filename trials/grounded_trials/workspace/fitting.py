@@ -15,16 +15,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, settle
 from grounded.findings import found as finding
+from grounded.fit import fit
 from grounded.result import Result
+from grounded_trials.workspace.adopted import settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
+from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault
@@ -97,9 +101,6 @@ def fit_in(
         GroundedError: if `apply` is set but the fit predicts held-out time worse than before;
             nothing is written then.
     """
-    from grounded.fit import fit
-    from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
-
     planner, share, names = workspace.planner, chosen(workspace, trials), params
     used = share.trials
     adopted = _adopted_delays(workspace)
@@ -157,8 +158,6 @@ def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
     Another delay of the same input can't be told from it, and a delay before a nonlinear effect is
     only partly latency (`planner_with`).
     """
-    from grounded.effects import param_name
-
     plan, found = workspace.planner.plan, dict[str, tuple[int, ...]]()
     assert plan.latency is not None
     for effect in workspace.config.model.effects:
@@ -173,8 +172,6 @@ def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
 
 def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
     """Return the adopted delays that were not fitted."""
-    from grounded.effects import param_name
-
     names = (str(e["name"]) for e in workspace.config.model.effects)
     delays = (name for name in names if name.startswith("delay:"))
     return tuple(name for name in delays if param_name(name, "d") not in found.params)
@@ -198,8 +195,6 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
     Parameters that are not identified keep their values. A fitted latency is the total one: it
     replaces adopted delays.
     """
-    from grounded_trials.workspace.adopted import settled
-
     base, table = workspace.base_model, workspace.config.model
     values = {
         name: float(f"{e.value:.8g}")

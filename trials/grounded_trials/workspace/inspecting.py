@@ -10,12 +10,16 @@ from typing import Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
+from grounded_trials.logs.inspection.assignment import assigned
+from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
 from grounded_trials.logs.log_table import layout_of
 from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids
+from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
 from grounded_trials.workspace.user_files.config import FILE
 
 
@@ -90,11 +94,6 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
     Raises:
         GroundedError: if the log can't be read at all.
     """
-    from grounded_trials.logs.inspection.assignment import assigned
-    from grounded_trials.logs.inspection.guessed_table import mapping_toml
-    from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
-    from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
-
     log = path_of(log)
     refuse_ids(workspace, log, "inspect")
     if layout == AS_IT_SAYS and (workspace.folder / FILE).exists():

@@ -21,6 +21,7 @@ from grounded_trials.workspace.candidates.exporting import (
     void_exports,
 )
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
+from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
@@ -71,8 +72,6 @@ def learn_in(
         progress: called with a description of each step.
         each: called with every candidate and its trial, once that is stored.
     """
-    from grounded_trials.workspace.candidates.running import run_candidate
-
     if trials is not None:
         whole_number("trials", trials, 0, MOST_TRIALS)
     tell, done, odd = progress or (lambda stage: None), 0, _odd_before(workspace)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
+BEFORE_TRIALS = ("adopt", "fit", "discard")  # verbs of commands that come before another trial
 TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 

@@ -32,6 +32,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held, Number, value_of
 from grounded_trials.workspace.home.mjcf import Mjcf, Urdf
 from grounded_trials.workspace.home.xml_text import XmlText, commented
+from grounded_trials.workspace.user_files.model_file import load_module
 
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
 
@@ -173,8 +174,6 @@ def _is_urdf(source: Path) -> bool:
 
 def _python_file(workspace: Folder) -> Path | None:
     """Return the file of a model that Python defines."""
-    from grounded_trials.workspace.user_files.model_file import load_module
-
     table = workspace.config.model
     named = load_module(workspace.folder, table.file, table.module).__file__
     return Path(named).resolve() if named else None
