@@ -31,7 +31,7 @@ def diagnosed(made, tmp_path, monkeypatch):
     """A copy of it in which `diagnose` finds that again, at once."""
     folder, found = made
     plain = replace(found, probe="", indistinguishable=(), motions=0)
-    monkeypatch.setattr("grounded.diagnosis.diagnose.diagnose", lambda *_, **__: plain)
+    monkeypatch.setattr("grounded_trials.workspace.diagnosing.diagnose", lambda *_, **__: plain)
     return Workspace(copied(folder, tmp_path / "w")), found
 
 
@@ -72,7 +72,7 @@ def test_a_probe_that_fails_costs_no_diagnosis(diagnosed, monkeypatch, caplog):
     def broken(*args):
         raise KeyError("lag_1")
 
-    monkeypatch.setattr("grounded.diagnosis.excitation.probe", broken)
+    monkeypatch.setattr("grounded_trials.workspace.diagnosing.probe", broken)
     found = w.diagnose(probe=True, library=FEW)
     assert found.verdict == before.verdict and found.probe == ""
     assert caplog.records[-1].exc_info[0] is KeyError  # the traceback of our mistake is not lost
