@@ -228,8 +228,7 @@ def stories(
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
-    rows = known_rows(task, own, trial, acts=acts, logged=logged)
-    rows += fitted_rows(task.model, own, trial, rows, logged, waits)
+    rows = rows_of(task, own, trial, acts=acts, logged=logged, waits=waits)
     some = list[Story]()
     for row in nearest(rows, trial):
         some += stories_of(row, task, own, trial, plain)
@@ -363,46 +362,32 @@ def nearest(rows: Sequence[Row], trial: Trial) -> list[Row]:
 # --- the table ------------------------------------------------------------------------------------
 
 
-def known_rows(
-    task: Task, own: Ran, trial: Trial, *, acts: bool, logged: Sequence[str]
+def rows_of(
+    task: Task,
+    own: Ran,
+    trial: Trial,
+    *,
+    acts: bool,
+    logged: Sequence[str],
+    waits: bool | None,
 ) -> list[Row]:
-    """Return the rows that hold for any trial.
+    """Return the table: rows that hold for any trial, and those with a number that is fitted.
 
     Args:
         task: the task of the candidate.
         own: the candidate.
-        trial: the trial, or the steps of a whole log.
-        acts: whether other commands than those held before a run are sent elsewhere in its log.
-        logged: the states that a column holds.
-    """
-    held = np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
-    return [
-        *_scales(task, own, trial.inputs, logged),
-        *_orders(task.model, own, logged),
-        *_times(own, unsent=bool(held[0]), over=bool(held.all()) and not acts),
-    ]
-
-
-def fitted_rows(
-    model: Model,
-    own: Ran,
-    trial: Trial,
-    known: Sequence[Row],
-    logged: Sequence[str],
-    waits: bool | None,
-) -> list[Row]:
-    """Return the rows with a number that is fitted to a trial.
-
-    Args:
-        model: with the units.
-        own: the candidate.
         trial: the trial, not longer than its run.
-        known: the other rows.
+        acts: whether other commands than those held before a run are sent elsewhere in its log.
         logged: the states that a column holds.
         waits: whether its log begins before any run; None if that is unknown.
     """
+    model, held = task.model, np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
+    scales = [*_scales(task, own, trial.inputs, logged)]
     return [
-        *_fitted_scales(own.policy, trial, known, [n for n in model.state_names if n in logged]),
+        *scales,
+        *_orders(model, own, logged),
+        *_times(own, unsent=bool(held[0]), over=bool(held.all()) and not acts),
+        *_fitted_scales(own.policy, trial, scales, [n for n in model.state_names if n in logged]),
         *_origins(model, own, trial, logged),
         *_smoothed(model, own, trial),
         *_clipped(own, trial),
@@ -541,9 +526,9 @@ def _at_times(policy: Policy, factor: float) -> Policy:
 def _fitted_scales(
     policy: Policy, trial: Trial, known: Sequence[Row], states: Sequence[str]
 ) -> Iterator[Row]:
-    """Yield the columns of each group times the factor that explains the commands best."""
+    """Yield each group of columns times the factor, unlike the known ones, that fits best."""
     tried = {(row.names, round(float(np.log(abs(row.by))), 2), row.by > 0) for row in known}
-    groups = [row.names for row in known if row.log is not None and not row.order]
+    groups = [row.names for row in known if row.log is not None]
     groups = list(dict.fromkeys((*groups, tuple(states))))
     columns = np.array([[name in some for name in trial.state_names] for some in groups])[:, None]
     sent = np.array([[name in some for name in trial.input_names] for some in groups])[:, None]

@@ -9,8 +9,6 @@ model's step is compared with 2, 4, 8 ... parts of it, at the states and inputs 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -31,23 +29,6 @@ BEYOND = 5.0  # times as large as any sample of most other trials
 PARTS = (2, 4, 8, 16, 32, 64)
 
 
-@dataclass(frozen=True)
-class TooLong:
-    """By how much a step of the integrator misses a state, and how many are needed."""
-
-    state: str
-    missed: float  # part of the state's change in a control step, rms
-    dt: float  # step of the integrator [s]
-    substeps: int  # that are enough; 0: more than were tried
-
-    @property
-    def finding(self) -> told.Finding:
-        """What is missed, and what to change."""
-        step = Quantity(1e3 * self.dt, "ms")
-        facts: dict[str, Any] = {"share": self.missed, "step": step, "substeps": self.substeps}
-        return told.found("plan.time_step", self.state, file="model.py", **facts)
-
-
 def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Finding]:
     """Return the finding on the state that the model's steps miss most, if they are too long.
 
@@ -60,12 +41,14 @@ def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int])
     u, hidden = np.concatenate([t.inputs for t in trials]), np.ones(model.n, bool)
     hidden[list(shown)] = False
     found = too_long(model, np.where(hidden, 0.0, x), u, trials[0].dt)
-    if found is None or hidden[model.state_names.index(found.state)]:
+    if found is None or hidden[model.state_names.index(found.about[0])]:
         return []
-    return [Finding(found.state, found.finding, "time step", mend=found.finding)]
+    return [Finding(found.about[0], found, "time step", mend=found)]
 
 
-def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong | None:
+def too_long(
+    model: Model, states: Array, inputs: Array, dt: float, file: str = "model.py"
+) -> told.Finding | None:
     """Compare the model's step with finer ones.
 
     Args:
@@ -73,9 +56,11 @@ def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong |
         states: (N, n); rows that are not finite are left out.
         inputs: (N, m), held over the step.
         dt: control step [s].
+        file: of the model.
 
     Returns:
-        What is missed most; None if the steps are short enough.
+        By how much a step misses the worst state, and how many steps are enough; None if they are
+        short enough.
     """
     if model.derivative is None:
         return None
@@ -94,9 +79,15 @@ def too_long(model: Model, states: Array, inputs: Array, dt: float) -> TooLong |
     worst = int(np.argmax(missed))
     if not missed[worst] > MISSED:
         return None
-    name, own = model.state_names[worst], model.substeps
-    wanted = own * 2 ** (len(runs) - 2) if enough else 0
-    return TooLong(name, float(missed[worst]), dt / own, wanted)
+    own = model.substeps
+    return told.found(
+        "plan.time_step",
+        model.state_names[worst],
+        share=float(missed[worst]),
+        step=Quantity(1e3 * dt / own, "ms"),
+        substeps=own * 2 ** (len(runs) - 2) if enough else 0,
+        file=file,
+    )
 
 
 def after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:

@@ -373,17 +373,8 @@ class Check:
 
         made, model = self.candidate, self.workspace.base_model
         states, inputs = made.predicted_states[:-1], made.predicted_inputs
-        if (long := too_long(model, states, inputs, made.policy.dt)) is None:
-            return None
         file = self.workspace.config.model.file or self.workspace.config.model.module
-        return found(
-            "plan.time_step",
-            long.state,
-            share=long.missed,
-            step=Quantity(long.dt, "s"),
-            substeps=long.substeps,
-            file=file,
-        )
+        return too_long(model, states, inputs, made.policy.dt, file)
 
     def _coasting(self) -> Finding | None:
         """Return where the robot goes after the run, with the input held then."""
