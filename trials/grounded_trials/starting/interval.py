@@ -16,9 +16,10 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found
 from grounded.frozen import Array
+from grounded_trials.logs.command_steps import changes_of
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
-from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+from grounded_trials.logs.signals import SignalSpec, read_signals
 from grounded_trials.starting.kinds import COMMANDED
 
 RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10, 5, 2)  # [Hz]
@@ -95,14 +96,8 @@ def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:
         found = read_signals(report.files, specs, report.layout)
     except GroundedError:  # reported later, when the run is sampled
         return np.zeros(0)
-    return np.concatenate([np.zeros(0), *map(_between_changes, found.values())])
-
-
-def _between_changes(series: Series) -> Array:
-    """Return the times between changes of a command [s]."""
-    order = np.argsort(series.t, kind="stable")
-    t, values = series.t[order], series.values[order]
-    return np.asarray(np.diff(t[1:][np.diff(values) != 0]) * 1e-9)
+    changes = [changes_of(one.t, one.values)[0] for one in found.values()]
+    return np.concatenate([np.zeros(0), *(1e-9 * np.diff(times) for times in changes)])
 
 
 def changes_every(gaps: Array, rows: float) -> float | None:

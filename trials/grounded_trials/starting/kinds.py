@@ -16,8 +16,8 @@ from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
 from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
-from grounded_trials.logs.inspection.relations import rates_among
-from grounded_trials.logs.stated_units import bare_command, command_unit, unit_in_name
+from grounded_trials.logs.inspection.relations import Signals
+from grounded_trials.logs.stated_units import Stated, bare_command, command_unit, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
@@ -182,9 +182,10 @@ def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[
 def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
     """Return for each position, by name, its rate as an expression of another number of the log."""
     names = {path: name for name, path in paths.items()}
+    signals = Signals(log, (), Stated.by(log.files))
     return {
         names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
-        for position, (rate, times) in rates_among(log, list(names)).items()
+        for position, (rate, times) in signals.rates(list(names)).items()
     }
 
 

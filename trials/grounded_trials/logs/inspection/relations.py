@@ -62,14 +62,6 @@ def follows(q: Floats, w: Floats, step: float) -> Follows:
     return Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
 
 
-def rates_among(log: LogReport, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """Return which numbers are the rate of which: {position: (rate, factor of the rate)}.
-
-    Only pairs whose units differ by a power of ten; each number is in one pair at most.
-    """
-    return Signals(log, (), Stated.by(log.files)).rates(paths)
-
-
 class Signals:
     """The samples of a log's numbers, read once, and put on a common grid on request.
 
@@ -160,7 +152,10 @@ class Signals:
         return found
 
     def rates(self, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
-        """Return the same as `rates_among`."""
+        """Return which numbers are the rate of which: {position: (rate, factor of the rate)}.
+
+        Only pairs whose units differ by a power of ten; each number is in one pair at most.
+        """
         self.read(paths)
         found = []
         for a, b in permutations(paths, 2):

@@ -26,7 +26,6 @@ LOGS = 2  # number of logs drawn; the table has all
 CHANNELS = 4  # number of states whose residuals are drawn
 POINTS = 1500  # points of a residual
 BINS = 24
-LEAST = 3  # points of a bin; one with fewer, or half as many as usual, is merged with the next
 NEARLY = 0.05  # of a residual's variance: what another variable may explain more, by chance
 RESTARTED = "Predictions restarted every"
 LAGS_S, LAGS = 1.0, 60  # largest lag of the autocorrelation, in [s] and in steps
@@ -224,19 +223,8 @@ def _told(x: Array, y: Array) -> float:
 
 
 def _binned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return means of x and y in bins of x.
-
-    Edges of equally full bins and of equally wide bins are combined, so that a line through the
-    means covers the whole range of x. Bins with few points are merged, except for the last.
-    """
-    edges = np.union1d(_edges(x), np.linspace(x.min(), x.max(), _bins(x) + 1))
-    inner, before = [edges[0]], np.searchsorted(np.sort(x), edges)
-    for edge, low in zip(edges[1:-2], before[1:-2], strict=True):
-        if low - np.sum(x < inner[-1]) >= max(LEAST, len(x) / _bins(x) / 2):
-            inner.append(edge)
-    edges = np.array([*inner, *edges[-2:]])
-    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
-    parts = [which == k for k in np.unique(which)]
+    """Return means of x and y in equally full bins of x."""
+    parts = np.array_split(np.argsort(x), _bins(x))
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
