@@ -54,18 +54,21 @@ def _servo() -> list[Trial]:
     return trials
 
 
-def _dart_steering() -> list[Trial]:
-    log = np.load(data("dart_small_car", "steering_sine_10Hz.npz"), allow_pickle=True)
-    trials = []
-    for i in range(11):
-        run = log[f"run{i:02d}"].astype(float)
-        on = np.flatnonzero(run[:, 6] > 0)
-        run = run[on[0] + 8 : on[-1] - 4] if len(on) else run[:0]
-        if len(run) >= 20:
-            u = run[:-1, [8, 5]]
-            names = (("w",), ("steering", "speed"))
-            trials.append(Trial(run[:, [4]], u, 0.1, *names, start_inputs=u[0]))
-    return trials
+def _dart_steered(name: str, most: int | None = None) -> Callable[[], list[Trial]]:
+    def read() -> list[Trial]:
+        log = np.load(data("dart_small_car", f"{name}.npz"), allow_pickle=True)
+        trials = []
+        for i in range(11):
+            run = log[f"run{i:02d}"].astype(float)
+            on = np.flatnonzero(run[:, 6] > 0)
+            run = run[on[0] + 8 : on[-1] - 4][:most] if len(on) else run[:0]
+            if len(run) >= 20:
+                u = run[:-1, [8, 5]]
+                names = (("w",), ("steering", "speed"))
+                trials.append(Trial(run[:, [4]], u, 0.1, *names, start_inputs=u[0]))
+        return trials
+
+    return read
 
 
 def _dart_throttle() -> list[Trial]:
@@ -79,20 +82,6 @@ def _dart_throttle() -> list[Trial]:
         run = run[max(on[0] - 5, 0) : on[-1]]
         names = (("v",), ("throttle",))
         trials.append(Trial(run[:, [5]], run[:-1, [7]], 0.1, *names, start_inputs=np.zeros(1)))
-    return trials
-
-
-def _dart_steps() -> list[Trial]:
-    log = np.load(data("dart_small_car", "steering_steps_10Hz.npz"), allow_pickle=True)
-    trials = []
-    for i in range(11):
-        run = log[f"run{i:02d}"].astype(float)
-        on = np.flatnonzero(run[:, 6] > 0)
-        run = run[on[0] + 8 : on[-1] - 4][:600] if len(on) else run[:0]
-        if len(run) >= 20:
-            u = run[:-1, [8, 5]]
-            names = (("w",), ("steering", "speed"))
-            trials.append(Trial(run[:, [4]], u, 0.1, *names, start_inputs=u[0]))
     return trials
 
 
@@ -197,7 +186,7 @@ model = Model(
     step=lambda s, a, p, dt: {"w": p.k * a.speed * a.steering + 0 * s.w},
 )
 """,
-    _dart_steering,
+    _dart_steered("steering_sine_10Hz"),
 )
 
 # A linear motor; straight runs at one throttle each, 10 Hz.
@@ -216,7 +205,7 @@ model = Model(
     _dart_throttle,
 )
 
-DART_STEPS = RealSystem(DART_STEERING.text, _dart_steps)
+DART_STEPS = RealSystem(DART_STEERING.text, _dart_steered("steering_steps_10Hz", 600))
 
 # A geared motor with back electromotive force that swings a mass; no friction.
 _BAM_TEXT = """import numpy as np
