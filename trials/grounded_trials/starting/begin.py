@@ -242,7 +242,7 @@ class _Draft:
     own: OwnModel | None
     named: Sequence[str]  # inputs of a generic skeleton
     kind: str = ""
-    why: str = "your model"
+    why: str = ""
     plain: Skeleton | None = None
     model: Model = field(init=False)
     matched: tuple[Sequence[Guess], Sequence[Guess]] = ((), ())  # states, inputs
@@ -250,11 +250,11 @@ class _Draft:
 
     def begin(self, kind: str) -> None:
         """Take the user's model, or a skeleton: the kind's if it has a state of the log."""
+        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.report, self.joints)
         if self.own:
-            self.model = self.own.bring(self.folder)
+            self.model, self.why = self.own.bring(self.folder), "your model"
             self._match()
             return
-        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.report, self.joints)
         self._take(skeleton(self.kind, self.report, self.joints, self.named, self.stated))
         if not (kind or any(g.path for g in self.matched[0])):
             self.kind, self.why = "generic", f"none of {self.kind}"
