@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -33,41 +33,20 @@ def command(log: str, output: str | None, json_: bool) -> None:
     with progress(f"reading {log}"):
         found = recover_log(source, target)
     if json_:
-        show_json(_document(found))
+        show_json(found.to_json())
     else:
         _tell(found)
     if not found.complete:
         click.get_current_context().exit(3)
 
 
-def _document(found: Recovery) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "file": str(found.target),
-        "messages": dict(found.messages),
-        "lost_messages": dict(found.lost_messages),
-        "losses": [one.sentence for one in found.losses],
-        "findings": [one.to_json() for one in found.losses],
-        "unverified": found.unverified,
-        "duration_s": found.duration_s,
-        "complete": found.complete,
-    }
-    if _is_trial(found):
-        document |= {
-            "candidate": found.candidate or None,
-            "steps": found.steps,
-            "planned_steps": found.planned,
-            "hole": found.hole,
-        }
-    return document
-
-
 def _tell(found: Recovery) -> None:
     for loss in found.losses:
-        say(field("lost", loss.sentence))
+        say(field("lost", loss))
     if found.complete:
         show(field("lost", "nothing"))
     saved = count(sum(found.messages.values()), "message")
-    show(field("saved", f"{saved} in {found.duration_s:.2f} s: {found.target}"))
+    show(field("saved", f"{saved} in {found.duration_s:.2f} s: {found.file}"))
     for topic, number in found.messages.items():
         lost = found.lost_messages.get(topic, 0)
         show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
@@ -87,22 +66,22 @@ def _is_trial(found: Recovery) -> bool:
 def _steps(found: Recovery) -> str:
     """Describe how much of a trial written by grounded is left."""
     ran = f" of {found.candidate}" * bool(found.candidate)
-    planned = f" of {found.planned}" if found.planned is not None else ""
-    return f"{found.steps}{planned} steps{ran}{', with a hole' * found.hole}"
+    planned = f" of {found.planned_steps}" if found.planned_steps is not None else ""
+    return f"{found.steps}{planned} steps{ran}{', with a hole' * bool(found.hole)}"
 
 
 def _next(found: Recovery) -> str:
     """Return the lines that say what to do with the file."""
     from grounded_trials.store.own_files import CANDIDATE
 
-    target = str(found.target)
+    target = str(found.file)
     if found.format == CANDIDATE:
         return next_line(NextCommand("propose"))
     if not _is_trial(found):
         return next_line(NextCommand("inspect", (target,)))  # which says how it is ingested
     if found.hole:
         return next_line(NextCommand("run", (found.candidate,) if found.candidate else ()))
-    short = found.planned is None or found.steps < found.planned
+    short = found.planned_steps is None or (found.steps or 0) < found.planned_steps
     if found.complete or not (found.candidate and short):
         return next_line(NextCommand("ingest", (target,)))
     return next_line(NextCommand("ingest", ("--data", target)))

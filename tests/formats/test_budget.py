@@ -183,7 +183,7 @@ def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DamagedFile, match=holding("channel 1", "'/a'", "/b")):
         read_signals(path, {"x": SignalSpec("/a.x", clock="log")})
     saved = recover_log(path, tmp_path / "saved.mcap")
-    assert not saved.complete and any(loss.code == "file.lost" for loss in saved.losses)
+    assert not saved.complete and any(loss.code == "file.lost" for loss in saved.findings)
     series = read_signals(tmp_path / "saved.mcap", {"x": SignalSpec("/a.x", clock="log")})
     assert series["x"].values.tolist() == [1.0]
 

@@ -27,6 +27,7 @@ from typing import (
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
+from grounded_trials.logs.recover import Recovery
 from grounded_trials.workspace.adoption import Adopted, Undone
 from grounded_trials.workspace.candidates.exporting import Exported
 from grounded_trials.workspace.candidates.running import Ran
@@ -311,23 +312,6 @@ class NextJson(TypedDict):
     findings: list[Finding]
 
 
-class RecoverJson(TypedDict):
-    """`recover`."""
-
-    file: str
-    messages: dict[str, int]
-    lost_messages: dict[str, int]
-    losses: list[str]
-    findings: list[Finding]
-    unverified: int
-    duration_s: float
-    complete: bool
-    candidate: NotRequired[str | None]
-    steps: NotRequired[int]
-    planned_steps: NotRequired[int | None]
-    hole: NotRequired[bool]
-
-
 class EntryJson(TypedDict):
     """The words of a code."""
 
@@ -364,7 +348,7 @@ DOCUMENTS: dict[str, Any] = {
     "learn": StatusJson,
     "next": NextJson,
     "propose": ProposeJson,
-    "recover": RecoverJson,
+    "recover": Recovery,
     "report": ReportJson,
     "restore": SetAside,
     "run": Ran,

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found
+from grounded.result import UNSAID, Document
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -40,27 +41,27 @@ HEAD = 2**20  # [bytes] at the beginning of a log, in which its first chunk begi
 COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")  # a chunk's; then the copy is compressed, too
 
 
-@dataclass(frozen=True)
-class Recovery:
+OF_A_TRIAL: Mapping[str, Any] = {"brief": True}  # a field that is None for other files
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery(Document):
     """What was saved, what was lost, and how much of it has no valid checksum."""
 
-    source: Path
-    target: Path
+    file: Path
     messages: Mapping[str, int]  # saved, by topic
     lost_messages: Mapping[str, int]  # known to be lost, by topic
-    losses: tuple[Finding, ...]  # empty if the file was not damaged
+    findings: tuple[Finding, ...]  # what was lost; empty if the file was not damaged
     unverified: int  # saved messages without a valid checksum
     duration_s: float  # from the first to the last saved message
-    format: str = ""  # TRIAL or CANDIDATE if grounded wrote the file, else ""
-    candidate: str = ""  # the candidate that a trial ran
-    steps: int = 0  # saved steps of a trial
-    planned: int | None = None  # steps of the policy that it ran, if saved
-    hole: bool = False  # steps before the last one are missing, so it can't be read as a trial
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing was lost, and everything saved is verified."""
-        return not self.losses
+    losses: tuple[str, ...]  # the findings in words
+    complete: bool  # nothing was lost, and everything saved is verified
+    candidate: str | None = field(metadata=OF_A_TRIAL, default=None)  # the one that it ran
+    steps: int | None = field(metadata=OF_A_TRIAL, default=None)  # saved ones
+    planned_steps: int | None = field(metadata=OF_A_TRIAL, default=None)  # of its policy, if saved
+    # steps before the last one are missing, so it can't be read as a trial
+    hole: bool | None = field(metadata=OF_A_TRIAL, default=None)
+    format: str = field(metadata=UNSAID, default="")  # TRIAL or CANDIDATE if grounded wrote it
 
 
 def recover_log(source: str | Path, target: str | Path) -> Recovery:
@@ -117,10 +118,9 @@ def _recover(source: Path, target: Path) -> Recovery:
         losses.append(found("file.lost", messages=copy.homeless))
     losses += copy.without(salvage.dropped)
     lost = Counter({copy.topic(c): n for c, n in salvage.lost_messages.items()})
-    saved = Recovery(
-        source, target, copy.counts, lost, tuple(losses), salvage.unverified, copy.duration_s
-    )
-    return _own(saved, copy)
+    words = tuple(one.sentence for one in losses)
+    much = (tuple(losses), salvage.unverified, copy.duration_s, words, not losses)
+    return _own(Recovery(target, copy.counts, lost, *much), copy)
 
 
 def _own(saved: Recovery, copy: _Copy) -> Recovery:
@@ -134,7 +134,7 @@ def _own(saved: Recovery, copy: _Copy) -> Recovery:
         format=kind,
         candidate=copy.meta.get("candidate", ""),
         steps=max(0, min(states - 1, inputs)),
-        planned=_horizon(copy.policy) if copy.policy else None,
+        planned_steps=_horizon(copy.policy) if copy.policy else None,
         hole=_hole(copy, states),
     )
 
