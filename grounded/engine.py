@@ -39,7 +39,7 @@ CONNECT_S = 10.0  # [s] timeout for a cluster's scheduler to answer
 TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
 LOAD, TASKS = Path("/proc/loadavg"), Path("/proc/self/task")  # runnable threads: all, and these
 LOOKS, LOOK_S = 5, 0.002  # that they are counted, and [s] between
-LARGE = 2**28  # [bytes] freed blocks up to this size are reused
+REUSED_BYTES = 2**28  # [bytes] freed blocks up to this size are reused
 T = TypeVar("T")
 
 
@@ -60,8 +60,8 @@ def _keep_pages() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # not the GNU C library
         return
-    mallopt(MAP, LARGE)
-    mallopt(TRIM, LARGE)
+    mallopt(MAP, REUSED_BYTES)
+    mallopt(TRIM, REUSED_BYTES)
 
 
 def cores() -> int:

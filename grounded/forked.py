@@ -32,7 +32,7 @@ import numpy as np
 
 WORTH_S = 0.03  # [s] least time of the pieces of a copy
 WIDTH = 4  # [bytes] of an index in the queue
-MOST = 8192  # pieces whose indices the queue holds
+QUEUE_PIECES = 8192  # pieces whose indices the queue holds
 PATIENCE_S, PATIENCE = 5.0, 10.0  # a copy gets this, or this times the longest piece, to answer
 PLAIN = (int, float, complex, bool, str, bytes, type(None), np.generic)  # sent as they are
 
@@ -69,7 +69,7 @@ class Forks:
             yield 0, self._here(function, left.pop(0))
         worth = int(len(left) * self._took[function] / WORTH_S)
         copies = min(self.jobs, len(left), worth) - 1
-        if copies > 0 and len(left) <= MOST:
+        if copies > 0 and len(left) <= QUEUE_PIECES:
             yield from self._shared(function, left, copies)
         for k, row in left.items():
             yield k, self._here(function, row)

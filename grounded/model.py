@@ -32,7 +32,9 @@ ROLES = (
     *("steering_angle", "hanging", "upright", "level", "rail"),
 )
 BELIEVED = 3.0  # prior standard deviations (as given by the user) that a parameter may move
-LEAST = 0.2  # smallest fraction of its value, without a bound towards zero: the sign is known
+SMALLEST_SHARE = (
+    0.2  # smallest fraction of its value, without a bound towards zero: the sign is known
+)
 MAX_SIZE = 200  # states plus inputs: the cost of a step grows with the cube of this number
 
 
@@ -109,9 +111,15 @@ class Param:
         elsewhere could change a measured length by a factor of five.
         """
         far = np.inf if self.std is None else BELIEVED * self.std
-        low = (LEAST * self.value if self.value > 0 else -np.inf) if self.low is None else self.low
+        low = (
+            (SMALLEST_SHARE * self.value if self.value > 0 else -np.inf)
+            if self.low is None
+            else self.low
+        )
         high = (
-            (LEAST * self.value if self.value < 0 else np.inf) if self.high is None else self.high
+            (SMALLEST_SHARE * self.value if self.value < 0 else np.inf)
+            if self.high is None
+            else self.high
         )
         return max(low, self.value - far), min(high, self.value + far)
 

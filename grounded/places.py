@@ -20,9 +20,9 @@ from grounded.model import Model, is_clock
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
-SHORT = 1e-5  # step for instantaneous rates [s]
+INSTANT_S = 1e-5  # step for instantaneous rates [s]
 STRAIGHT = 1e-3  # error of velocities of about 1 from such a step
-LITTLE = 1e-3  # part of what an input moves most below which it does not move a state
+MOVES_STATE = 1e-3  # part of what an input moves most below which it does not move a state
 SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
@@ -74,11 +74,11 @@ def of_a_kind(model: Model) -> tuple[tuple[str, ...], ...]:
     if model.m < 2:
         return ()
     bare = direct(model)
-    _, f_u = bare.system.linearise(*samples(bare, 8), bare.values, probe(bare, SHORT))
+    _, f_u = bare.system.linearise(*samples(bare, 8), bare.values, probe(bare, INSTANT_S))
     by, units = np.abs(f_u).max(axis=0), list(bare.states.values())
     kinds: dict[tuple[str, ...], list[str]] = {}
     for j, name in enumerate(model.input_names):
-        moved = {units[i] for i in np.flatnonzero(by[:, j] > LITTLE * by[:, j].max())}
+        moved = {units[i] for i in np.flatnonzero(by[:, j] > MOVES_STATE * by[:, j].max())}
         unit = model.inputs[name]
         kinds.setdefault((unit, *(sorted(moved) if unit == "1" else ())), []).append(name)
     return tuple(tuple(found) for found in kinds.values() if len(found) > 1)
@@ -113,7 +113,7 @@ def body_velocity(model: Model) -> tuple[str, ...]:
     where, turned, model = position(model), heading(model), motion(model)
     if len(where) < 2 or turned is None:
         return ()
-    (x, u), dt, names = samples(model, 8), probe(model, SHORT), model.state_names
+    (x, u), dt, names = samples(model, 8), probe(model, INSTANT_S), model.state_names
     rates = (model.system.step(x, u, model.values, dt) - x) / dt
     i, j, k = (names.index(name) for name in (*where, turned))
     cos, sin = np.cos(x[:, k]), np.sin(x[:, k])
@@ -158,7 +158,7 @@ def crossed(model: Model) -> list[str]:
 
     An input that acts on a state through others in between (a servo) does not drive it at once.
     """
-    dt, (x, u) = probe(model, SHORT), samples(model, 8)
+    dt, (x, u) = probe(model, INSTANT_S), samples(model, 8)
     size = np.abs(model.system.linearise(x, u, model.values, dt)[1]).max(axis=0)
     acts = dict(zip(model.state_names, size > 1e-3 * dt, strict=True))
     driven = [name for name in dynamic(model) if acts[name].any()]
@@ -195,7 +195,7 @@ def undeclared_angles(model: Model) -> list[str]:
     A log that wraps at pi then shows a jump of 6.28 rad, and errors of a turn count.
     """
     bare = motion(model)
-    (x, u), dt, found = samples(bare, 8), probe(bare, SHORT), list[str]()
+    (x, u), dt, found = samples(bare, 8), probe(bare, INSTANT_S), list[str]()
     if getattr(bare.step, "timestep", None) is not None:
         return found  # a simulator says itself
 
@@ -212,7 +212,7 @@ def undeclared_angles(model: Model) -> list[str]:
             before, after, other = rates(x), rates(turned), rates(moved)
         size = np.abs(before).max(axis=0) + np.abs(other).max(axis=0) + 1e-9
         same = np.abs(after - before).max(axis=0) <= STRAIGHT * size
-        differs = np.abs(other - before).max(axis=0) > LITTLE * size
+        differs = np.abs(other - before).max(axis=0) > MOVES_STATE * size
         if same.all() and differs.any():
             found.append(name)
     return found
@@ -255,7 +255,7 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
     (x, u), dt = within_limits(model), probe(model, 1e-8)
     after = model.system.step(x, u, model.values, dt)
     moved, names, found = (after - x) / dt, model.state_names, {}
-    if dt > SHORT:
+    if dt > INSTANT_S:
         for i, name in enumerate(names):
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = moved[:, [i]] / after

@@ -11,7 +11,7 @@ from typing import Any
 from grounded.errors import GroundedError, alike
 from grounded.findings import Weight, found
 
-MOST = 40  # most names listed in a message
+MOST_NAMES = 40  # most names listed in a message
 
 
 def refused(code: str, *about: object, then: Any = None, **facts: Any) -> GroundedError:
@@ -72,5 +72,5 @@ def near(name: str, valid: Iterable[str]) -> dict[str, Any]:
     names = [str(one) for one in valid]
     if close := alike(name, names):
         return {"near": close}
-    more = [f"{len(names) - MOST} more"] * (len(names) > MOST)
-    return {"known": (*names[:MOST], *more)}
+    more = [f"{len(names) - MOST_NAMES} more"] * (len(names) > MOST_NAMES)
+    return {"known": (*names[:MOST_NAMES], *more)}

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
 SCALED = ("m", "rad", "s")  # units that may get the prefixes m and µ, as may their rates
-SMALL = 1e-3  # values below this get a prefix
+PREFIX_BELOW = 1e-3  # values below this get a prefix
 FIXED = 1e-4  # values from here on are shown without a power of ten when they are compared
 ROUNDING = 1e-9  # share of its scale below which a number is what rounding left of 0
 UNSEEN = 0.005  # of a standard deviation: a smaller value is 0 in two digits of it
@@ -141,15 +141,15 @@ def _scale(value: float, unit: str) -> tuple[float, str]:
 
     With cm between mm and m, two lines on one motion were in two units.
     """
-    if unit == "m" and SMALL <= value < 1.0:
+    if unit == "m" and PREFIX_BELOW <= value < 1.0:
         return 1e3, "mm"
-    if unit.startswith(SCALED) and 0 < value < SMALL:
+    if unit.startswith(SCALED) and 0 < value < PREFIX_BELOW:
         step = 1 if value >= 1e-5 else 2
         return 1e3**step, "-mµ"[step] + unit
     return 1.0, unit
 
 
-def _told(value: float, scale: float, unit: str, least: float = SMALL) -> str:
+def _told(value: float, scale: float, unit: str, least: float = PREFIX_BELOW) -> str:
     """Format a value in two digits with its unit, without a power of ten from `least` on."""
     value *= scale
     shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if least <= value < 1e6 else ".1e"

@@ -19,7 +19,7 @@ from grounded.frozen import Array, calm, readonly, resampled_noise, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
 LAST = 2  # steps at the end of a run that may be missing and are extrapolated,
-ENOUGH = 10  # if the trial has at least this many times as many steps
+STEPS_FACTOR = 10  # if the trial has at least this many times as many steps
 RECENT = 4  # steps whose mean rate is used to extrapolate
 HUGE = 1e100  # treated as infinite: squares and products must stay finite
 
@@ -160,7 +160,7 @@ class Trial:
         For missing steps the last input is held and the states continue at their recent mean rate.
         """
         missing = steps - self.steps
-        if not (0 < missing <= LAST and self.steps >= ENOUGH * missing):
+        if not (0 < missing <= LAST and self.steps >= STEPS_FACTOR * missing):
             return self.until(steps)
         if self.finite_steps < self.steps:
             return self

@@ -50,7 +50,7 @@ from grounded.findings import found as found_
 from grounded.frozen import Array, median, white_noise, wrapped
 from grounded.model import Model
 from grounded.places import Integral, integrals, partner, true_values
-from grounded.result import SMALL
+from grounded.result import PREFIX_BELOW
 from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
@@ -265,7 +265,7 @@ class Ages:
 
 def _size(delay: float, lag: Lag) -> Quantity:
     """Return a delay with its standard deviation; in ms if that is small."""
-    if lag.std < SMALL:
+    if lag.std < PREFIX_BELOW:
         return Quantity(1e3 * delay, "ms", 1e3 * lag.std)
     return Quantity(delay, "s", lag.std)
 

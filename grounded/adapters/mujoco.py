@@ -62,7 +62,9 @@ from grounded.model import Model
 SHIFT = 1e-6  # relative step of the forward differences, as in mjd_transitionFD
 CHUNK = 4096  # samples stepped in one call
 EXACT = 1e-6  # relative tolerance for a control step that is a multiple of the simulation's step
-NEAR = 1e-3  # relative change of the simulation's step that may be made to fit the control step
+TIMESTEP_FIT = (
+    1e-3  # relative change of the simulation's step that may be made to fit the control step
+)
 MOST_THREADS, SHARED = 8, 64  # most threads; samples from which on threads are used
 MOST_COPIES = 20  # most copies of the model with other parameters at a time
 PRIVATE = ("_lock", "_data", "_base", "_copies", "_pools")  # attributes private to a process
@@ -382,7 +384,7 @@ class MujocoStepper(Stepper):
         h = self._own  # a control step is a whole multiple of it
         steps = round(dt / h)
         off = abs(steps * h - dt)
-        if steps < 1 or off > NEAR * dt:
+        if steps < 1 or off > TIMESTEP_FIT * dt:
             like = f"{dt / max(1, steps):.12g}"
             raise wrong("timestep", h, must="divisor", like=like, of=f"{dt:g} s")
         return steps, h if off <= EXACT * dt else dt / steps

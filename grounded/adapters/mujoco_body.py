@@ -17,7 +17,7 @@ from grounded.frozen import Array
 SHOWN = 3  # geom groups from here on are hidden, as in MuJoCo's viewer
 SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 2, 3, 4, 5, 6, 7  # mjtGeom
 THIN = 0.012  # radius of a rod, as a fraction of the model's extent
-LEAST = 1e-6  # [m] smallest half edge of a box
+SMALLEST_EDGE = 1e-6  # [m] smallest half edge of a box
 
 
 class MujocoBody:
@@ -134,7 +134,7 @@ def _inertia(compiled: Any, body: int) -> Part:
     a, b, c = (float(v) for v in compiled.body_inertia[body])
     mass = float(compiled.body_mass[body])
     edges = [np.sqrt(max(1.5 * v / mass, 0.0)) for v in (b + c - a, a + c - b, a + b - c)]
-    return Part(f"body{body}", "box", tuple(max(float(e), LEAST) for e in edges))
+    return Part(f"body{body}", "box", tuple(max(float(e), SMALLEST_EDGE) for e in edges))
 
 
 def _rod(compiled: Any, body: int) -> Part:

@@ -45,7 +45,7 @@ SEARCH_FLOOR = 1e-3  # regularisation after a failed search
 GROWTH = 10.0
 CEILING = 1e10
 LARGE_MU = 1.0
-LEAST = 1e-14  # a predicted change that is none
+NO_CHANGE = 1e-14  # a predicted change that is none
 Status = Literal["converged", "no improvement", "max iterations", "not finite"]
 STATUSES: tuple[Status, ...] = ("converged", "no improvement", "max iterations", "not finite")
 

@@ -88,7 +88,7 @@ def _slopes(
     low = np.full(model.m, -1.0) if low is None else np.where(np.isfinite(low), low, -1.0)
     high = np.full(model.m, 1.0) if high is None else np.where(np.isfinite(high), high, 1.0)
     x, u = rng.uniform(-1, 1, (SAMPLES, model.n)), rng.uniform(low, high, (SAMPLES, model.m))
-    dt = places.probe(model, places.SHORT)
+    dt = places.probe(model, places.INSTANT_S)
     _, f_u, f_p = model.system.sensitivities(x, u, model.values, dt)
     if family in ("input_gain", "input_bias"):
         at = [model.input_names.index(name) for name in targets]

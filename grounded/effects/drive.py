@@ -34,12 +34,12 @@ from grounded.frozen import Array
 from grounded.model import Model
 
 WHOLE = 0.02  # largest part of the accelerations' slopes that F W may leave unexplained
-PART = 1e-3  # smallest weight of a velocity, relative to the largest
-MOST = 3  # velocities in a combination
-KEPT = 64  # models whose drives are remembered
+SMALLEST_WEIGHT = 1e-3  # smallest weight of a velocity, relative to the largest
+MOST_VELOCITIES = 3  # velocities in a combination
+MODELS_KEPT = 64  # models whose drives are remembered
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=MODELS_KEPT)
 def combined_speeds(model: Model) -> Mapping[str, Mapping[str, float]]:
     """Return the speeds of drives that are combinations: {input: {velocity: weight}}.
 
@@ -61,8 +61,8 @@ def combined_speeds(model: Model) -> Mapping[str, Mapping[str, float]]:
     for j, tau in enumerate(model.input_names):
         main = int(np.argmax(np.abs(W[j])))
         weights = {n: w / W[j, main] for n, w in zip(names, W[j], strict=True) if W[j, main]}
-        own = {n: float(w) for n, w in weights.items() if abs(w) > PART}
-        if 1 < len(own) <= MOST and F[:, main, j].min() > 0 and W[j, main] > 0:
+        own = {n: float(w) for n, w in weights.items() if abs(w) > SMALLEST_WEIGHT}
+        if 1 < len(own) <= MOST_VELOCITIES and F[:, main, j].min() > 0 and W[j, main] > 0:
             found[tau] = {names[main]: 1.0} | own
     return found
 
@@ -79,7 +79,7 @@ def _combinations(F: Array, slopes: Array) -> Array:
 
 def _slopes(model: Model, values: Array) -> tuple[Array, Array]:
     """Return slopes of the accelerations by inputs (S, v, m) and by velocities (S, v, v)."""
-    dt, (x, u) = places.probe(model, places.SHORT), places.samples(model, 8)
+    dt, (x, u) = places.probe(model, places.INSTANT_S), places.samples(model, 8)
     at = [model.state_names.index(name) for name in _velocities(model)]
     back = x.copy()
     back[:, at] *= -1
@@ -89,7 +89,7 @@ def _slopes(model: Model, values: Array) -> tuple[Array, Array]:
     return f_u[:, at] / dt, slopes
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=MODELS_KEPT)
 def _bare(model: Model) -> Model:
     """Return the model inside all adopted effects, with the current parameters."""
     found = model
@@ -150,7 +150,7 @@ def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None)
     return total
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=MODELS_KEPT)
 def push(model: Model, target: str) -> float:
     """Return the median acceleration of a drive, `tau<-w`, per unit of the input."""
     tau = target.partition("<-")[0]

@@ -32,7 +32,10 @@ PER_PERIOD = 8  # samples in a period of the fastest resonance that is looked fo
 PERIODS = 4  # periods of the slowest one in the longest trial
 NEXT = 1.1  # ratio of resonances that are tried
 SHARES = (0.1, 0.4)  # parts of the inertia that an input drives that are tried as its motor's
-MOST, LEAST = 0.95, 0.02  # largest such part, and least that is left to the side that is shown
+LARGEST_SHARE, SMALLEST_REST = (
+    0.95,
+    0.02,
+)  # largest such part, and least that is left to the side that is shown
 DAMPED = 0.05  # first damping ratio of a spring
 NEWTON = 3  # steps of the solution, from one that is at most a tenth off
 FLAT = 1e-6  # way in units of the bristles' below which they bend in proportion
@@ -96,7 +99,7 @@ def _spring(site: Site, driven: float) -> tuple[Quantity, ...]:
     fs = tuple(float(f) for f in np.geomspace(slowest, fastest, count))
     f = Quantity("f", "Hz", fs, 0.1 * slowest, 2 * fastest, places=count)
     unit, shares = per_acceleration(site), tuple(part * whole for part in SHARES if driven)
-    J = Quantity("J", unit, shares, 1e-3 * whole if driven else 0.0, MOST * whole)
+    J = Quantity("J", unit, shares, 1e-3 * whole if driven else 0.0, LARGEST_SHARE * whole)
     found = (J, f, Quantity("zeta", "1", (DAMPED,), 0.0, 0.95))
     return (*found, Quantity("M", unit, fixed=True, start=whole)) if driven else found
 
@@ -125,9 +128,9 @@ class _Swing(NamedTuple):
 
 
 def _swing(c: Mapping[str, Any], gain: Any, dt: Any, driven: float) -> _Swing:
-    v, n = _own(c, driven), np.maximum(1 - c["J"] * gain / dt, LEAST)
+    v, n = _own(c, driven), np.maximum(1 - c["J"] * gain / dt, SMALLEST_REST)
     square, down = v * v / n, c["zeta"] * v / n
-    turn = np.sqrt(np.maximum(square - down * down, LEAST * square))
+    turn = np.sqrt(np.maximum(square - down * down, SMALLEST_REST * square))
     e = np.exp(-down * dt)
     S, C = e * np.sin(turn * dt) / turn, e * np.cos(turn * dt)
     return _Swing(v, n, S, C - down * S, C + down * S)
@@ -153,7 +156,7 @@ def _spring_later(w: Any, end: Any, gain: Any, u: Any, c: Any, dt: Any, driven: 
 def _spring_torque(w: Any, rate: Any, gain: Any, u: Any, c: Any, driven: float) -> Any:
     own = _own(c, driven)
     swing = 2 * c["zeta"] * own * c["r"] + own * own * c["z"] + rate
-    return (driven * u - c["J"] * swing) / np.maximum(1 - c["J"] * gain, LEAST)
+    return (driven * u - c["J"] * swing) / np.maximum(1 - c["J"] * gain, SMALLEST_REST)
 
 
 def _at_rest(u: Any, c: Any, driven: float) -> Values:

@@ -448,7 +448,7 @@ def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: f
 
 def _turns(speeds: Array, dt: float) -> tuple[float, float] | None:
     """Return `Scales.turns` of one velocity (N,), None if it hardly ever reversed."""
-    clear = np.flatnonzero(np.abs(speeds) > STILL * np.abs(speeds).max(initial=0.0))
+    clear = np.flatnonzero(np.abs(speeds) > SIGN_IS_NOISE * np.abs(speeds).max(initial=0.0))
     ways = np.sign(speeds[clear])
     begun = clear[1:][ways[1:] != ways[:-1]]
     if len(begun) < REVERSALS:
@@ -472,4 +472,4 @@ def _slowest(model: Model, states: Array, inputs: Array, dt: float, duration: fl
 SAMPLES = 8
 RESOLVED = 2  # samples after a reversal within which a friction that builds up must show
 REVERSALS = 6  # fewest reversals that tell how it builds up
-STILL = 0.05  # fraction of the largest speed below which a sign may be noise
+SIGN_IS_NOISE = 0.05  # fraction of the largest speed below which a sign may be noise

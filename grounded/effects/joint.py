@@ -35,7 +35,7 @@ from grounded.model import Model
 ALIKE = 0.999  # cosine from which two slopes are equivalent
 ONLY = 2e-3  # relative response of other states below which an input drives one speed alone
 TURNS = 4  # factor on the number of samples for positions over their whole range
-SOME = 0.1  # fraction of a parameter's uncertainty by which it is varied
+VARIED_BY = 0.1  # fraction of a parameter's uncertainty by which it is varied
 FORCES = ("N", "V", "A")  # first letters of the units of efforts: N m, V ...
 
 
@@ -209,8 +209,8 @@ def _uncertain_inertia(model: Model) -> bool:
         return np.asarray(model.system.linearise(x, u, values, dt)[1])
 
     before, spreads = pushes(model.values), [p.spread for p in model.params.values()]
-    moved = [step for step in np.diag(SOME * np.array(spreads)) if step.any()]
-    most = ONLY * SOME * np.abs(before).max()
+    moved = [step for step in np.diag(VARIED_BY * np.array(spreads)) if step.any()]
+    most = ONLY * VARIED_BY * np.abs(before).max()
     return any(np.abs(pushes(model.values + step) - before).max() > most for step in moved)
 
 

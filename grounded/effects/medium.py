@@ -116,7 +116,7 @@ def _felt(model: Model) -> tuple[Array, Array]:
     if not (found := places.body_velocity(model)):
         return np.zeros((0, 2)), np.zeros((0, 2))
     effect = current.at(Site(model, found, Scales()))
-    (x, u), dt = places.samples(model, 8), places.probe(model, places.SHORT)
+    (x, u), dt = places.samples(model, 8), places.probe(model, places.INSTANT_S)
     names, c = model.state_names, {"a": 0.1, "b": 0.2}
     plain = model.system.step(x, u, model.values, dt)
     start = Named("state", names, list(x.T))

@@ -181,7 +181,7 @@ def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
 
 SAMPLES = 40
 SAME = 1e-7  # relative difference of squared lengths of equivalent rates
-BESIDE = 1.3  # factor on the parameters for the second comparison
+PARAMETER_FACTOR = 1.3  # factor on the parameters for the second comparison
 
 
 def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
@@ -195,7 +195,7 @@ def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
     x, u = rng.uniform(-1, 1, (SAMPLES, n)), rng.uniform(-1, 1, (SAMPLES, model.m))
     kept = [i for i, name in enumerate(model.state_names) if name not in set(idle)]
     found: dict[str, str] = {}
-    beside = np.where(model.values == 0, 0.1, BESIDE * model.values)
+    beside = np.where(model.values == 0, 0.1, PARAMETER_FACTOR * model.values)
     here, there = (_Rates(model, x, u, p, kept) for p in (model.values, beside))
     for name, own in here.named.items():
         for other, slope in here.slopes.items():
@@ -209,7 +209,7 @@ class _Rates:
     """Rates (SAMPLES, n) that rate effects add, and slopes of the model's rates, by effect name."""
 
     def __init__(self, model: Model, x: Array, u: Array, p: Array, kept: list[int]) -> None:
-        dt = places.probe(model, places.SHORT)
+        dt = places.probe(model, places.INSTANT_S)
         own = (model.system.step(x, u, p, dt) - x) / dt
         _, f_u, f_p = model.system.sensitivities(x, u, p, dt)
         self.named: dict[str, Array] = {}

@@ -170,7 +170,7 @@ def _inside(around: _Shell, effect: Effect, values: Mapping[str, float], dt: flo
     return replace(whole, params=params, name=name)
 
 
-SURE = 0.5  # prior standard deviation of an adopted quantity, relative to its value
+ADOPTED_SPREAD = 0.5  # prior standard deviation of an adopted quantity, relative to its value
 
 
 def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
@@ -184,7 +184,7 @@ def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
         return Param(value, quantity.unit, value, value)
     low = None if not np.isfinite(quantity.low) else min(float(quantity.low), value)
     high = None if not np.isfinite(quantity.high) else max(float(quantity.high), value)
-    return Param(value, quantity.unit, low, high, SURE * abs(value) or None)
+    return Param(value, quantity.unit, low, high, ADOPTED_SPREAD * abs(value) or None)
 
 
 def _replaced(model: Model, a: Any, target: Mapping[str, Any]) -> Named:

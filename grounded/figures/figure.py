@@ -41,8 +41,8 @@ DASHES = {
     "step2": (5.0, 2.0),
 }
 TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
-LEAST = 1e-12  # range below which differences are rounding errors
-FEW = 300  # most dots that are drawn large
+SMALLEST_RANGE = 1e-12  # range below which differences are rounding errors
+LARGE_DOTS = 300  # most dots that are drawn large
 LETTER = 0.045  # width of a letter of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # factors by which deviations may be enlarged
 
@@ -265,7 +265,7 @@ def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]
     low, high = min(float(v.min()) for v in kept), max(float(v.max()) for v in kept)
     size = max(abs(low), abs(high))
     span = high - low if high - low > 1e-9 * size else 0.0
-    room = margin * span if span > LEAST else max(0.05 * size, LEAST)
+    room = margin * span if span > SMALLEST_RANGE else max(0.05 * size, SMALLEST_RANGE)
     return low - room, high + room
 
 

@@ -18,7 +18,7 @@ from grounded.errors import needs
 from grounded.figures.figure import (
     COLOURS,
     DASHES,
-    FEW,
+    LARGE_DOTS,
     Bars,
     Curve,
     Dot,
@@ -32,8 +32,8 @@ from grounded.figures.figure import (
 )
 from grounded.frozen import Array
 
-LONG = 26  # most letters in a line of a bar's label
-MOST = 1600  # most points of a curve
+LABEL_LETTERS = 26  # most letters in a line of a bar's label
+MOST_POINTS = 1600  # most points of a curve
 CONTEXT = 300  # most points of a curve that is only context
 STEPS = 65535  # steps in the range of a packed number
 COARSE = 50.0  # ratio of the range to that of nearly all values above which two bytes are too few
@@ -107,7 +107,7 @@ def _ruled(axis: dict[str, Any]) -> dict[str, Any]:
 
 def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
     near = curve.name and curve.role != "other" and curve.style != "ghost"
-    most = MOST if near else CONTEXT
+    most = MOST_POINTS if near else CONTEXT
     index = thinned(curve.x, curve.y, most)
     trace: dict[str, Any] = {
         "type": "scatter", "mode": "lines", "x": curve.x[index], "y": panel.height(curve.y[index]),
@@ -128,7 +128,7 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
     if not curve.name:
         trace |= {"hoverinfo": "skip", "hovertemplate": ""}
     if curve.style == "points":
-        look = ("0.7", 6) if len(curve.x) <= FEW else ("0.4", 4)
+        look = ("0.7", 6) if len(curve.x) <= LARGE_DOTS else ("0.4", 4)
         trace |= {"mode": "markers", "marker": {"color": f"@{curve.role}/{look[0]}"}}
         trace["marker"]["size"] = look[1]
     if curve.style == "steps":
@@ -224,11 +224,11 @@ def _bars(panel: Bars, axis: str) -> dict[str, Any]:
 
 def in_lines(label: str) -> str:
     """Break a label that is too long for a small panel, after a blank, a colon or a plus."""
-    if len(label) <= LONG:
+    if len(label) <= LABEL_LETTERS:
         return label
     lines = [""]
     for part in re.findall(r"[^ :+]+[ :+]?", label):
-        if lines[-1] and len(lines[-1] + part.rstrip()) > LONG:
+        if lines[-1] and len(lines[-1] + part.rstrip()) > LABEL_LETTERS:
             lines.append("")
         lines[-1] += part
     return "<br>".join(line.rstrip() for line in lines)

@@ -25,7 +25,7 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.likelihood.data import Data, entire
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.intervals import FAR, level
+from grounded.diagnosis.likelihood.intervals import FARTHEST_MOVE, level
 from grounded.diagnosis.likelihood.linearise import thresholds
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import SAME as STILL
@@ -225,7 +225,9 @@ def _far_off(search: Alone, fit: Fitted) -> list[tuple[int, Array]]:
     for j in thresholds(search.predictor, fit):
         i = calibrated(data)[j - len(effects)]
         ends = np.array([*data.model.params.values()][i].reach) - data.model.values[i]
-        low, high = np.clip(ends / param_scale(data.model)[i], -FAR, FAR).tolist()
+        low, high = np.clip(
+            ends / param_scale(data.model)[i], -FARTHEST_MOVE, FARTHEST_MOVE
+        ).tolist()
         found.append((j, np.linspace(low, high, GRID)))
     return found
 

@@ -33,10 +33,14 @@ Slopes = Literal[
     "original, corrected",
 ]
 
-LITTLE = 0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
-SURE = 0.95  # probability of an improvement from which it counts as one
+DOUBTFUL_GAIN = (
+    0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
+)
+IMPROVED = 0.95  # probability of an improvement from which it counts as one
 UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
-PART = 0.3  # share of a gain or loss due to different start states from which on it is reported
+START_SHARE = (
+    0.3  # share of a gain or loss due to different start states from which on it is reported
+)
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 
@@ -179,7 +183,7 @@ class Candidate(Result):
     def stake(self, best: Tried) -> float | None:
         """Return its promised share of the best cost if that is too little for a doubtful run."""
         share = self.promised_over(best) / abs(best.utility)
-        return share if 0 < share < LITTLE and not best.is_unsteady else None
+        return share if 0 < share < DOUBTFUL_GAIN and not best.is_unsteady else None
 
     @property
     def of_original(self) -> bool:
@@ -263,7 +267,7 @@ class Tried(Result):
         if self.starts is None or not (loss >= 0 and np.isfinite(loss)):
             return 0.0
         due = -self.starts.owed(self, other)
-        return due if due > PART * loss else 0.0
+        return due if due > START_SHARE * loss else 0.0
 
     @property
     def promised(self) -> float:
@@ -334,7 +338,7 @@ class Tried(Result):
             return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
-        return "maybe better" if self.probability < SURE or self.unsure else "better"
+        return "maybe better" if self.probability < IMPROVED or self.unsure else "better"
 
     def summary(self) -> str:
         """Return the id, the utility and the verdict."""

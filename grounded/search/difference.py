@@ -18,14 +18,14 @@ from functools import cached_property
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
-from grounded.search.candidate import PART, SURE, Candidate, Tried
+from grounded.search.candidate import IMPROVED, START_SHARE, Candidate, Tried
 from grounded.search.scatter import Repeats, Scatter
 
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
-SHOWN = 1.645  # standard errors of a gain that is one with probability SURE, 0.95
-MANY = 50  # runs of a candidate; that more would be needed is said, but not how many
-CLEAR = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
-FEW = 8  # repeats below which a scatter may be off by half, so that their number is told
+SHOWN = 1.645  # standard errors of a gain that is one with probability IMPROVED, 0.95
+MOST_RUNS_TOLD = 50  # runs of a candidate; that more would be needed is said, but not how many
+COST_RATIO = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
+FEW_REPEATS = 8  # repeats below which a scatter may be off by half, so that their number is told
 
 
 class Doubt(StrEnum):
@@ -120,7 +120,7 @@ class Difference:
     def owed(self) -> float:
         """How much of the gain is due to different start states; 0 if it is a small part."""
         start = self.of_start
-        return start if abs(start) > PART * abs(self.gain) and math.isfinite(start) else 0.0
+        return start if abs(start) > START_SHARE * abs(self.gain) and math.isfinite(start) else 0.0
 
     @property
     def apart(self) -> bool:
@@ -142,17 +142,17 @@ class Difference:
         """Whether the gain is one although no repeat tells how much runs scatter."""
         if not math.isfinite(self.before.utility):  # it failed
             return True
-        return self.before.utility < CLEAR * (self.after.utility - self.owed)
+        return self.before.utility < COST_RATIO * (self.after.utility - self.owed)
 
     @property
     def doubt(self) -> Doubt:
-        """What may explain the gain: none if it is one with probability SURE, or `clear`."""
+        """What may explain the gain: none if it is one with probability IMPROVED, or `clear`."""
         sure = self.probability
-        if sure < SURE:
+        if sure < IMPROVED:
             by_scatter = student(self.gain / self.error, self.freedom) if self.error else 0.0
-            return Doubt.STARTS if by_scatter >= SURE else Doubt.SCATTER
+            return Doubt.STARTS if by_scatter >= IMPROVED else Doubt.SCATTER
         if math.isnan(sure) and not self.clear:
-            whole = self.before.utility < CLEAR * self.after.utility
+            whole = self.before.utility < COST_RATIO * self.after.utility
             return Doubt.STARTS if whole else Doubt.UNKNOWN
         return Doubt.NONE
 
@@ -207,7 +207,7 @@ def last_gain(history: Sequence[Tried]) -> Difference | None:
 
 def few(repeats: int) -> int | None:
     """Return on how many repeats a scatter rests if it may be far off; else None."""
-    return repeats if 0 < repeats < FEW else None
+    return repeats if 0 < repeats < FEW_REPEATS else None
 
 
 def one_trial_error(best: Tried, repeats: int = 1) -> float:
@@ -219,11 +219,11 @@ def one_trial_error(best: Tried, repeats: int = 1) -> float:
 def runs_to_show(gain: float, best: Tried) -> int | None:
     """Return how many runs of a candidate and as many of the best show a gain, see `SHOWN`.
 
-    None if a single repeat tells the scatter: the number goes with its square. MANY + 1 for more.
+    None if a single repeat tells the scatter: the number goes with its square. MOST_RUNS_TOLD + 1 for more.
     """
     if best.repeats == 1:
         return None
-    return min(math.ceil(2 * (SHOWN * best.deviation / gain) ** 2), MANY + 1)
+    return min(math.ceil(2 * (SHOWN * best.deviation / gain) ** 2), MOST_RUNS_TOLD + 1)
 
 
 def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
@@ -254,7 +254,7 @@ def missed_by_start(tried: Tried) -> float:
     if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
         return 0.0
     cost = tried.starts.cost(tried)
-    small = abs(cost) < PART * abs(tried.promised - tried.utility)
+    small = abs(cost) < START_SHARE * abs(tried.promised - tried.utility)
     return 0.0 if small or not math.isfinite(cost) else cost
 
 

@@ -40,12 +40,12 @@ from grounded.task import Task
 STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
 ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
 ROUNDS = 3  # passes over the neighbours' solutions
-FEW = 8  # inputs are reset one by one if there are at most so many
+RESET_EACH = 8  # inputs are reset one by one if there are at most so many
 FREE_WEIGHT = 0.3  # weight of the equations of free states, below that of prescribed ones
 KNOTS = 250  # steps that are solved from scratch; the others start from their neighbours
 ALIKE = 1e-3  # relative difference of errors below which two results are the same minimum
 FEW_KNOTS, FEW_STARTS = 12, 2  # KNOTS and STARTS of a simulator
-CLOSE = 1e-2  # EXACT for a simulator
+EXACT_OF_SIMULATOR = 1e-2  # EXACT for a simulator
 EXACT = 1e-12  # squared error, relative to the mean squared rate, at which a trim is accepted
 
 
@@ -180,7 +180,10 @@ def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
         return J
 
     rate = np.diff(x, axis=0)[:, known] / problem.dt
-    nowhere, enough = np.full(len(free), np.inf), CLOSE if problem.system.simulated else EXACT
+    nowhere, enough = (
+        np.full(len(free), np.inf),
+        EXACT_OF_SIMULATOR if problem.system.simulated else EXACT,
+    )
     return LeastSquares(
         residual,
         jacobian,
@@ -234,7 +237,7 @@ def _from_scratch(
         best, reached = again(np.hstack([states, start]), ITERATIONS, everywhere)
         ends.append(reached)
     differ = ~(np.max(ends, axis=0) <= (1 + ALIKE) * best.error)
-    resets = task.model.m if task.model.m <= FEW and not task.model.system.simulated else 0
+    resets = task.model.m if task.model.m <= RESET_EACH and not task.model.system.simulated else 0
     for j in range(resets):
         for start in starts:
             w = best.w.copy()

@@ -44,7 +44,7 @@ CAUTION = 100.0  # factor on the input penalties for each crash of the first pol
 ITERATIONS = 1000  # most iterations of DDP from one start
 AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
 STARTS = 24  # random starts
-MANY = 300  # further starts if there are local optima
+FURTHER_STARTS = 300  # further starts if there are local optima
 KNOTS = (5, 8, 14)  # knots of a random start's inputs, in turn
 AMPLITUDES = (0.05, 0.15, 0.4)  # standard deviation of the knots, as a share of the input's range
 KICK, KICKED = 0.3, (5.0, 40.0)  # height of a kick as in AMPLITUDES; range of its width in steps
@@ -53,7 +53,7 @@ STAYED = 100  # iterations for such a plan
 WORSE = 1.01  # factor of the best cost above which a plan counts as another optimum
 WORK = 4e7  # budget for all rivals of the reference: iterations x H x (n + m)^2
 SKETCH, PROMISING = 40, 1.3  # after so many iterations, a plan above this factor is dropped
-MORE_WORK = 2e8  # budget for MANY, in the same units
+MORE_WORK = 2e8  # budget for FURTHER_STARTS, in the same units
 WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry friction builds up over
 FOLLOWED = 200  # iterations of DDP for each of them
 ROUGH = 1e-3  # relative gain of an iteration below which a simulator's plan is done
@@ -182,7 +182,7 @@ def _hopped(
     """Return the best plan of many more starts; most are dropped before they converge."""
     rng, size = np.random.default_rng(STARTS), problem.horizon * (problem.nz + task.model.m) ** 2
     work = MORE_WORK
-    for i in range(MANY):
+    for i in range(FURTHER_STARTS):
         if i % 2:
             early = _early(task, problem, rng, i // 2)
             work -= size * len(early.trace)

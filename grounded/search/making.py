@@ -13,7 +13,7 @@ from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, Run, apart, for_late_samples
-from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Slopes, Tried, Way
+from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
 from grounded.search.feedback.sample_age import planned_age, run_ages
@@ -22,7 +22,7 @@ from grounded.search.safety import objections, spread
 from grounded.search.scatter import beyond_noise
 from grounded.search.standing import LOST, Ending, Proposal, Standing, ended, wild
 from grounded.search.step.directions import base_columns, direction
-from grounded.search.step.step_size import KEPT, SearchOptions, Step, losers_of
+from grounded.search.step.step_size import KEPT_PROMISE, SearchOptions, Step, losers_of
 from grounded.solve import ddp
 from grounded.solve.bias import ground
 from grounded.solve.measured import measured_gains
@@ -34,9 +34,12 @@ if TYPE_CHECKING:
     from grounded.search.step.mispredictions import Alternative
 
 GENTLER = 1e3  # factor on the input weights for each unit of caution
-HALF, FINE = 0.5, 12  # share of the mean gain to fall below; parts of a unit of caution
-MOST = 3  # units of caution by which gains are lowered at most to what ran quietly
-NEAR = 0.2  # relative distance to a run that lost within which a step counts as the same
+GAIN_SHARE, CAUTION_PARTS = (
+    0.5,
+    12,
+)  # share of the mean gain to fall below; parts of a unit of caution
+MOST_CAUTION = 3  # units of caution by which gains are lowered at most to what ran quietly
+SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
 MISTAKEN = 0.5  # share of its predictions that the plain model may miss
@@ -132,7 +135,7 @@ class About:
             return False
         off = self.incumbent.gain_over(base) - made.predicted_gain
         lost = losers_of(history, made.id, made.model)
-        return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
+        return not lost and abs(off) <= (1 - KEPT_PROMISE) * made.predicted_gain
 
     def _refuted(self) -> int:
         """Count the steps with corrected derivatives that lost by more than their likely error."""
@@ -250,7 +253,7 @@ class About:
 
     def _doubtful(self, made: Candidate) -> bool:
         """Return whether it promises little, and less than its likely error."""
-        little = made.predicted_gain < LITTLE * -self.incumbent.utility
+        little = made.predicted_gain < DOUBTFUL_GAIN * -self.incumbent.utility
         return little and made.expected_gain <= 0.0
 
     def _disturbed(self, policies: Sequence[Policy]) -> list[float]:
@@ -267,7 +270,7 @@ class About:
     def _near(self, made: Candidate, lost: Rollout) -> bool:
         """Return whether a candidate's run is nearly that of one that lost, in this model."""
         run, other = (made.predicted_states, made.predicted_inputs), (lost.states, lost.inputs)
-        return apart(self.real, run, other) <= NEAR**2 * apart(self.real, self.run, other)
+        return apart(self.real, run, other) <= SAME_STEP**2 * apart(self.real, self.run, other)
 
     def _told(self, made: Candidate) -> Candidate:
         """Return the candidate with its likely error raised to what other models imply.
@@ -392,7 +395,7 @@ class About:
         """
         plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
         sure = -np.inf if plainly is None else plainly - self._plain_off
-        little = sure <= LITTLE * -self.incumbent.utility
+        little = sure <= DOUBTFUL_GAIN * -self.incumbent.utility
         return made.expected_gain if little else max(made.expected_gain, sure)
 
 
@@ -471,8 +474,8 @@ class Maker:
         problem, real = self.planner.plan.problem(exact=True), incumbent.utility
         caution = own.caution + 1.0
         if not between_limits(incumbent, self.planner.task):
-            less = own.caution + np.arange(1, FINE) / FINE
-            most = HALF * _gain(own.policy)
+            less = own.caution + np.arange(1, CAUTION_PARTS) / CAUTION_PARTS
+            most = GAIN_SHARE * _gain(own.policy)
             run = predicted(problem, own.policy)
             few = (c for c in less if _gain(self._gently(own.policy, problem, run, c)) < most)
             caution = float(next(few, caution))
@@ -528,7 +531,7 @@ class Maker:
         if quiet is None or quiet.needed or quiet.allows(made.policy):
             return made
         policy, caution, run = made.policy, made.caution, predicted(problem, made.policy)
-        for more in np.arange(1, MOST * FINE + 1) / FINE:
+        for more in np.arange(1, MOST_CAUTION * CAUTION_PARTS + 1) / CAUTION_PARTS:
             policy = self._gently(made.policy, problem, run, made.caution + more)
             caution = float(more)
             if quiet.allows(policy):

@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.candidate import LITTLE, Tried
+from grounded.search.candidate import DOUBTFUL_GAIN, Tried
 from grounded.search.difference import LUCK, Difference
 from grounded.search.making import FORETOLD, About
 from grounded.search.planner import Planner
-from grounded.search.step.step_size import BROKEN
+from grounded.search.step.step_size import BROKEN_PROMISE
 from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
@@ -51,8 +51,8 @@ class Promises:
 
     @property
     def broken(self) -> bool:
-        """Whether less than the share `BROKEN` was kept, beyond doubt."""
-        return self.real + self.doubt < BROKEN * self.promised
+        """Whether less than the share `BROKEN_PROMISE` was kept, beyond doubt."""
+        return self.real + self.doubt < BROKEN_PROMISE * self.promised
 
     def and_of(self, promised: float, real: float, error: float) -> Promises:
         """Return them with those of one more step, given the standard error of its gain."""
@@ -73,7 +73,7 @@ def keeping_promises(about: About) -> About:
     history = make.now.history
     stopped = [t.candidate.id for t in history if stopped_on_path(planner.task, t, history)]
     adopted, original = promises(history, make.fingerprint, stopped)
-    much = adopted.promised >= LITTLE * -about.incumbent.utility
+    much = adopted.promised >= DOUBTFUL_GAIN * -about.incumbent.utility
     if not (much and adopted.broken and adopted.share < original.share):
         return about
     bare = Planner(planner.task, planner.task)

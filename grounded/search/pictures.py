@@ -14,14 +14,14 @@ from grounded.result import figure
 from grounded.search.candidate import Tried
 
 STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
-MOST = 300  # most candidates that are drawn
+MOST_DRAWN = 300  # most candidates that are drawn
 TICKS = 8  # most candidates named on an axis
 OPEN = {  # labels of undecided verdicts
     "waiting": "waiting for its trial",
     "in doubt": "in doubt",
     "no trial": "without a trial",
 }
-NEAR = 4  # with more candidates than this, the better two thirds get a panel of their own
+OWN_PANEL_FROM = 4  # with more candidates than this, the better two thirds get a panel of their own
 
 
 class Drawn(Protocol):
@@ -49,14 +49,14 @@ def search_figure(now: Drawn, optimum: float | None = None) -> Figure | None:
         now: the standing of the search.
         optimum: best possible utility on the real system, if known.
     """
-    shown, left = few(now.history, MOST)
+    shown, left = few(now.history, MOST_DRAWN)
     tried = [t for t in shown if t.utilities]
     if not tried:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     waits = [t for t in shown if not t.utilities and now.verdict(t) == "waiting"]
     whole = _utility(now, tried + waits, number, optimum)
-    near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
+    near = (_near(whole),) if whole.loss and len(tried) > OWN_PANEL_FROM else ()
     panels = (whole, *near, _steps(now, shown, number))
     unsure = any(now.verdict(t) == "maybe better" for t in shown)
     key = [

@@ -25,9 +25,11 @@ from grounded.search.planner import Planner
 from grounded.trial import Trial
 
 BEYOND = 6  # steps beyond the lag in question that are tried: a delay may be missing
-MUCH = 0.3  # share left of one state's error if the sign of an input is flipped
-CLEAR = MARGIN / 4  # [nats] by which one explanation must predict the run better than the other
-NEAR = 0.35  # of the lag: how near the motion must be to what an explanation expects
+LEFT_BY_FLIP = 0.3  # share left of one state's error if the sign of an input is flipped
+PREDICTS_BETTER = (
+    MARGIN / 4
+)  # [nats] by which one explanation must predict the run better than the other
+NEAR_EXPECTED_LAG = 0.35  # of the lag: how near the motion must be to what an explanation expects
 
 
 def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding | None:
@@ -58,7 +60,7 @@ def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding |
         j = int(np.argmax(nats))
         shares = np.where(turned[j] > HALF * ahead.moved, 1.0, turned[j] / plain)[own]
     i = int(np.argmin(shares))
-    if nats[j] < 2 * MARGIN or shares[i] > MUCH:
+    if nats[j] < 2 * MARGIN or shares[i] > LEFT_BY_FLIP:
         return None
     state = planner.task.model.state_names[i]
     return found("run.reversed", trial.input_names[j], state=state, times=1 / float(shares[i]))
@@ -105,10 +107,12 @@ def what_is_late(planner: Planner, trial: Trial, late: int, before: Sequence[Tri
     usual = float(np.median(known)) if known else 0.0
     led, followed = (float(np.interp(by, shifts, now)) for by in (usual - late, usual))
     leads = usual - own
-    if leads > (1 - NEAR) * late and followed - led > CLEAR:  # a cause comes before its effect
+    if (
+        leads > (1 - NEAR_EXPECTED_LAG) * late and followed - led > PREDICTS_BETTER
+    ):  # a cause comes before its effect
         return Late.LOG
     # without earlier runs the rest may be a delay that no model has yet
-    follows = leads < NEAR * late and led - followed > CLEAR
+    follows = leads < NEAR_EXPECTED_LAG * late and led - followed > PREDICTS_BETTER
     return Late.PROGRAM if known and follows else Late.EITHER
 
 
@@ -148,7 +152,7 @@ def _best(shifts: Array, missed: Array) -> float | None:
         return None
     k = int(np.argmin(missed))
     others = np.abs(shifts - shifts[k]) > 1
-    if missed[others].min() < missed[k] + CLEAR or not 0 < k < len(missed) - 1:
+    if missed[others].min() < missed[k] + PREDICTS_BETTER or not 0 < k < len(missed) - 1:
         return None
     left, least, right = missed[k - 1 : k + 2]
     return float(shifts[k] + 0.5 * (left - right) / max(left - 2 * least + right, 1e-12))

@@ -25,7 +25,9 @@ from grounded.trial import Trial
 
 COASTS = 2.0  # [s] time after a run that is checked
 MAX_GAIN = 1e6  # input units per state unit; a larger gain is a numerical error
-MOST = 0.6  # share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
+ONE_RUN_SHARE = (
+    0.6  # share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
             off = task.model.difference(states, np.mean(states, axis=0)) ** 2
             scatter = 2 * np.sqrt(off.sum(axis=0) / (len(whole) - 1))
             ids = np.array([t.id for t in whole], dtype=object)[off.argmax(axis=0)]
-            ids[off.max(axis=0) <= MOST * off.sum(axis=0)] = ""
+            ids[off.max(axis=0) <= ONE_RUN_SHARE * off.sum(axis=0)] = ""
             whose = np.where(scatter > size, ids, whose)
             size = np.maximum(size, scatter)
     grounded = [

@@ -38,7 +38,7 @@ PIECES = 4  # parts of a run
 LATEST, ROWS = 9, 10_000  # trials from which the noise of the sensors is estimated; rows of each
 HUGE = 1e100  # bound on the noise of a diverged run, in the state's unit
 LEFT = 0.5  # share of the variance of repeats that starts may leave if they are most of it
-FAR = 2.0  # largest ratio of costs of candidates whose scatter is pooled
+LARGEST_COST_RATIO = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ CHANCE = 3.0  # standard deviations of sensor noise by which one sample may diff
 SLOW_S, SLOWER = 0.1, 3.0  # [s] of second differences; times the white noise, at most
 WHITE = MEDIAN * 6**0.5  # median of absolute second differences of white noise of std 1
 FEWEST = 10  # least number of second differences
-NOTHING = 1e-9  # difference treated as zero, in the state's unit or relative to its value
+SAME_START = 1e-9  # difference treated as zero, in the state's unit or relative to its value
 
 
 def beyond_noise(trials: Sequence[Trial], off: Array, start: Array, predicted: Array) -> Array:
@@ -94,7 +94,7 @@ def beyond_noise(trials: Sequence[Trial], off: Array, start: Array, predicted: A
     """
     each = [sample_noise(trial, predicted) ** 2 for trial in trials]
     noise = np.sqrt(np.mean(each, axis=0) / len(trials))
-    least = np.maximum(CHANCE * noise, NOTHING * np.maximum(1.0, np.abs(start)))
+    least = np.maximum(CHANCE * noise, SAME_START * np.maximum(1.0, np.abs(start)))
     return np.asarray(np.abs(np.mean(off, axis=0)) > least)
 
 
@@ -216,7 +216,9 @@ class Repeats:
         """Return the scatter of runs of about this utility; none if all repeats agree exactly."""
         cost, each = abs(utility), np.abs(self.rows[:, 0])
         exact = not self.rows[:, 2:].any()  # then no run scatters, at whatever utility
-        some = self.rows[exact | ((each <= FAR * cost) & (cost <= FAR * each))]
+        some = self.rows[
+            exact | ((each <= LARGEST_COST_RATIO * cost) & (cost <= LARGEST_COST_RATIO * each))
+        ]
         nu, total = float(some[:, 1].sum()), float(some[:, 2].sum())
         parts = some[:, 3:].sum(axis=0)
         if not (nu and math.isfinite(total + parts.sum())):

@@ -28,11 +28,11 @@ from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import BY_STEP, LITTLE, Candidate, Tried, Way
+from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried, Way
 from grounded.search.certainty import judged
 from grounded.search.difference import (
     LUCK,
-    MANY,
+    MOST_RUNS_TOLD,
     Difference,
     last_gain,
     missed_by_start,
@@ -70,7 +70,7 @@ class Ending(StrEnum):
     CRASHED = "crashed"  # every first policy crashed
     NOT_ALLOWED = "not allowed"  # the next candidate violates [limits] or [safety]
     GAINS = "gains too large"  # of the next candidate: a state that hardly moves, or weights
-    LITTLE = "too little gained"  # by the last candidates
+    DOUBTFUL_GAIN = "too little gained"  # by the last candidates
     BELOW_NOISE = "below the noise"  # steps lost, and the next promises less than a trial can show
     USED_UP = "trials used up"
 
@@ -83,12 +83,12 @@ DOUBTS = ("search.crashes", *ASKS)
 RESULTS = (
     Ending.NOTHING_PROMISED,
     Ending.NO_STEP,
-    Ending.LITTLE,
+    Ending.DOUBTFUL_GAIN,
     Ending.BELOW_NOISE,
 )  # endings with a result: the search has converged
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
-AGAIN = 2  # runs of the best candidate after which a search that doubts its model ends
+DOUBTED_RUNS = 2  # runs of the best candidate after which a search that doubts its model ends
 WILD = 100.0  # a trial worse than predicted, and than the best, by this factor: diagnose
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
@@ -142,7 +142,7 @@ class Standing(Result):
     @property
     def asks_again(self) -> bool:
         """Whether another run of the best candidate may settle the doubt that ended the search."""
-        once = self.incumbent is not None and len(self.incumbent.trials) < AGAIN
+        once = self.incumbent is not None and len(self.incumbent.trials) < DOUBTED_RUNS
         return self.ending is Ending.DOUBTFUL and once
 
     @property
@@ -394,7 +394,7 @@ def _hardly(
     little = gained < PATIENCE * tolerance * abs(best.utility)
     if not little and not (between.known and gained < between.error):
         return None
-    return Ending.LITTLE, found(
+    return Ending.DOUBTFUL_GAIN, found(
         "search.little",
         own,
         best=own,
@@ -430,7 +430,7 @@ def let_down(now: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if the model promises much that it lacks.
 
     A plan of the model alone promises what that reaches beyond the best run, a step that has lost
-    what it was to gain. Much is more than LITTLE of the best cost, more than a step's own likely
+    what it was to gain. Much is more than DOUBTFUL_GAIN of the best cost, more than a step's own likely
     error, and not to be explained by noise.
     """
     best = now.incumbent
@@ -452,7 +452,7 @@ def let_down(now: Standing, model: str) -> Standing:
         if short > noise:
             missed.append((gain, tried))
     gain, most = max(missed, key=lambda one: one[0], default=(0.0, None))
-    if most is None or not gain > LITTLE * -best.utility:
+    if most is None or not gain > DOUBTFUL_GAIN * -best.utility:
         return now
     if most.candidate.of_model_alone:
         own = best.candidate.id
@@ -534,7 +534,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
     excused, gap = doubt.excused(best), abs(doubt.gain_over(best))
     # many runs that would show the difference that is left without the starts
     runs = runs_to_show(gap, best) if excused and best.deviation > 0 and gap > 0 else None
-    runs = runs if runs and runs > MANY else None
+    runs = runs if runs and runs > MOST_RUNS_TOLD else None
     share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
     known = not excused and Repeats(now.history).near(best.utility).known
     return found(
@@ -547,7 +547,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
         start=excused or None,
         known=int(known),
         runs=runs,
-        share=None if runs or share >= LITTLE or best.is_unsteady else max(share, 1e-9),
+        share=None if runs or share >= DOUBTFUL_GAIN or best.is_unsteady else max(share, 1e-9),
     )
 
 

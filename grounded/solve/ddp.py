@@ -40,7 +40,7 @@ from grounded.compile.problem import (
     FLOOR,
     GROWTH,
     LARGE_MU,
-    LEAST,
+    NO_CHANGE,
     SEARCH_FLOOR,
     Controls,
 )
@@ -141,7 +141,7 @@ def descended(
         if not found.ok:
             return ended("not finite", gains.failed_at)
         promised = -(gains.d1 + gains.d2)
-        if promised <= options.tolerance * abs(state.cost) + LEAST or gained < options.enough:
+        if promised <= options.tolerance * abs(state.cost) + NO_CHANGE or gained < options.enough:
             small = found.mu < LARGE_MU  # or else it is mu that makes the change small
             return ended("converged" if small else "no improvement")
         if len(lines) >= options.max_iterations:

@@ -33,7 +33,7 @@ from grounded.frozen import Array, wrapped
 PASSES = 4
 SHARES = (0.5, 0.25, 0.0)  # of the gains on the known part: what is left where no pass is better
 SAME = 1e-9  # of what inputs do together: less, in difference, is rounding
-STILL = 1e-3  # of what a state or input does along the run
+UNMOVED = 1e-3  # of what a state or input does along the run
 RIDGE = 1e-6  # of a known quantity's own variance
 
 
@@ -53,7 +53,7 @@ def measured_gains(
         u: its inputs (H, m).
         K: gains on all of z (H, m, nz); an input without any at some step keeps none there.
         measured: how many of the first states the robot measures; it knows the inputs it sent.
-        units: of states, by name: what hardly moves along the run is disturbed by STILL of what the
+        units: of states, by name: what hardly moves along the run is disturbed by UNMOVED of what the
             others of its unit are. A robot that drives straight from rest never leaves its line;
             told from deviations of 1e-18 m, its speed had a gain of 120,000 V/m on them.
     """
@@ -64,7 +64,7 @@ def measured_gains(
         return dropped
     with np.errstate(all="ignore"):
         q = linearised(problem.system, problem, z, u)
-        noise, still = _disturbances(problem, z, units), STILL * np.ptp(z, axis=0)
+        noise, still = _disturbances(problem, z, units), UNMOVED * np.ptp(z, axis=0)
         tried, gains = [dropped, *(share * dropped for share in SHARES)], K
         for _ in range(PASSES):
             gains = _swept(q, K, _estimates(q, gains, noise, known, still), known)
@@ -80,7 +80,7 @@ def _disturbances(problem: Problem, z: Array, units: Mapping[str, str]) -> Array
     own = np.array([units.get(name, "") for name in problem.system.states])
     for unit in {*own} - {""}:
         alike = np.flatnonzero(own == unit)
-        variance[alike] = np.maximum(variance[alike], STILL**2 * variance[alike].max())
+        variance[alike] = np.maximum(variance[alike], UNMOVED**2 * variance[alike].max())
     return variance
 
 

@@ -25,7 +25,7 @@ from grounded.compile.problem import (
     FLOOR,
     GROWTH,
     LARGE_MU,
-    LEAST,
+    NO_CHANGE,
     SEARCH_FLOOR,
     STATUSES,
     Status,
@@ -157,7 +157,7 @@ class _Descent:
         """Returns when nothing more is promised, or the iterations are used up."""
         f, (d1, d2) = self.f, self._promises()
         cost = f.call("fabs", [f.load(self.result, COST)])
-        least = self._add(self._mul(self.words.double("tolerance"), cost), number(LEAST))
+        least = self._add(self._mul(self.words.double("tolerance"), cost), number(NO_CHANGE))
         small = f.compare("ole", f.neg(self._add(d1, d2)), least)
         free = f.compare("olt", f.load(self.mu), number(LARGE_MU))  # or mu makes it small
         f.return_if(f.emit(f"and i1 {small}, {free}"), self._end("converged"))

@@ -110,8 +110,8 @@ def plain(array: Any) -> Array:
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
-SMALL = 2**13  # doubles; below, the C library keeps its pages
-MOST = 2**23  # doubles on the shelf
+SHELF_FROM = 2**13  # doubles; below, the C library keeps its pages
+SHELF_SIZE = 2**23  # doubles on the shelf
 
 _shelf: dict[int, list[Array]] = {}  # free blocks by size
 
@@ -119,7 +119,7 @@ _shelf: dict[int, list[Array]] = {}  # free blocks by size
 def empty(shape: tuple[int, ...]) -> Array:
     """An array whose values are not set, float64 and C-contiguous."""
     size = math.prod(shape)
-    if size < SMALL:
+    if size < SHELF_FROM:
         return np.empty(shape)
     return np.asarray(_Block(1 << (size - 1).bit_length(), shape), np.float64)
 
@@ -155,7 +155,7 @@ class _Block:
         self.__array_interface__: dict[str, Any] = dict(self._memory.__array_interface__)
         self.__array_interface__["shape"] = shape
 
-    def __del__(self, shelf: dict[int, list[Array]] = _shelf, most: int = MOST) -> None:
+    def __del__(self, shelf: dict[int, list[Array]] = _shelf, most: int = SHELF_SIZE) -> None:
         memory = getattr(self, "_memory", None)
         if memory is None:
             return

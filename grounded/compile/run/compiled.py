@@ -62,7 +62,7 @@ from grounded.frozen import Array
 Words = ctypes.c_int64 * len(BATCH)
 RESULTS = BATCH[6:]
 POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
-SMALL = 600  # operations of a model that need not be counted with their derivatives
+UNCOUNTED_OPERATIONS = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
 
@@ -131,7 +131,7 @@ class CompiledSystem(TracedSystem):
     @property
     def operations(self) -> int:
         """Operations of the model and its derivatives where it is large; 0 says it is small."""
-        large = [v for v in self._variants if len(v.trace.graph.nodes) > SMALL]
+        large = [v for v in self._variants if len(v.trace.graph.nodes) > UNCOUNTED_OPERATIONS]
         return max((variant.operations() for variant in large), default=0)
 
     def _compiled(self, p: Array, dt: float) -> Kernels:

@@ -26,7 +26,7 @@ from itertools import combinations
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
-from grounded.diagnosis.levels import NATS, SURE
+from grounded.diagnosis.levels import ADOPTED_SPREAD, NATS
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -35,7 +35,7 @@ from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
-from grounded.effects.wrap import SURE as USUAL
+from grounded.effects.wrap import ADOPTED_SPREAD as USUAL
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array, median, white_noise
 
@@ -169,7 +169,7 @@ def sizeless(h: Hypothesis, std: Array) -> list[str]:
     return [
         name
         for name, own in zip(h.names, h.sizes, strict=True)
-        if own and (np.abs(h.theta[own]) < SURE * std[own]).all()
+        if own and (np.abs(h.theta[own]) < ADOPTED_SPREAD * std[own]).all()
     ]
 
 

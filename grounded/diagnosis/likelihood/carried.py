@@ -7,7 +7,7 @@ made with the loss of the step before, T-, and corrected to first order,
 
     x' = f(x, u - T-) - B (T - T-),        w_free = w' + B T-
 
-B changes as slowly as the robot's posture and is computed anew every FRESH steps. Where T is far
+B changes as slowly as the robot's posture and is computed anew every STEPS_PER_ANSWER steps. Where T is far
 from T- (a joint that reverses), the step is repeated with T.
 """
 
@@ -27,8 +27,10 @@ from grounded.effects.family import coupled
 from grounded.effects.losses import NUDGE, ahead, loads_from, solved
 from grounded.frozen import Array
 
-FRESH = 5  # steps after which B is computed anew
-FAR = 0.1  # change of a loss, as a fraction of the input's peak, above which a step is repeated
+STEPS_PER_ANSWER = 5  # steps after which B is computed anew
+REPEATED_ABOVE = (
+    0.1  # change of a loss, as a fraction of the input's peak, above which a step is repeated
+)
 
 
 def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
@@ -66,7 +68,7 @@ class Carried(Predictor):
         lost = self.memory.get("lost", np.zeros((*x.shape[:-1], len(inputs))))
         before = u - lost
         after = self.step(x, before, p)
-        if self.memory.get("age", 0) % FRESH == 0:
+        if self.memory.get("age", 0) % STEPS_PER_ANSWER == 0:
             self.memory["B"] = self._answers(x, before, p, after, set(drives))
         B = self.memory["B"]
         free = after + sum(B[tau] * lost[..., tau, None] for tau in B)
@@ -78,7 +80,7 @@ class Carried(Predictor):
             now[..., tau] += loss
         found = after - sum(B[tau] * (now - lost)[..., tau, None] for tau in B)
         _, peaks, _ = self.taken.unit
-        again = (np.abs(now - lost) > FAR * peaks).any(axis=-1)
+        again = (np.abs(now - lost) > REPEATED_ABOVE * peaks).any(axis=-1)
         if again.any():
             found[again] = self.step(x[again], (u - now)[again], p if p.ndim == 1 else p[again])
         for q, by in ahead(pairs, at, losses, self.data.dt, self.positions).items():

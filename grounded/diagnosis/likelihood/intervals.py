@@ -36,14 +36,18 @@ from grounded.frozen import Array
 NORMAL = 1.96  # half-width of a 95 % interval in standard deviations
 DELAY, LAGS = "sensor_delay", ("first_order_lag", "sensor_lag")
 STRETCHES = (5, 10, 20)  # numbers of stretches tried, since the duration of misfits is unknown
-LONG = 4  # fewest steps of a stretch
+SHORTEST_STRETCH = 4  # fewest steps of a stretch
 # p-values of differing scores between which the model is more and more taken to be wrong: with a
 # single one, an interval would double by the last bit
 CHANCE, CLEAR = 0.02, 0.005
 DROP = 3.67  # [nats] within which a threshold has its 95 % interval
-FAR = 12**0.5  # standard deviations of the prior between two bounds, and the farthest move
+FARTHEST_MOVE = (
+    12**0.5
+)  # standard deviations of the prior between two bounds, and the farthest move
 HALVINGS, ZOOMS, PARTS = 10, 3, 4  # of the widest move; then in parts between two of them
-LEAST = 0.2  # smallest fraction of the information taken to be left without a stretch
+LEFT_WITHOUT_STRETCH = (
+    0.2  # smallest fraction of the information taken to be left without a stretch
+)
 
 
 def standard_deviations(
@@ -121,7 +125,7 @@ def level(predictor: Predictor, fit: Fitted, j: int, drop: float) -> tuple[float
 
     sides = []
     for sign, ends in zip((-1.0, 1.0), room(data, h, len(unit)), strict=True):
-        near, far = 0.0, min(abs(float(ends[j])), FAR)
+        near, far = 0.0, min(abs(float(ends[j])), FARTHEST_MOVE)
         steps = far * 2.0 ** np.arange(-HALVINGS, 1)
         for _ in range(ZOOMS if far > 0 else 0):
             beyond = np.flatnonzero(~within(sign * steps))
@@ -194,7 +198,7 @@ def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
     axes = _whitener(fit.gram.sum(axis=0) + np.diag(fit.prior))
     columns, steps = white[..., 1:] @ axes, np.rint(data.time / data.dt).astype(int)
     length, found = int(data.lengths.max()), []
-    for count in (c for c in STRETCHES if length >= LONG * c and axes.size):
+    for count in (c for c in STRETCHES if length >= SHORTEST_STRETCH * c and axes.size):
         part = steps * count // length
         s, G = np.zeros((count, axes.shape[1])), np.zeros((count, *2 * axes.shape[1:]))
         for p in range(count):
@@ -208,7 +212,9 @@ def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
         value = float(chdtrc(max(int(told.sum()) - len(s[0]), 1), surprise))
         weight = min(float(np.log(max(value, 1e-300) / CHANCE) / np.log(CLEAR / CHANCE)), 1.0)
         if weight > 0:
-            moved = np.einsum("pij,pj->pi", turned, along / np.maximum(1 - share, LEAST))
+            moved = np.einsum(
+                "pij,pj->pi", turned, along / np.maximum(1 - share, LEFT_WITHOUT_STRETCH)
+            )
             found.append(weight * moved @ axes.T)
     return found
 

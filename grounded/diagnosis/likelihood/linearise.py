@@ -310,7 +310,7 @@ def _tried(h: Hypothesis) -> list[tuple[float, ...]]:
     for j, effect in enumerate(effects):
         if isinstance(effect.family, ParamFamily):
             value = effect.site.model.params[effect.site.target].value
-            found[j] = (*found[j], PART * abs(value))
+            found[j] = (*found[j], THRESHOLD_NUDGE * abs(value))
     return found
 
 
@@ -340,7 +340,7 @@ def _by_parameter(
         shift[i] += size * param.spread
         return predictor.advance(replace(h, shift=shift), x, u, time)
 
-    size = SLIGHT if 2 * start < sum(param.reach) else -SLIGHT
+    size = PARAMETER_NUDGE if 2 * start < sum(param.reach) else -PARAMETER_NUDGE
     slope = model.difference(reached(size), after) / size
     for part in SECANTS:
         if slope.any():
@@ -349,10 +349,15 @@ def _by_parameter(
     return np.asarray(slope)
 
 
-SLIGHT = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
-SOME = 10  # samples that show at once of most parameters that they have a slope
-PART = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
-SECANTS = (PART, 2 * PART, 4 * PART, 8 * PART)  # the same, wider while no sample is between
+PARAMETER_NUDGE = 1e-5  # finite-difference step of a parameter, as a fraction of its scale
+SAMPLES_FIRST = 10  # samples that show at once of most parameters that they have a slope
+THRESHOLD_NUDGE = 0.05  # fraction of a parameter's size, to each side, of the step for thresholds
+SECANTS = (
+    THRESHOLD_NUDGE,
+    2 * THRESHOLD_NUDGE,
+    4 * THRESHOLD_NUDGE,
+    8 * THRESHOLD_NUDGE,
+)  # the same, wider while no sample is between
 
 
 def thresholds(predictor: Predictor, fit: Fitted) -> list[int]:
@@ -375,7 +380,7 @@ def sensitivities(
         f_x (N, n, n), f_u (N, n, m), f_p (N, n, k).
     """
     f_x, f_u, f_p = model.system.sensitivities(x, u, p, dt)
-    few = f_p[:SOME].any(axis=(0, 1))
+    few = f_p[:SAMPLES_FIRST].any(axis=(0, 1))
     flat = np.flatnonzero(~few & (param_scale(model) > 0))
     flat = flat[~f_p[:, :, flat].any(axis=(0, 1))] if len(flat) else flat
     for i in flat:
@@ -391,14 +396,14 @@ def sensitivities(
     return f_x, f_u, f_p
 
 
-WIDE = 10.0  # [SI unit] standard deviation of a state that is never measured
+UNMEASURED_SPREAD = 10.0  # [SI unit] standard deviation of a state that is never measured
 
 
 def prior(data: Data) -> Array:
     """Return the initial variances (n,) of states that were not measured when a run began."""
     found = []
     for i, name in enumerate(data.model.state_names):
-        found.append(data.scales.spread(name) ** 2 if data.told[i] else WIDE**2)
+        found.append(data.scales.spread(name) ** 2 if data.told[i] else UNMEASURED_SPREAD**2)
     return np.array(found)
 
 

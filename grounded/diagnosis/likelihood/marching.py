@@ -37,7 +37,7 @@ def arriving_name(name: str) -> str:
 
 
 Times = Array | float  # [s] within the trial, of each row (M,) or of all
-LONG = 50  # fewest steps for which compiling pays
+STEPS_TO_COMPILE = 50  # fewest steps for which compiling pays
 AGREE = 1e-9  # tolerance of the check, relative to a state's size
 CARRIED = 1e-3  # the same for a heading rate, which `advance` computes by a short finite step
 
@@ -85,7 +85,7 @@ def marched(
     acting = (e.name for e, _ in h.pairs if isinstance(e.family, LossFamily | RateFamily))
     key, given = (*acting, arrival), np.zeros(0) if parts is None else parts
     if key not in predictor.marches:
-        if len(u) < LONG:
+        if len(u) < STEPS_TO_COMPILE:
             return None
         march = _compiled(predictor, h, arrival)
         if march is not None:

@@ -39,7 +39,9 @@ from grounded.frozen import Array
 DOF = 4.0
 UNSEEN = 1e-2  # initial disturbance of a state that is never measured, as a fraction of its scale
 REMEMBERED = 20  # steps after which a start is taken to be forgotten
-NOTHING = 1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
+ZERO_VARIANCE = (
+    1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
+)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
         if not values.size:  # never measured: large enough for the fit to move it either way
             log_q[i] = floor[i] + 2 * math.log(UNSEEN / 1e-6)
         if steps:
-            floor[i] = max(floor[i], math.log(NOTHING * total))
+            floor[i] = max(floor[i], math.log(ZERO_VARIANCE * total))
     return NoiseModel(
         Structure(), np.maximum(log_q, floor), np.maximum(log_r, floor), log_q.copy(), floor
     )

@@ -9,7 +9,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects.sensed import behind_logs
 from grounded.frozen import Array
 
-SMALL = 1e-4  # finite-difference step as a fraction of a state's spread
+STATE_NUDGE = 1e-4  # finite-difference step as a fraction of a state's spread
 STEEPEST = 1.0  # most damping of a rate by its own state over half a step
 
 
@@ -114,7 +114,7 @@ def rate_slopes(
     if any(e.family.needs_own for e, _ in rates):
         own = predictor.instant(h, x, u) if now else (predictor.moved(h, x, u) - x) / data.dt
     # the rates at the states and beside them, in each state's direction: (1 + n, L, B, n)
-    size = np.array([0.0, *(SMALL * data.scales.spread(name) for name in names)])
+    size = np.array([0.0, *(STATE_NUDGE * data.scales.spread(name) for name in names)])
     beside = np.broadcast_to(x, (1 + n, *x.shape)).copy()
     moved = np.broadcast_to(own, beside.shape)
     moved = moved.copy() if of_own is not None else moved

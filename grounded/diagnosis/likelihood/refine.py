@@ -56,13 +56,15 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # size of one (L, B, N, N) array of a block; what fits in the cache is fastest
 SHORTEST = 0.05  # smallest fraction of a step that is tried
-CLOSE = 10.0  # nats behind the best within which all rivals continue
-AHEAD = 2.0  # times what its next step promises that a rival may gain
-KEPT = 4  # iterations of a round of a simulator, whose slopes are kept during a round
-LITTLE = 0.1  # nats that a shortened step must promise to be tried
-NOTHING = 0.01  # nats: after a rise below LEAST, a step that promises less is not tried
-LEAST = 1.0  # nats: smaller rises may end a fit
-STILL = 0.03  # nats: smaller rises do end it
+RIVAL_NATS = 10.0  # nats behind the best within which all rivals continue
+RIVAL_PROMISE = 2.0  # times what its next step promises that a rival may gain
+ITERATIONS_PER_ROUND = (
+    4  # iterations of a round of a simulator, whose slopes are kept during a round
+)
+PROMISE_SHORTENED = 0.1  # nats that a shortened step must promise to be tried
+PROMISE_LAST = 0.01  # nats: after a rise below RISE_MAY_END, a step that promises less is not tried
+RISE_MAY_END = 1.0  # nats: smaller rises may end a fit
+RISE_ENDS = 0.03  # nats: smaller rises do end it
 
 
 @dataclass(eq=False)
@@ -79,7 +81,9 @@ class Work:
     given_up: bool = False  # can't catch up with its rivals
     moving: bool = True  # the track moves with the step; at kinks of the model this may not help
     along: Predictor | None = None  # predictor of its own track, during the fit
-    share: float = 1.0  # of the thresholds LITTLE, NOTHING and STILL, below which it ends
+    share: float = (
+        1.0  # of the thresholds PROMISE_SHORTENED, PROMISE_LAST and RISE_ENDS, below which it ends
+    )
 
     def shorten(self, data: Data) -> None:
         """Retry the step with the track held, then shorter ones; stop if they are too short."""
@@ -87,7 +91,7 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.step is None or self.part < SHORTEST or self.hope < LITTLE * self.share:
+        if self.step is None or self.part < SHORTEST or self.hope < PROMISE_SHORTENED * self.share:
             self.still = True
         else:
             self.go(data)
@@ -151,7 +155,7 @@ def refine(
         size, left = max(1, int(MOST_NUMBERS / (L * B * wide * wide))), iterations
         some = [works[i] for i in own]
         # a race: after each round, those that can't catch up with the best are given up
-        lap = KEPT if simulated(predictor.data.model) else 1
+        lap = ITERATIONS_PER_ROUND if simulated(predictor.data.model) else 1
         while worth is not None and len(some) > 1 and left > lap:
             some = _after(predictor, some, (lap, fixed_noise, False), size, tick)
             _race(some, worth, bar)
@@ -205,10 +209,10 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool])
 
 
 def _race(works: list[Work], worth: Callable[[Fitted], float], bar: float) -> None:
-    """Give up works that stay CLOSE nats behind the best with AHEAD times what a step promises."""
+    """Give up works that stay RIVAL_NATS nats behind the best with RIVAL_PROMISE times what a step promises."""
     value = [-np.inf if work.best is None else worth(work.best) for work in works]
     for work, mine in zip(works, value, strict=True):
-        reach = mine + AHEAD * np.nan_to_num(work.hope) + CLOSE
+        reach = mine + RIVAL_PROMISE * np.nan_to_num(work.hope) + RIVAL_NATS
         work.given_up = work.given_up or -np.inf < reach < max(bar, *value)
 
 
@@ -269,7 +273,7 @@ def _iterate(
         fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
         if (rise := _rises(work, fit)) == 0:
             work.shorten(data)
-        elif not (last and rise >= LEAST):  # else it has not converged, and no step follows
+        elif not (last and rise >= RISE_MAY_END):  # else it has not converged, and no step follows
             rises[i] = rise
     if not rises:
         return
@@ -285,7 +289,7 @@ def _iterate(
     for i, work, step in zip(rises, up, steps, strict=True):
         assert work.best is not None
         work.step = proposed(data, work.best, filtered[:, own[i]], *step)
-        little = rises[i] < LEAST and work.step.promise < NOTHING * work.share
+        little = rises[i] < RISE_MAY_END and work.step.promise < PROMISE_LAST * work.share
         work.still = work.still or little
         work.go(data)
 
@@ -355,7 +359,7 @@ def _rises(work: Work, fit: Fitted) -> float:
     rise = np.inf if work.best is None else fit.peak - work.best.peak
     if not (rise > 0 and np.isfinite(fit.evidence) and np.isfinite(fit.gram).all()):
         return 0.0
-    work.still = not rise > STILL * work.share
+    work.still = not rise > RISE_ENDS * work.share
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit

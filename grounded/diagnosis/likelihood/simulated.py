@@ -3,7 +3,7 @@
 A diagnosis evaluates thousands of steps along nearly the same tracks, so results are reused:
 
 `Slopes`    of steps from the same samples. Along the track of a hypothesis during its fit, slopes
-            are taken anew only where it moved by more than NEAR of the range of the log; the track
+            are taken anew only where it moved by more than SLOPES_HOLD of the range of the log; the track
             that the filter is linearised about is no more accurate than that
 `tangent`   steps from samples nearby, with a value or an input changed slightly, by these slopes
 `carried`   rollouts with losses of joints
@@ -24,8 +24,8 @@ from grounded.compile.run.differenced import DifferencedSystem
 from grounded.frozen import Array
 from grounded.model import Model
 
-NEAR = 0.01  # fraction of a state's spread, an input's peak or a parameter's size
-KEPT = 24  # sets of slopes in the cache
+SLOPES_HOLD = 0.01  # fraction of a state's spread, an input's peak or a parameter's size
+SLOPES_KEPT = 24  # sets of slopes in the cache
 
 Take = Callable[[Array, Array], tuple[Array, ...]]  # x (N, n), u (N, m) -> slopes (N, ...)
 
@@ -84,7 +84,7 @@ class Slopes:
         return old.found if old is not None and old.x.shape == x.shape else None
 
     def _far(self, kind: int, one: Array, other: Array) -> Array:
-        return np.asarray(np.abs(one - other) > NEAR * self.unit[kind])
+        return np.asarray(np.abs(one - other) > SLOPES_HOLD * self.unit[kind])
 
     def _same(self, take: Take, x: Array, u: Array, p: Array, full: bool) -> tuple[Array, ...]:
         key = blake2b(b"".join(a.tobytes() for a in (x, u, p, np.array(full)))).digest()
@@ -92,6 +92,6 @@ class Slopes:
             found = take(x, u)
         self.same.pop(key, None)
         self.same[key] = found  # least recently used first
-        for old in list(self.same)[:-KEPT]:
+        for old in list(self.same)[:-SLOPES_KEPT]:
             self.same.pop(old, None)
         return found

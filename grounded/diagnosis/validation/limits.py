@@ -41,7 +41,7 @@ from grounded.effects.actuator import backlash
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import LITTLE, told_by
+from grounded.places import MOVES_STATE, told_by
 from grounded.share import share_of
 from grounded.task import Task
 from grounded.trial import Trial, scattered
@@ -312,7 +312,7 @@ def copies(data: Data) -> Copies:
         at = np.linspace(0, len(x) - 1, SAMPLES).astype(int)
         with np.errstate(all="ignore"):
             slopes = model.system.linearise(x[at], u[at], model.values, data.dt)[1]
-        same = like & _proportional(slopes.reshape(-1, model.m), LITTLE)
+        same = like & _proportional(slopes.reshape(-1, model.m), MOVES_STATE)
 
     def groups(like: Any) -> dict[str, tuple[str, ...]]:
         names = {name: j for j, name in enumerate(model.input_names) if name not in still}

@@ -28,7 +28,7 @@ from grounded.search.step.corrected import runs
 AGES = (0.0, 0.3, 0.6)  # age of the samples, as a fraction of a step
 NOISE, SEEDS = 0.1, 3  # noise, as a fraction of each state's rms motion in a step; number of draws
 WORSE = 1.5  # most cost, relative to the predicted run, with which a loop counts as stable
-LITTLE = 1.3  # most mean cost relative to the best gains; gentler ones are more robust
+MOST_COST = 1.3  # most mean cost relative to the best gains; gentler ones are more robust
 CAUTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25)  # gains that are tried, see `Maker._gently`
 
 
@@ -55,7 +55,7 @@ def steadied(
     gentler = [gently(caution) for caution in CAUTIONS]
     tried = [(own, policy), *zip(all_worse_costs(models, gentler), gentler, strict=True)]
     on_average = [np.log(np.maximum(found, np.finfo(float).tiny)).mean() for found, _ in tried]
-    enough = min(on_average) + np.log(LITTLE)
+    enough = min(on_average) + np.log(MOST_COST)
     if on_average[0] <= enough:
         return policy
     return next(

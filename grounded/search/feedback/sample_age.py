@@ -32,10 +32,12 @@ from grounded.trial import Trial
 
 PROBED = 0.1  # age for the derivative of the commands, in steps
 OLDEST = 2.0  # largest age, in steps; a program that acts on older samples needs another remedy
-CLEAR = 0.25  # smallest share of the squares of the commands' differences that an age explains
+EXPLAINED_SHARE = (
+    0.25  # smallest share of the squares of the commands' differences that an age explains
+)
 # ages differ if by more than both, in s and in steps: less costs little, and noise gives it too
 DIFFERENT_S, DIFFERENT = 3e-3, 0.1
-NOTHING = 1e-6  # rms difference of commands, relative to their size, that is rounding
+ROUNDING_OF_COMMANDS = 1e-6  # rms difference of commands, relative to their size, that is rounding
 
 
 def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> float:
@@ -70,11 +72,11 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
         return 0.0
     e, g = np.concatenate(off), np.concatenate(by_age)
     squares = float(np.vdot(e, e))
-    if not squares > NOTHING**2 * e.size or not (steep := float(np.vdot(g, g))) > 0:
+    if not squares > ROUNDING_OF_COMMANDS**2 * e.size or not (steep := float(np.vdot(g, g))) > 0:
         return 0.0
     explains = float(np.vdot(g, e)) ** 2 / steep
     age = float(np.vdot(g, e)) / steep
-    clear = explains > CLEAR * squares and abs(age) <= OLDEST * task.dt
+    clear = explains > EXPLAINED_SHARE * squares and abs(age) <= OLDEST * task.dt
     return age if clear else 0.0
 
 

@@ -28,7 +28,7 @@ from grounded.policy import Policy
 from grounded.rollout import SETTLED, Rollout, seen_late
 from grounded.search.planner import predicted
 
-MOST = 2**22  # gains held at once
+MOST_GAINS = 2**22  # gains held at once
 Flags = NDArray[np.bool_]
 
 
@@ -193,7 +193,7 @@ def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollou
     if len(systems) < len(problems) or open_loop or not systems:
         return [predicted(*each) for each in zip(problems, policies, strict=True)]
     problem, system = problems[0], _with_each_law(systems)
-    room = max(1, MOST // (problem.horizon * problem.nz * system.m))
+    room = max(1, MOST_GAINS // (problem.horizon * problem.nz * system.m))
     if len(policies) > room:  # long horizons
         parts = [slice(i, i + room) for i in range(0, len(policies), room)]
         return [run for part in parts for run in runs(problems[part], policies[part])]

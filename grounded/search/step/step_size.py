@@ -43,9 +43,9 @@ from grounded.checks import one_of, whole_number, wrong
 from grounded.result import figure
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 
-KEPT, BROKEN = 0.9, 0.25
+KEPT_PROMISE, BROKEN_PROMISE = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
-LEAST, MOST = 1e-6, 1e3
+SMALLEST_DAMPING, LARGEST_DAMPING = 1e-6, 1e3
 BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
 Method = Literal["ddp", "policy-gradient"]
 Stepping = Literal["damped", "full"]
@@ -75,10 +75,10 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
         predicted: gain of utility that the grounded model predicted.
         real: gain of utility in the trial.
     """
-    if step.alpha == 1.0 and real >= KEPT * predicted:
-        return Step(max(step.damping / EASED, LEAST))
-    if real < BROKEN * predicted:
-        return Step(min(step.damping * RAISED, MOST))
+    if step.alpha == 1.0 and real >= KEPT_PROMISE * predicted:
+        return Step(max(step.damping / EASED, SMALLEST_DAMPING))
+    if real < BROKEN_PROMISE * predicted:
+        return Step(min(step.damping * RAISED, LARGEST_DAMPING))
     return Step(step.damping)
 
 
@@ -90,8 +90,8 @@ def after_failure(step: Step, max_halvings: int, *, damps: bool = True) -> Step 
         max_halvings: smallest alpha is 2^-max_halvings.
         damps: whether the damping is raised before alpha is halved.
     """
-    if damps and step.damping < MOST:
-        return replace(step, damping=min(step.damping * RAISED, MOST))
+    if damps and step.damping < LARGEST_DAMPING:
+        return replace(step, damping=min(step.damping * RAISED, LARGEST_DAMPING))
     alpha = step.alpha / 2
     return replace(step, alpha=alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
 

@@ -77,7 +77,7 @@ def test_all_folds_together_are_each_alone(model, freed):
 @pytest.mark.parametrize("before", ["", "delay", "first_order_lag"])
 def test_a_compiled_hypothesis_goes_where_its_steps_lead(before, monkeypatch):
     model = pendulum
-    monkeypatch.setattr(marching, "LONG", 1)
+    monkeypatch.setattr(marching, "STEPS_TO_COMPILE", 1)
     data = data_of(model)
     predictor, compiled, refused = Predictor(data), set(), set()
     by_family = {e.family.name: e for e in Library().candidates(model, data.scales)}

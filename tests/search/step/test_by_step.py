@@ -112,7 +112,9 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     together = runs([late] * len(tried), tried)
     assert len(steps) - one_by_one < 0.3 * one_by_one
     assert_same_runs(together, alone)
-    monkeypatch.setattr("grounded.search.step.corrected.MOST", 1)  # a long horizon: one at a time
+    monkeypatch.setattr(
+        "grounded.search.step.corrected.MOST_GAINS", 1
+    )  # a long horizon: one at a time
     assert_same_runs(runs([late] * len(tried), tried), alone)
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 

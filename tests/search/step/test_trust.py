@@ -2,7 +2,13 @@
 
 import pytest
 
-from grounded.search.step.step_size import LEAST, MOST, Step, after_failure, after_success
+from grounded.search.step.step_size import (
+    LARGEST_DAMPING,
+    SMALLEST_DAMPING,
+    Step,
+    after_failure,
+    after_success,
+)
 
 
 def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
@@ -10,8 +16,8 @@ def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
     assert after_success(Step(0.1), 100.0, 60.0) == Step(0.1)
     assert after_success(Step(0.1), 100.0, 10.0) == Step(1.0)
     assert after_success(Step(1.0), 100.0, 10.0) == Step(10.0)
-    assert after_success(Step(MOST), 100.0, 10.0) == Step(MOST)
-    assert after_success(Step(LEAST), 100.0, 100.0) == Step(LEAST)
+    assert after_success(Step(LARGEST_DAMPING), 100.0, 10.0) == Step(LARGEST_DAMPING)
+    assert after_success(Step(SMALLEST_DAMPING), 100.0, 100.0) == Step(SMALLEST_DAMPING)
 
 
 def test_failures_damp_first_and_halve_then():
@@ -24,7 +30,7 @@ def test_failures_damp_first_and_halve_then():
         (1.0, 1.0),
         (10.0, 1.0),
         (100.0, 1.0),
-        (MOST, 1.0),
-        (MOST, 0.5),
-        (MOST, 0.25),
+        (LARGEST_DAMPING, 1.0),
+        (LARGEST_DAMPING, 0.5),
+        (LARGEST_DAMPING, 0.25),
     ]

@@ -14,7 +14,7 @@ import numpy as np
 from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import SHORT, probe, samples
+from grounded.places import INSTANT_S, probe, samples
 from grounded.trial import Trial
 from grounded_trials.report.findings import ESTIMATED, Findings, Run
 from grounded_trials.report.forecast import forecast
@@ -196,7 +196,7 @@ def _telling(model: Model, state: int, values: Array, rate: Array) -> int:
 
 def _own(model: Model, state: int) -> list[int]:
     """Return the columns (states, then inputs) on which a state's rate depends, and its own."""
-    dt, (x, u) = probe(model, SHORT), samples(model, 8)
+    dt, (x, u) = probe(model, INSTANT_S), samples(model, 8)
     by_states, by_inputs = model.system.linearise(x, u, model.values, dt)[:2]
     by_states = by_states - np.eye(model.n)
     sizes = np.abs(np.concatenate([by_states[:, state], by_inputs[:, state]], axis=-1)).max(axis=0)

@@ -18,7 +18,7 @@ from grounded.figures.figure import Figure
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import begun, listed
-from grounded.search.pictures import MOST, few
+from grounded.search.pictures import MOST_DRAWN, few
 from grounded_trials.report.findings import (
     Findings,
     by_state,
@@ -91,7 +91,7 @@ def table(
 def candidate_table(findings: Findings) -> list[Block]:
     """Return the candidates with their trials; of many, a part and the number left out."""
     rows, best = [], findings.standing.incumbent
-    kept, left = few(findings.history, MOST)
+    kept, left = few(findings.history, MOST_DRAWN)
     for tried in kept:
         c = tried.candidate
         cells = {
