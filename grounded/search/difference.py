@@ -219,7 +219,8 @@ def one_trial_error(best: Tried, repeats: int = 1) -> float:
 def runs_to_show(gain: float, best: Tried) -> int | None:
     """Return how many runs of a candidate and as many of the best show a gain, see `SHOWN`.
 
-    None if a single repeat tells the scatter: the number goes with its square. MOST_RUNS_TOLD + 1 for more.
+    None if a single repeat tells the scatter: the number goes with its square. MOST_RUNS_TOLD + 1
+    for more.
     """
     if best.repeats == 1:
         return None

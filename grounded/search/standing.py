@@ -430,8 +430,8 @@ def let_down(now: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if the model promises much that it lacks.
 
     A plan of the model alone promises what that reaches beyond the best run, a step that has lost
-    what it was to gain. Much is more than DOUBTFUL_GAIN of the best cost, more than a step's own likely
-    error, and not to be explained by noise.
+    what it was to gain. Much is more than DOUBTFUL_GAIN of the best cost, more than a step's own
+    likely error, and not to be explained by noise.
     """
     best = now.incumbent
     if best is None:

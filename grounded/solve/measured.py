@@ -53,9 +53,8 @@ def measured_gains(
         u: its inputs (H, m).
         K: gains on all of z (H, m, nz); an input without any at some step keeps none there.
         measured: how many of the first states the robot measures; it knows the inputs it sent.
-        units: of states, by name: what hardly moves along the run is disturbed by UNMOVED of what the
-            others of its unit are. A robot that drives straight from rest never leaves its line;
-            told from deviations of 1e-18 m, its speed had a gain of 120,000 V/m on them.
+        units: of states, by name: what hardly moves along the run is disturbed by UNMOVED of
+            what the others of its unit are: a robot that drives straight never leaves its line.
     """
     known = np.ones(problem.nz, bool)
     known[measured : problem.system.n] = False

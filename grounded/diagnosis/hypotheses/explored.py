@@ -26,7 +26,7 @@ from itertools import combinations
 import numpy as np
 
 from grounded.diagnosis.error_report import TIMES
-from grounded.diagnosis.levels import ADOPTED_SPREAD, NATS
+from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -35,7 +35,7 @@ from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.polish import APART
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, InputFamily, MediumFamily, ParamFamily, RateFamily
-from grounded.effects.wrap import ADOPTED_SPREAD as USUAL
+from grounded.effects.wrap import ADOPTED_SPREAD
 from grounded.filter.tempering import Tempering, tempering
 from grounded.frozen import Array, median, white_noise
 
@@ -169,7 +169,7 @@ def sizeless(h: Hypothesis, std: Array) -> list[str]:
     return [
         name
         for name, own in zip(h.names, h.sizes, strict=True)
-        if own and (np.abs(h.theta[own]) < ADOPTED_SPREAD * std[own]).all()
+        if own and (np.abs(h.theta[own]) < SURE * std[own]).all()
     ]
 
 
@@ -319,7 +319,7 @@ def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> fl
 
 def _of_change(effect: Effect, values: Mapping[str, float], steps: int) -> float:
     """Return the price of a change of an adopted effect, by the prior of its adopted values."""
-    sizes = {q.name: USUAL * q.known for q in effect.free if q.known}
+    sizes = {q.name: ADOPTED_SPREAD * q.known for q in effect.free if q.known}
     pulls = sum(0.5 * (values.get(name, 0.0) / size) ** 2 for name, size in sizes.items())
     return pulls + 0.25 * len(effect.free) * math.log(max(steps, 2)) + 1.0
 

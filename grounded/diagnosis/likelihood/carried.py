@@ -7,8 +7,8 @@ made with the loss of the step before, T-, and corrected to first order,
 
     x' = f(x, u - T-) - B (T - T-),        w_free = w' + B T-
 
-B changes as slowly as the robot's posture and is computed anew every STEPS_PER_ANSWER steps. Where T is far
-from T- (a joint that reverses), the step is repeated with T.
+B changes as slowly as the robot's posture and is computed anew every STEPS_PER_ANSWER steps. Where
+T is far from T- (a joint that reverses), the step is repeated with T.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool, bool])
 
 
 def _race(works: list[Work], worth: Callable[[Fitted], float], bar: float) -> None:
-    """Give up works that stay RIVAL_NATS nats behind the best with RIVAL_PROMISE times what a step promises."""
+    """Give up works RIVAL_NATS behind the best after RIVAL_PROMISE times what a step promises."""
     value = [-np.inf if work.best is None else worth(work.best) for work in works]
     for work, mine in zip(works, value, strict=True):
         reach = mine + RIVAL_PROMISE * np.nan_to_num(work.hope) + RIVAL_NATS

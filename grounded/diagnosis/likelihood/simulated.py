@@ -3,8 +3,8 @@
 A diagnosis evaluates thousands of steps along nearly the same tracks, so results are reused:
 
 `Slopes`    of steps from the same samples. Along the track of a hypothesis during its fit, slopes
-            are taken anew only where it moved by more than SLOPES_HOLD of the range of the log; the track
-            that the filter is linearised about is no more accurate than that
+            are taken anew only where it moved by more than SLOPES_HOLD of the range of the log;
+            the track that the filter is linearised about is no more accurate than that
 `tangent`   steps from samples nearby, with a value or an input changed slightly, by these slopes
 `carried`   rollouts with losses of joints
 
