@@ -15,24 +15,10 @@ from helpers import fastest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from grounded_trials.formats.bags import standard_types
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
-PARTS = {
-    "": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    "geometry_msgs/TwistWithCovariance twist\n",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
-}
-DEFINITION = ("=" * 80 + "\n").join(
-    (f"MSG: {name}\n" if name else "") + text for name, text in PARTS.items()
-)
+KIND = "nav_msgs/msg/Odometry"
 PATHS = {
     "x": "/odom.pose.pose.position.x",
     "y": "/odom.pose.pose.position.y",
@@ -48,7 +34,8 @@ def write(path: Path, count: int, *, chunked: bool) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream, compression=kind, use_chunking=chunked)
         writer.start("ros2")
-        schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", DEFINITION.encode())
+        definition, _ = standard_types().generate_msgdef(KIND, 2)
+        schema = writer.register_schema(KIND, "ros2msg", definition.encode())
         channel = writer.register_channel("/odom", "cdr", schema)
         for i in range(count):
             stamp = struct.pack("<II", i // 1000, i % 1000 * 10**6)
@@ -68,12 +55,10 @@ def one_by_one(path: Path) -> None:
 
 def with_rosbags(path: Path) -> None:
     """Read with the rosbags package."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = standard_types()
     with path.open("rb") as stream:
         for _, _, message in make_reader(stream).iter_messages():
-            _ = store.deserialize_cdr(message.data, "nav_msgs/msg/Odometry").pose.pose.position.x
+            _ = store.deserialize_cdr(message.data, KIND).pose.pose.position.x
 
 
 def main() -> None:
