@@ -14,7 +14,7 @@ from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
-from grounded_trials.logs.inspection.inspect_log import find_twins, inspect_log
+from grounded_trials.logs.inspection.inspect_log import inspect_log, opposite_signals
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
 from shared_data import data, needs_data
@@ -103,7 +103,7 @@ def test_number_paths() -> None:
     assert len(number_paths(Dynamic(), deep)) < 20
 
 
-def test_twins() -> None:
+def test_signals_of_opposite_sign() -> None:
     t = np.arange(0, 10, 0.01)
     ns = (t * 1e9).astype(np.int64)
     slow = ns[::9]
@@ -114,9 +114,9 @@ def test_twins() -> None:
         "/c.q.@rpy.pitch": (slow, np.cos(t[::9])),
         "/d.q.@rpy.pitch": (slow, np.full(len(slow), np.nan)),
     }
-    (twins,) = find_twins(samples)
-    assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
-    assert twins.opposite and twins.correlation < -0.999
+    (opposite,) = opposite_signals(samples)
+    assert opposite.about == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
+    assert opposite.facts["correlation"] < -0.999
 
 
 @needs_data

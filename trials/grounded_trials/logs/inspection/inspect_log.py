@@ -8,7 +8,7 @@ two must not be mixed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -95,7 +95,7 @@ class LogReport:
     duration_s: float
     messages: int
     topics: tuple[TopicReport, ...]
-    twins: tuple[Twins, ...]  # signals of different topics with one motion
+    opposite: tuple[Finding, ...]  # signals of different topics with one motion, but for its sign
     damage: str = ""  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
     layout: Layout = AS_IT_SAYS  # what was said of its table
@@ -159,12 +159,7 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
             odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
         if bad:
             odd.append(found("file.odd_values", bad[0], lost="some"))
-    odd += [
-        found("file.opposite", twins.first, twins.second, correlation=twins.correlation)
-        for twins in log.twins
-        if twins.opposite
-    ]
-    return tuple(odd)
+    return *odd, *log.opposite
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
@@ -238,7 +233,7 @@ class _Look:
             duration_s=(end - start) * 1e-9,
             messages=sum(topic.count for topic in self.topics.values()),
             topics=tuple(topic.report(start) for topic in self.topics.values()),
-            twins=find_twins(self._samples()),
+            opposite=tuple(opposite_signals(self._samples())),
             damage=self.damage,
             meta=self.meta if len(files) == 1 else {},
         )
@@ -396,38 +391,22 @@ def _noise(values: Floats) -> float:
     return max(noise, STEP * quantum([values]))
 
 
-@dataclass(frozen=True)
-class Twins:
-    """Two signals with the same motion; the correlation is negative if their signs differ."""
-
-    first: str  # message paths
-    second: str
-    correlation: float
-
-    @property
-    def opposite(self) -> bool:
-        """Whether the two have opposite signs."""
-        return self.correlation < 0
-
-
 def measured_kind(path: str) -> str:
     """Return what a path measures, such as position.x; "" if its name does not show it."""
     return next((kind for kind in KINDS if path.endswith("." + kind)), "")
 
 
-def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
-    """Find signals of the same kind that show the same motion.
+def opposite_signals(samples: Mapping[str, tuple[Ints, Floats]]) -> Iterator[Finding]:
+    """Yield the pairs of signals of one kind that show the same motion with opposite signs.
 
     Args:
         samples: stamps [ns] and values by message path.
     """
-    found = []
     for first, second in combinations(samples, 2):
         if measured_kind(first) == measured_kind(second) != "":
             correlation = _correlation(samples[first], samples[second])
-            if abs(correlation) >= SAME:
-                found.append(Twins(first, second, correlation))
-    return tuple(found)
+            if correlation <= -SAME:
+                yield found("file.opposite", first, second, correlation=correlation)
 
 
 def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
@@ -436,17 +415,13 @@ def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
     inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
     if inside.sum() < LEAST:
         return 0.0
-    other = np.interp((ta[inside] - ta[0]) * 1e-9, (tb - ta[0]) * 1e-9, yb)
-    one = ya[inside]
-    if min(one.std(), other.std()) < 1e-3 * max(one.std(), other.std(), 1e-9):
-        return 0.0
-    return float(np.corrcoef(one, other)[0, 1])
+    one, other = ya[inside], np.interp(ta[inside], tb, yb)
+    sizes = one.std(), other.std()
+    return float(np.corrcoef(one, other)[0, 1]) if min(sizes) > 1e-3 * max(sizes) else 0.0
 
 
-def _clean(t: Ints, y: Floats) -> tuple[Ints, Floats]:
+def _clean(t: Ints, y: Floats) -> tuple[Floats, Floats]:
+    """Return the finite samples, sorted, in seconds; of equal stamps the first."""
     finite = np.isfinite(y)
-    t, y = t[finite], y[finite]
-    order = np.argsort(t, kind="stable")
-    t, y = t[order], y[order]
-    keep = np.append(True, np.diff(t) > 0) if len(t) else finite[:0]
-    return t[keep], y[keep]
+    seconds, first = np.unique(1e-9 * t[finite], return_index=True)
+    return seconds, y[finite][first]
