@@ -30,7 +30,6 @@ from grounded.accounts.sent import (
     follows,
 )
 from grounded.findings import Finding, Quantity, Weight, found
-from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
@@ -72,7 +71,6 @@ class Look:
         self.read, self.own, self.candidates, self.task = read, own, candidates, task
         self.found: Start | None = None
         self.exact = False
-        self.old: Array | None = None  # ages of the samples acted on [s], (n,), if it is surely its
         # set if judged on other samples than stored
         self.apart = None if log is read.log else log
         cut = self.apart.cut(read.trial.candidate)[0] if self.apart else read.trial
@@ -105,11 +103,9 @@ class Look:
         self.found = start = start_of(own)
         sender = sender_of(log, own, candidates, start_of)
         self.exact = sender.own is not None and sender.own.exact
-        if sender.own is not None and sender.sure:
-            self.old = sender.own.old
         behind = _behind(log, own.policy, start, sure=sender.sure)
         if behind:
-            self.found, self.exact, self.old = behind, True, None
+            self.found, self.exact = behind, True
             if abs(behind.seconds - log.first) > ALIGNED * log.interval:
                 self._cut(stored, behind)
             seen = self._judged()
