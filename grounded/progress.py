@@ -60,7 +60,7 @@ class Stages:
     """Reports each stage with the time taken.
 
     The time left is not known to within a factor of two before the end: whether a diagnosis looks
-    for one more effect depends on what the last one left, and its last stages took 3 to 15 % of it.
+    for one more effect depends on what the last one left.
 
     Args:
         tell: shows a line; None for no output.

@@ -14,9 +14,8 @@ what the actuator delivers over the step, so fractions of a step matter:
 
 The mean gives the correct speeds at the end of the step, but what arrives early moves positions
 farther, and a servo settles from it longer. A diagnosis makes the step in parts, before and after a
-delayed command arrives, or adds the first moment of u_eff within the step (`lead`). Without it, a
-delay of two fifths of a step was 30 % too long by an arm's encoders, and 15 % too short by the
-angle of a servo with a time constant of two steps.
+delayed command arrives, or adds the first moment of u_eff within the step (`lead`). Without it,
+delays that are no whole steps would be biased.
 """
 
 from __future__ import annotations

@@ -16,8 +16,7 @@ mean over opposite velocities removes centrifugal terms. It counts if F W explai
 that no friction of another origin is taken for a motor's.
 
 The weights depend on the model's parameters: h is half its track. While these are fitted, the
-weights follow (`weights_at`). With those of a crude track, a third of the wheels' viscous friction
-and a damping of the speed that nothing makes stood for a track that is 8 % larger.
+weights follow (`weights_at`): else frictions would stand for a track that is larger than modelled.
 """
 
 from __future__ import annotations

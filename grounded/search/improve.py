@@ -270,8 +270,7 @@ def _below_noise(
 
     Else a search under noise goes on for as long as the model promises anything. None: it goes on,
     as it does before a measured loss (a failed run is none), since many small gains add up, and if
-    the best one's runs scatter by as much as they cost: a ball's search ended so at -1.1 +- 0.6,
-    and the next one was steady at -0.55.
+    the best one's runs scatter by as much as they cost.
     """
     measured = [tried for tried in make.now.history if not tried.crashed]
     lost = losers_of(measured, best.candidate.id, make.fingerprint)

@@ -240,9 +240,8 @@ class About:
     def ruined_by(self, made: Candidate) -> bool:
         """Return whether this model gives a step of another one far more than the best cost.
 
-        This model replays the best trial, too. A step of an excavator's original model, planned
-        without the adopted delay of 60 ms, made it swing: -12 where the best was -0.2. A model that
-        missed its own steps by about as much is no witness.
+        This model replays the best trial, too. A model that missed its own steps by about as much
+        is no witness.
         """
         history = self.make.now.history
         own = losers_of(history, self.incumbent.candidate.id, self.make.fingerprint)

@@ -222,7 +222,7 @@ def model_fingerprint(task: Task) -> str:
 def fixed_draws(count: int) -> Array:
     """Return the first numbers in [0, 1) that `np.random.default_rng(0)` draws.
 
-    They are made here because to import numpy.random takes 10 ms, as long as many a plan. PCG64
+    They are made here because to import numpy.random takes as long as many a plan. PCG64
     (O'Neill 2014) is a linear congruence of 128 bits; its halves are combined and rotated.
     """
     state, step = 35399562948360463058890781895381311971, 87136372517582989555478159403783844777

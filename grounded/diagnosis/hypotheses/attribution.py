@@ -237,8 +237,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     """Return the likeliest of up to `most` effects: add one, then try to replace each, repeat.
 
     A part of a larger set may be likelier than the set that was extended to it, and is extended in
-    turn: a robot's true scale of distances took the place of its speed sensor's only beside a limit
-    of its acceleration, and a side slip was found only beside the true one.
+    turn.
     """
     size, done = len(best.hypothesis.effects), set[frozenset[str]]()
     while 1 <= size < most:

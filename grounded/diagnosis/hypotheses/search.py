@@ -313,8 +313,8 @@ class HypothesisSearch(FittedHypotheses):
 
         Each is filtered at a few delays with the noise and the track of the fit. The scan takes a
         late sample for the present state plus an offset, and the process noise of the fit for that
-        of a log without delay: a position 50 ms late, 73 nats likelier, seemed to gain 0.6. It is
-        asked last: a servo's log would be called late before its delay and speed limit are found.
+        of a log without delay. It is asked last: a log may look late until the actuator's delay
+        and limits are found.
         """
         known = delayed(fit.hypothesis.effects)
         starts = [

@@ -88,8 +88,8 @@ def linearise(
         into: d and r to fill, zeros with at least `columns_of` columns; None: they are allocated.
         whole: slopes in the parameters are those of the whole hypothesis also beside effects on
             steps. The model's own, carried through these effects, are up to a third off there, but
-            fits of real logs (EMPS, a servo, a car's throttle) end nearer to the published causes
-            with them; why is not known.
+            fits of real logs (`benchmarks/real_data.py`) end nearer to the published causes with
+            them; why is not known.
 
     Returns:
         F (L, B, n, n), d (L, B, n, C) and r (L + 1, B, n, C). The columns are the residual, the

@@ -4,9 +4,7 @@ A limit cycle shows in a trial: an input swings about its plan, by the plan's ra
 (`swings`), or goes from limit to limit (`between_limits`). Noise that high gains carry swings an
 input, too, at all frequencies (`periodic`).
 
-An arm of a search swung, and its next candidate, with 44 % of the gains, ran quietly but lost: dry
-friction held it back. The step after it had all of the gains again, and ended in a limit cycle
-between the limits of both motors. What a loop lacks to be stable (a delay, a filter) is not in the
+What a loop lacks to be stable (a delay, a filter) is not in the
 model, so no prediction shows it; runs do. So the strength of a policy's feedback, input by input,
 
     mean over t of sum_j |K_tij| d_j,    d_j = rms motion of state j in a step of the run that swung

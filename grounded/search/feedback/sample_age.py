@@ -1,10 +1,9 @@
 """Find how old the samples are that a robot's policy acts on, and allow for it.
 
 A program commands from the last sample that has reached it, while its log has the states at the
-time of the command. A car at 1.8 m/s whose poses were 7 ms old saw itself 12 mm further back than
-it was, and so drove 12 mm ahead of its reference. A model that replays the recorded inputs replays
-that lead; but a policy that is planned about the replayed run, and run on such samples again, leads
-by 12 mm more, which no model promised: two steps lost, the second one to 1.7 times the cost.
+time of the command. It sees itself further back than it is, and so leads its reference. A model
+that replays the recorded inputs replays that lead; but a policy that is planned about the replayed
+run, and run on such samples again, leads by as much again, which no model promised.
 
 So a policy pi is taken to see x - age dx/dt. The age is that of the incumbent's runs,
 
