@@ -186,6 +186,10 @@ def test_a_manoeuvre_is_drawn_before_the_first_plan(tmp_path):
     assert w.undo_adoption().then.verb == "target"
     diagnosed(w.folder, verdict=NONE, ranking=[])
     assert after_diagnosis(Folder(w.folder), read_diagnosis(w.reports)).verb == "target"
+    diagnosed(w.folder, **UNKNOWABLE)  # a drive that tells more comes before a manoeuvre
+    assert after_diagnosis(Folder(w.folder), read_diagnosis(w.reports)).verb == "excite"
+    assert following(w.folder) == "excite"
+    diagnosed(w.folder, verdict=NONE, ranking=[])
     config = w.config.file.read_text()
     w.config.file.write_text(config.replace("[task]", "[task]\nstart = { x = 0.3 }"))
     assert following(w.folder) == "propose"  # from there zeros ask for something
@@ -294,6 +298,12 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
     assert following(w.folder) == "diagnose"
     diagnosed(w.folder, diagnosed=taken_in(*range(1, count + 1)))
     assert following(w.folder) == then
+
+
+def test_a_changed_model_that_promises_nothing_is_said_to(w):
+    set_in_model(w.config.file, effects=[{"name": "viscous_friction:v", "k": 1e-9}])
+    found = w.propose()
+    assert found.candidate is None and "plan.no_better" in {one.code for one in found.findings}
 
 
 # how commands are printed

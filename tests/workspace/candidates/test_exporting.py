@@ -14,7 +14,12 @@ from cli import grounded, plain
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
-from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate, to_run
+from grounded_trials.workspace.candidates.exporting import (
+    RUNNER,
+    export_candidate,
+    exported_as,
+    to_run,
+)
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.folder import Folder
@@ -154,7 +159,7 @@ def test_only_the_candidates_own_export_counts_as_made(tmp_path, monkeypatch):
         export_candidate(other, "c0001", form, path)
         assert to_run(mine, "c0001").verb == "export" and to_run(other, "c0001").verb == "next"
         export_candidate(mine, "c0001", form, path)
-        assert to_run(mine, "c0001").verb == "next"
+        assert to_run(mine, "c0001").verb == "next" and exported_as(mine, "c0001") == form
         path.unlink()
     (here / "c0001.csv").write_text("t,x,force\n0,0,0\n")  # its log
     assert to_run(mine, "c0001").verb == "export"

@@ -122,8 +122,7 @@ def _followed(effect: Effect, values: Mapping[str, Any], dt: float) -> Mapping[s
     """Check an effect's parameters and widen a dry friction too steep for the time step.
 
     If c dt is many times the width over which the friction builds up, one step reverses a slow
-    motion and makes it faster, so that no plan converges (a ball in a tube went to 4 m instead of
-    0.6 m).
+    motion and makes it faster, so that no plan converges.
     """
     whole = _checked(effect, values)
     if effect.family.name != "coulomb_friction":

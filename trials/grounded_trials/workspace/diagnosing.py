@@ -340,8 +340,8 @@ def probe_candidate(
 def near(task: Task, n: int, trials: Sequence[Trial]) -> Task:
     """Bound the states without [safety] to the range of the trials, extended by half on each side.
 
-    Without it, a probe may go anywhere (doublets took a quadrotor 100 m below the ground). States
-    that nothing measures, angles, and memory states of effects, from the nth on, stay unbounded.
+    States that nothing measures, angles, and memory states of effects, from the nth on, stay
+    unbounded.
     """
     been = np.vstack([trial.states for trial in trials])
     known = np.isfinite(been)

@@ -127,8 +127,7 @@ def _off(workspace: Folder, one: StoredTrial, but: str) -> Iterator[Array]:
     """Yield how far a run began off the start that its candidate was planned for; nothing of data.
 
     Where [task] start was moved since to where the robot does begin, it is how far the run began
-    off the new one. Four starts that scattered by 26 mm were "off by 0.072 m", two of them by the
-    old start. Runs of a model with other states are left out.
+    off the new one. Runs of a model with other states are left out.
     """
     trial, model = one.trial, workspace.base_model
     same = trial.state_names == model.state_names
