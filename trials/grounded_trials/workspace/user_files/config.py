@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -23,6 +22,7 @@ from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 
 MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
+OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 FILE = "grounded.toml"
 OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
@@ -289,7 +289,8 @@ def set_target(
         _put(document, "reward", {"terminal": _inline(ends)})
     text = tomlkit.dumps(document)
     if same and own:
-        text = re.sub(r"(?m)^# terminal = .*$", partial(_offered, before=own, now=weights), text)
+        offered = _inline({name: float(f"{OFFERED * w:.6g}") for name, w in weights.items()})
+        text = OFFER.sub(f"# terminal = {offered.as_string()}", text)
     if made and blank:
         text = MADE.sub(f"# input_change = {_inline(made | blank).as_string()}", text)
     write_atomically(file, text.encode())
@@ -306,16 +307,6 @@ def made_changes(text: str) -> dict[str, float]:
         weights = tomllib.loads(found[0].removeprefix("# "))["input_change"] if found else {}
         return {name: w for name, w in weights.items() if isinstance(w, int | float)}
     return {}
-
-
-def _offered(found: re.Match[str], before: Mapping[str, float], now: Mapping[str, float]) -> str:
-    """Return the comment with terminal weights, renewed if it is still what `init` wrote."""
-    with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
-        told = tomllib.loads(found[0].removeprefix("# "))["terminal"]
-        if told.keys() == before.keys() and all(_is_offered(told[k], w) for k, w in before.items()):
-            ends = _inline({name: float(f"{OFFERED * w:.6g}") for name, w in now.items()})
-            return f"# terminal = {ends.as_string()}"
-    return found[0]
 
 
 def _is_offered(terminal: float, weight: float | None) -> bool:
