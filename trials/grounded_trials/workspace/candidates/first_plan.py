@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
+from grounded.search.feedback.oscillation import jumps
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -198,8 +199,6 @@ def _most_missed(task: Task, run: Trial) -> tuple[str, Quantity, float]:
 
 def rough(plan: Plan) -> Iterator[Finding]:
     """Inputs jump over half their [limits], or sensor noise moves them through the gains."""
-    from grounded.search.feedback.oscillation import jumps
-
     if plan.made is None:
         return
     task, gain = plan.task, plan.made.policy.gain

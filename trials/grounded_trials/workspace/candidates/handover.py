@@ -32,6 +32,8 @@ from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.difference import beyond_one_trial
 from grounded.search.feedback.oscillation import quiet_gains
+from grounded.search.safety import coasts_out, objections, spread
+from grounded.search.standing import Standing, standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import what_became
@@ -41,7 +43,6 @@ from grounded_trials.workspace.where_to_mend import twice_in_time
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
-    from grounded.search.standing import Standing
 
 INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
 PROPOSE = NextCommand("propose")
@@ -217,8 +218,6 @@ class Check:
     @cached_property
     def standing(self) -> Standing:
         """The standing of the search."""
-        from grounded.search.standing import standing
-
         if self.now is not None:
             return self.now
         here = self.workspace
@@ -378,8 +377,6 @@ class Check:
 
     def _coasting(self) -> Finding | None:
         """Return where the robot goes after the run, with the input held then."""
-        from grounded.search.safety import coasts_out
-
         made, planner = self.candidate, self.workspace.planner
         run = planner.lift(made.predicted_run)
         held = np.clip(made.policy.past, made.policy.low, made.policy.high)
@@ -411,8 +408,6 @@ class Check:
 
     def _unsafe(self) -> tuple[Finding, ...]:
         """Return objections of [safety]; a step not run yet gets a margin for how runs strayed."""
-        from grounded.search.safety import objections, spread
-
         workspace, made = self.workspace, self.candidate
         if self._changed and self._predictable:
             made = self._predicted()
