@@ -278,7 +278,7 @@ def test_zstd_files_of_any_log(tmp_path):
 
 def test_an_exported_candidate_is_no_log(cart_candidate):
     folder, file = cart_candidate
-    with pytest.raises(GroundedError, match=holding("best.npz", "candidate c0001")):
+    with pytest.raises(GroundedError, match=holding("c0001.npz", "candidate c0001")):
         list(npz_records(file))
     for k in range(4):
         (folder / f"drive{'abcd'[k]}.csv").write_text("t,x\n0,0\n")
@@ -289,5 +289,5 @@ def test_an_exported_candidate_is_no_log(cart_candidate):
 @pytest.fixture
 def cart_candidate(tmp_path):
     w = Workspace(make(tmp_path / "w").folder)
-    w.export(w.propose().candidate.id, tmp_path / "best.npz", form="npz")
-    return tmp_path, tmp_path / "best.npz"
+    w.export(w.propose().candidate.id, tmp_path / "c0001.npz", form="npz")
+    return tmp_path, tmp_path / "c0001.npz"

@@ -12,14 +12,12 @@ import hashlib
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
-from zipfile import BadZipFile, ZipFile
 
-from grounded.errors import GroundedError, needs
+from grounded.errors import GroundedError, alike, needs
 from grounded.findings import found
 from grounded_trials.formats import dataflash, parquet, text_tables
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
@@ -127,48 +125,21 @@ def _bag(folder: Path) -> list[Path]:
 
 def _missing(path: Path) -> GroundedError:
     """Return the error for a file that does not exist, with the logs that it may stand for."""
-    from difflib import get_close_matches
-
     if not path.parent.is_dir():
         return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
-    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS)]
-    there = [p for p in there if not _NO_LOG.fullmatch(p.name) and not _is_candidate(p)]
-    logs = sorted(there, key=lambda p: -_written(p))
-    plain = _DIGITS.sub("0", path.stem.lower())
-    named = {p.stem.lower(): p.name for p in reversed(logs)}  # endings make all names alike
-    close = get_close_matches(path.stem.lower(), named, n=1)
-    close += [stem for stem in named if _DIGITS.sub("0", stem) == plain]  # another number
-    near = named[close[0]] if close else ""
+    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and p.exists()]
+    logs = [p for p in there if not _NO_LOG.fullmatch(p.name)]
+    logs = sorted(logs, key=lambda p: -p.stat().st_mtime)
+    named = {p.stem: p.name for p in reversed(logs)}  # endings make all names alike
+    close = named.get(alike(path.stem, named), "")
     newest = () if close else tuple(p.name for p in logs[:NEWEST])
     return GroundedError(
-        found("file.missing", str(path), near=near, newest=newest, logs=len(logs) * (not close))
+        found("file.missing", str(path), near=close, newest=newest, logs=len(logs) * (not close))
     )
 
 
 def _unreadable(path: Path, why: str, kind: str = "") -> GroundedError:
     return GroundedError(found("file.unreadable", str(path), why=why, kind=kind))
-
-
-def _is_candidate(path: Path) -> bool:
-    """Return whether a file is a candidate that was exported as .npz, by the names in it."""
-    from grounded_trials.formats.tables import CANDIDATE
-
-    with suppress(OSError, GroundedError, BadZipFile):
-        return within(path, path.stat().st_size, _names_in, path) >= CANDIDATE
-    return False
-
-
-def _names_in(path: Path) -> set[str]:
-    with ZipFile(path) as archive:
-        return {name.removesuffix(".npy") for name in archive.namelist()}
-
-
-def _written(path: Path) -> float:
-    """Return when a file was last written [s]; 0 if it is gone."""
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0
 
 
 def _no_log_in(folder: Path) -> GroundedError:
