@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +40,7 @@ from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.signals import Decoder, decoder_of
 
+NAMING = "/JointState", "/JointTrajectoryControllerState"  # types of messages that name joints
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
 GAP = 10.0  # intervals; longer gaps are reported
@@ -98,6 +101,7 @@ class LogReport:
     opposite: tuple[Finding, ...]  # signals of different topics with one motion, but for its sign
     damage: str = ""  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
+    joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names that topics give
     layout: Layout = AS_IT_SAYS  # what was said of its table
 
     @property
@@ -236,6 +240,11 @@ class _Look:
             opposite=tuple(opposite_signals(self._samples())),
             damage=self.damage,
             meta=self.meta if len(files) == 1 else {},
+            joints={
+                name: next(iter(topic.joints))
+                for name, topic in self.topics.items()
+                if len(topic.joints) == 1
+            },
         )
 
     def _samples(self) -> dict[str, tuple[Ints, Floats]]:
@@ -288,12 +297,15 @@ class _Topic:
     skews: list[Ints] = field(default_factory=list)
     decoder: Decoder | None = None
     ranges: dict[str, _Range] = field(default_factory=dict)
+    joints: set[tuple[str, ...]] = field(default_factory=set)
 
     def add(self, batch: Messages) -> None:
         self.count += len(batch)
         self.log_times.append(batch.log_times)
         if self.problem or not len(batch):
             return
+        if self.schema is not None and self.schema.name.endswith(NAMING):
+            self.joints |= _joints_in(batch, self.channel.encoding, self.schema)
         stride = 1 + self.looked // DECODED
         chosen = np.zeros(len(batch), dtype=np.bool_)
         chosen[::stride] = True
@@ -355,6 +367,34 @@ class _Topic:
             fields=tuple(_field(p, r) for p, r in _telling(self.ranges).items() if r.count),
             problem=self.problem,
         )
+
+
+@cache
+def _types_of(ros1: bool) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+def _joints_in(batch: Messages, encoding: str, schema: Schema) -> set[tuple[str, ...]]:
+    """Return the lists of joints' names in the first and last message of a batch."""
+    from rosbags.typesys import get_types_from_msg
+
+    store = _types_of(encoding == "ros1")
+    read = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    kind, listed = "sensor_msgs/msg/JointState", "name"
+    if schema.name.endswith(NAMING[1]):
+        kind, listed = "control_msgs/msg/JointTrajectoryControllerState", "joint_names"
+        defined = get_types_from_msg(schema.data.decode(errors="replace"), kind)
+        store.register({name: one for name, one in defined.items() if name not in store.types})
+    names = set()
+    for i in {0, len(batch) - 1}:
+        data = batch.buffer[int(batch.starts[i]) : int(batch.ends[i])]
+        try:
+            names.add(tuple(getattr(read(data, kind), listed)))
+        except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
+            continue  # not a ROS encoding: joints have no names
+    return names
 
 
 def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:

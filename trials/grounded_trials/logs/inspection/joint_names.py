@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,17 +19,14 @@ import numpy as np
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 from grounded.units import UNITS
-from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
-from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.logs.inspection.relations import Signals
 
-NAMING = "/JointState", "/JointTrajectoryControllerState"  # types of messages that name joints
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
@@ -66,11 +62,9 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
 
     A topic whose messages name different joints is left out, since its indices are ambiguous.
     """
-    wanted = {t.topic for t in log.topics if t.type.endswith(NAMING) and t.messages}
-    found = read_apart(log.files, _joint_names, wanted) if wanted else {}
     there = _there(log)
-    parts = {t: [p for p in AIMED if f"{t}.{p}.positions[0]" in there] for t in found}
-    return {f"{t}.{parts[t][0]}" if parts[t] else t: names for t, names in found.items()}
+    parts = {t: [p for p in AIMED if f"{t}.{p}.positions[0]" in there] for t in log.joints}
+    return {f"{t}.{parts[t][0]}" if parts[t] else t: names for t, names in log.joints.items()}
 
 
 def at_joints(joints: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
@@ -92,26 +86,6 @@ def _aimed_at(topic: str, kind: str, index: int, there: set[str]) -> str:
     base, _, part = topic.rpartition(".")
     paths = [f"{base}.{aim}.{PLURAL[kind]}[{index}]" for aim in AIMED[part]]
     return next((path for path in paths if path in there), "")
-
-
-def _joint_names(files: tuple[Path, ...], wanted: set[str]) -> dict[str, tuple[str, ...]]:
-    found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
-    for file in files:
-        channels: dict[int, Channel] = {}
-        schemas: dict[int, Schema] = {}
-        for record in log_records(file):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Messages):
-                for identity in record.channel_ids():
-                    channel = channels.get(identity)
-                    if channel is not None and channel.topic in wanted:
-                        found[channel.topic] |= _names_in(
-                            record.of(identity), channel.encoding, schemas.get(channel.schema_id)
-                        )
-    return {topic: names.pop() for topic, names in found.items() if len(names) == 1}
 
 
 def slides(joint: str) -> bool:
@@ -141,28 +115,6 @@ def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
 
 def _words(joint: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)}
-
-
-def _names_in(batch: Messages, encoding: str, schema: Schema | None) -> set[tuple[str, ...]]:
-    """Return the lists of names in the first and last message of a batch."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    ros1 = encoding == "ros1"
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    read = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-    kind, listed = "sensor_msgs/msg/JointState", "name"
-    if schema is not None and schema.name.endswith(NAMING[1]):
-        kind, listed = "control_msgs/msg/JointTrajectoryControllerState", "joint_names"
-        defined = get_types_from_msg(schema.data.decode(errors="replace"), kind)
-        store.register({name: one for name, one in defined.items() if name not in store.types})
-    found = set()
-    for i in {0, len(batch) - 1}:
-        data = batch.buffer[int(batch.starts[i]) : int(batch.ends[i])]
-        try:
-            found.add(tuple(getattr(read(data, kind), listed)))
-        except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
-            continue  # not a ROS encoding: joints have no names
-    return found
 
 
 def from_base(joints: Sequence[str]) -> tuple[str, ...]:
