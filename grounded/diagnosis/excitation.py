@@ -58,12 +58,12 @@ from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 
-NOTHING = 0.1  # nats below which no trial can separate two effects
+SEPARABLE_NATS = 0.1  # nats below which no trial can separate two effects
 REPLAYED = 4  # most recent trials whose commands are used to calibrate the expected evidence
 ADAPTED = 12  # iterations in which a rival is fitted to a run
 SETTLED = 4  # iterations in which the track of an unmeasured state is found
-MOST = 0.1  # smallest fraction of a value's `+-` that is promised
-LITTLE = 1e-6  # fraction of a value's information, and of its size, that counts as zero
+PROMISED_SHARE = 0.1  # smallest fraction of a value's `+-` that is promised
+NO_INFORMATION = 1e-6  # fraction of a value's information, and of its size, that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ def probe(
         step = found("gap.next.probe", *group[:2], by=expected, probe=words, **pair)
         return Probe(chosen, expected, (group[0], group[1]), step)
     claimed = next((name for name in group[:2] if name in diagnosis.effects), None)
-    claimed = claimed if most < NOTHING and not diagnosis.contested else None
+    claimed = claimed if most < SEPARABLE_NATS and not diagnosis.contested else None
     step = found("gap.next.no_probe", *group[:2], claimed=claimed, **pair)
     return Probe(chosen, expected, (group[0], group[1]), step, little=True)
 
@@ -183,9 +183,12 @@ def _teaching(
     if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
         return None
     F = groups.sum(axis=0)
-    own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or that of the priors
+    own = np.maximum(np.diag(F), 1 / np.maximum(std, NO_INFORMATION) ** 2)  # or that of the priors
     unit_of = 1 / np.sqrt(own)
-    groups, prior = groups * np.outer(unit_of, unit_of), np.diag(1 - np.diag(F) / own + LITTLE)
+    groups, prior = (
+        groups * np.outer(unit_of, unit_of),
+        np.diag(1 - np.diag(F) / own + NO_INFORMATION),
+    )
     F = groups.sum(axis=0) + prior
     unseen = np.isnan(np.concatenate([trial.states for trial in trials])).all(axis=0)
     for words, candidate in probes(policy, task.model, range(task.model.m)):
@@ -207,7 +210,7 @@ def _teaching(
     well = bool(diagnosis.leftover or diagnosis.unconfirmed) & (std < WELL * np.abs(values))
     k = int(np.argmin(np.where((std > 0) & (~well | well[std > 0].all()), twice, np.inf)))
     again = bool(twice[k] < (1 - SHOWS) * once[k])
-    shrunk = max(float(twice[k] if again else once[k]), MOST)
+    shrunk = max(float(twice[k] if again else once[k]), PROMISED_SHARE)
     name = list(spreads)[k]
     of = spreads[name].unit
     now = float(spreads[name].std)

@@ -36,7 +36,7 @@ from grounded.findings import Finding
 from grounded.result import Document, figure, html_table, number, or_zero, seen, spread, with_unit
 
 Kind = Literal["effect", "several", "none", "unknown"]
-LARGE, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
+POWERS_FROM, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
 UNKNOWABLE = (  # codes of what the trials can't show
     *("model.few", "model.still", "model.unmeasured", "model.share", "model.copy"),
 )
@@ -81,7 +81,7 @@ class Estimate(Document):
         value = seen(value, std)
         places = math.floor(math.log10(max(abs(value), std))) - math.floor(math.log10(std)) + 2
         digits = min(max(places, 3), MOST_DIGITS)
-        large = abs(value) >= LARGE  # a few digits would give it a power of ten
+        large = abs(value) >= POWERS_FROM  # a few digits would give it a power of ten
         shown = figure(value, digits) if large else f"{value:#.{digits}g}".rstrip(".")
         return with_unit(f"{shown if value else 0} +- {spread(std)}", self.unit)
 

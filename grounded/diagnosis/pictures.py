@@ -16,7 +16,7 @@ from grounded.result import figure, measured, measured_alike, percent, shown
 if TYPE_CHECKING:  # of which this is a part
     from grounded.diagnosis.parts import Diagnosis
 
-MOST = 12  # bars
+MOST_BARS = 12  # bars
 STATES = 6  # whose error without each cause is drawn
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
@@ -114,7 +114,7 @@ def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
     names = sorted(changed, key=lambda name: changed[name])[:states]
     panels = [worth_of(name, error, diagnosis) for name in names if error]
     if credit:
-        bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST]]
+        bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST_BARS]]
         panels.insert(0, Bars("Errors without each", tuple(bars)))
     found = tuple(panel for panel in panels if panel.bars)
     return Figure("credit", "What each is worth", "", found) if found else None
@@ -131,7 +131,7 @@ def worth_of(name: str, error: RulerRow, diagnosis: Diagnosis) -> Bars:
     if causes:  # else nothing was found: the same error once more
         rows += [(("best", "all causes"), error.with_effects)]
     if len(causes) > 1:  # without the only one, it is the model before
-        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST]]
+        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST_BARS]]
     rows += [(("other", columns_told(diagnosis)["noise_floor"]), error.noise_floor)]
     known = [(look, errors[name]) for look, errors in rows if name in errors]
     bars = [(label, v, role) for (role, label), v in known if math.isfinite(v)]
@@ -152,7 +152,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     panels = [
         Bars(
             f"Share by {word}",
-            tuple(Bar(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST]),
+            tuple(Bar(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST_BARS]),
         )
         for word, shares, role in (
             ("channel", by_channel, "best"),
@@ -164,7 +164,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     if diagnosis.ranking:
         evidence = tuple(
             Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
-            for r in diagnosis.ranking[:MOST]
+            for r in diagnosis.ranking[:MOST_BARS]
         )
         panels.append(Bars("Evidence [nats]", evidence))
     title = "Where the gap is" if by_channel else "Effects compared"

@@ -39,9 +39,11 @@ from grounded.filter.kalman import (
 from grounded.frozen import Array
 
 SWEEPS = 20  # most sweeps
-CLOSE = 1e-2  # change of the track, in standard deviations, at which sweeps end,
-STILL = 1e-3  # [nats] or change of the likelihood; at a kink a track may alternate for ever,
-ENOUGH = 0.05  # [nats] so this change is accepted after SWEEPS
+TRACK_SETTLED = 1e-2  # change of the track, in standard deviations, at which sweeps end,
+LIKELIHOOD_SETTLED = (
+    1e-3  # [nats] or change of the likelihood; at a kink a track may alternate for ever,
+)
+ACCEPTED_AFTER_SWEEPS = 0.05  # [nats] so this change is accepted after SWEEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +137,10 @@ def _sweeps(
                 float(np.max(np.abs(done.x[:-1] - track) / wide[:-1])),
                 float(np.max(np.abs(done.x_prior - xbar) / wide)),
             )
-            settled = abs(done.loglik - last) < (STILL if sweep < SWEEPS - 1 else ENOUGH)
-            if moved < CLOSE or settled:
+            settled = abs(done.loglik - last) < (
+                LIKELIHOOD_SETTLED if sweep < SWEEPS - 1 else ACCEPTED_AFTER_SWEEPS
+            )
+            if moved < TRACK_SETTLED or settled:
                 return done
             track, xbar, last = done.x[:-1], done.x_prior, done.loglik
     return None

@@ -25,7 +25,7 @@ from grounded.frozen import Array
 
 FLOOR = 1e-4  # smallest std, as a fraction of the visible scatter
 ROUNDS = 4  # most linearisations
-ENOUGH = 0.2  # [nats] a round that gains less is the last
+LAST_GAIN = 0.2  # [nats] a round that gains less is the last
 FIRST_STEPS = 4  # steps of expectation-maximisation
 ROWS = 8_000  # samples; more add little information about the noise
 
@@ -72,7 +72,7 @@ def maximum_likelihood(
         gain = after.loglik - best.loglik
         if gain > 0:
             noise, best = trial, after
-        if not gain > ENOUGH:
+        if not gain > LAST_GAIN:
             break
         if round_ == rounds - 1:
             status = "still rising"

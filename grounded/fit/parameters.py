@@ -28,7 +28,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import FARTHEST_MOVE, level
 from grounded.diagnosis.likelihood.linearise import thresholds
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.likelihood.polish import SAME as STILL
+from grounded.diagnosis.likelihood.polish import EVIDENCE_SETTLED as STILL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated

@@ -16,10 +16,10 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.joint_model import joint_model
 from grounded.diagnosis.hypotheses.search import (
-    LARGE,
     LARGE_GAIN,
     SHORTLIST,
     SPREADS,
+    STATES_LARGE,
     TO_THE_TOP,
     HypothesisSearch,
 )
@@ -45,7 +45,7 @@ from grounded.result import listed
 USUAL_EFFECTS = 3  # most effects searched for at first
 AT_FIRST = 8  # iterations of the first fit of a further effect
 HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-AGAIN = 12  # iterations of fits of the model alone from each other's values
+ALONE_ITERATIONS = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
@@ -141,7 +141,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         more = search.score(whole) - search.score(search.of_size(1)[0])
         if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
-    search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
+    search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= STATES_LARGE else 2])
     sweep(search)
     search.beside_parameters()
     best = search.of_size(1)[0]
@@ -340,13 +340,13 @@ def _neighbours(search: HypothesisSearch) -> None:
     found = max(search.fits.values(), key=search.score)
     if len(found.hypothesis.effects) > 1:
         bare = replace(found.hypothesis, effects=(), values=())
-        search.refined([(bare, found.noise, found.track)], AGAIN)
+        search.refined([(bare, found.noise, found.track)], ALONE_ITERATIONS)
     for _ in range(ROUNDS):
         best = search.best_null()
         h = best.hypothesis
         near = [(replace(h, spread=w), best.noise, best.track) for w in SPREADS if h.spread > 0]
-        search.refined([start for start in near if start[0].spread != h.spread], AGAIN)
-        search.coloured(h, best.noise, best.track, iterations=AGAIN)
+        search.refined([start for start in near if start[0].spread != h.spread], ALONE_ITERATIONS)
+        search.coloured(h, best.noise, best.track, iterations=ALONE_ITERATIONS)
         if search.best_null() is best:
             return
         search.refined([search.best_null()], TO_THE_TOP)

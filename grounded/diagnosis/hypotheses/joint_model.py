@@ -36,8 +36,8 @@ from grounded.effects.joint import added_inertia
 from grounded.frozen import Array
 
 STICKING = (0.03, 0.2)  # initial dry frictions, as fractions of an input's peak
-MANY = 3  # joints, and effects, above which adding one effect at a time may fail
-AGAIN = 8  # iterations after an effect was removed or added
+MANY_JOINTS = 3  # joints, and effects, above which adding one effect at a time may fail
+CHANGED_ITERATIONS = 8  # iterations after an effect was removed or added
 BEYOND = 4  # most effects added to those of the joints
 OWN = 0.3  # initial added inertia, as a fraction of a joint's own
 
@@ -48,11 +48,11 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
     All fits are added to the search.
 
     Returns:
-        The best fit. None if fewer than MANY joints (two of a simulator, which is slow) share an
-        inertia, if a single effect is likelier, or if fewer than MANY effects remain.
+        The best fit. None if fewer than MANY_JOINTS joints (two of a simulator, which is slow)
+        share an inertia, if a single effect is likelier, or if fewer than MANY_JOINTS effects remain.
     """
     joints = _joints(search)
-    if len(joints) < (2 if simulated(search.data.model) else MANY):
+    if len(joints) < (2 if simulated(search.data.model) else MANY_JOINTS):
         return None
     found = search.refined(_starts(search, joints), TO_THE_TOP, rivals=True)
     best = max(found, key=search.score, default=None)
@@ -62,7 +62,7 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
     if any(search.score(best) < search.score(single) for single in search.of_size(1)[:1]):
         return None
     best = _spared(search, best)
-    if len(best.hypothesis.effects) < MANY:
+    if len(best.hypothesis.effects) < MANY_JOINTS:
         return None  # adding one at a time finds them, too
     if not simulated(search.data.model):
         tune(search, [best])
@@ -107,7 +107,7 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
 
 def _coloured(search: HypothesisSearch, fit: Fitted) -> Fitted:
     """Return the likeliest of the fit and the same under noise of other correlation times."""
-    found = search.coloured(fit.hypothesis, fit.noise, fit.track, iterations=AGAIN)
+    found = search.coloured(fit.hypothesis, fit.noise, fit.track, iterations=CHANGED_ITERATIONS)
     return max([fit, *found], key=search.score)
 
 
@@ -136,14 +136,14 @@ def _losses(search: HypothesisSearch, fit: Fitted) -> Array:
 def _less(search: HypothesisSearch, fit: Fitted, index: int) -> Fitted:
     """Refit without one effect; return the fit unchanged if that can't be filtered."""
     start = fit.hypothesis.minus(fit.hypothesis.names[index])
-    found = search.refined([(start, fit.noise, fit.track)], AGAIN)
+    found = search.refined([(start, fit.noise, fit.track)], CHANGED_ITERATIONS)
     return found[0] if found else fit
 
 
 def _completed(search: HypothesisSearch, fit: Fitted, most: int) -> Fitted:
     """Add effects beside those of the joints, such as a lag of all motors, while evidence rises."""
     while len(fit.hypothesis.effects) < most:
-        further = search.extended(fit, iterations=AGAIN, late=False)
+        further = search.extended(fit, iterations=CHANGED_ITERATIONS, late=False)
         best = max(further, key=search.score, default=fit)
         best = max(search.refined([best], TO_THE_TOP), key=search.score, default=best)
         if search.score(best) < search.score(fit) + NATS:

@@ -210,7 +210,7 @@ def whiteness(fit: Fitted, seen: Array) -> Array:
     return np.asarray(chdtrc(lags, q * count * (count + 2)))
 
 
-MOST = 2  # most variables
+MOST_VARIABLES = 2  # most variables
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def correction(ruler: Ruler, fit: Fitted, left: Sequence[Leftover]) -> Correctio
     i = predictor.data.model.state_names.index(left[0].channel)
     chosen, gains = list[_Curve](), filter_of(predictor, fit)
     best, weights = PICKED, np.zeros((0, 0))
-    while len(chosen) < MOST:
+    while len(chosen) < MOST_VARIABLES:
         rivals = [c for c in _curves(predictor, fit) if c.over not in [o.over for o in chosen]]
         tried = [
             (held_out_columns(predictor, fit, gains, _joined([*chosen, c]), i), c) for c in rivals

@@ -50,7 +50,7 @@ from grounded.model import Model
 
 NEARLY = 0.75  # share of an effect's gain from which a look-alike is named
 IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects may differ
-MOST = 3  # most look-alikes named per effect
+MOST_LOOKALIKES = 3  # most look-alikes named per effect
 
 
 def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
@@ -74,7 +74,7 @@ def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
         rest, less = h.minus(effect.name), search.without(best, effect.name)
         whole, *looks = scan_candidates(search.predictor, less, [effect, *own])
         shares = [look.gain / max(whole.gain, NATS) for look in looks]
-        near = sorted(zip(shares, looks, strict=True), key=lambda pair: -pair[0])[:MOST]
+        near = sorted(zip(shares, looks, strict=True), key=lambda pair: -pair[0])[:MOST_LOOKALIKES]
         for share, look in near:
             if not (share > NEARLY and look.values):
                 continue

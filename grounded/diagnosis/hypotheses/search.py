@@ -41,14 +41,16 @@ SPREADS = (0.1, 0.3)  # prior widths of calibrated parameters, as fractions of t
 CRUDE = 1.0  # the same once a parameter has moved beyond: its full prior
 SHORTLIST = 14  # effects of a scan that are refined, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # correlation times of coloured noise [s]
-SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
-BESIDE = 4  # effects that are fitted with the parameters freed
-LOUD = 0.45  # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
+STEPS_TAUS = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
+FREED_BESIDE = 4  # effects that are fitted with the parameters freed
+LATE_NOISE = (
+    0.45  # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
+)
 SOME_DELAYS = 3  # grid values at which the delay of one sensor is tried
 LATE = slice(1, 4, 2)  # grid values from which the common delay of two states starts
 LARGE_GAIN = 50.0  # nats above which a hypothesis is also fitted from a start of its own
 TO_THE_TOP = 25  # most iterations of fits that decide; most converge earlier
-LARGE = 8  # states; above, or for a simulator, one correlation time and half the shortlist
+STATES_LARGE = 8  # states; above, or for a simulator, one correlation time and half the shortlist
 
 
 Start = tuple[Hypothesis, NoiseModel, Array]
@@ -71,12 +73,12 @@ class HypothesisSearch(FittedHypotheses):
         self.joints = {motion_of(effect): effect for effect in joints}
         self.crowd |= dict.fromkeys((effect.name for effect in joints), len(joints))
         self.tick = tick or (lambda what: None)
-        large = data.model.n > LARGE or simulated(data.model)
+        large = data.model.n > STATES_LARGE or simulated(data.model)
         taus = TAUS[1:2] if large else TAUS
         self.taus = [tau for tau in taus if tau > 0.7 * data.dt]
-        self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
+        self.taus = self.taus or [k * data.dt for k in STEPS_TAUS[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
-        self.beside = BESIDE // 2 if large else BESIDE
+        self.beside = FREED_BESIDE // 2 if large else FREED_BESIDE
         # the scan can't find them, since its noise and track belong to a log without delay
         late = [e for e in candidates if isinstance(e.family, SensorDelayFamily)]
         self.together = [e for e in late if len(e.site.targets) > 1]
@@ -136,7 +138,9 @@ class HypothesisSearch(FittedHypotheses):
         noise = noise_guess(residual, data.seen, scale).behind(data.now)
         if late := [data.model.state_names.index(name) for name in delayed(h.effects)]:
             log_r = noise.log_r.copy()  # the delay hides it; a fit decreases it from above
-            log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)
+            log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(
+                LATE_NOISE
+            )
             noise = replace(noise, log_r=log_r)
         return h, noise, track
 

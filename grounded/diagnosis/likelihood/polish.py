@@ -17,9 +17,9 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 
-SHARE = 0.05  # of the thresholds of `refine`
+POLISH_SHARE = 0.05  # of the thresholds of `refine`
 ROUNDS = 2  # most times that the track is moved
-SAME = 0.05  # nats by which the evidence may change in the last of these rounds
+EVIDENCE_SETTLED = 0.05  # nats by which the evidence may change in the last of these rounds
 APART = 2.0  # nats that a point beside the fixed point may be higher; more is a kink of the model
 
 
@@ -43,11 +43,11 @@ def polished(
     for _ in range(ROUNDS):
         left = []
         starts = [(found[i].hypothesis, found[i].noise, found[i].states) for i in open_]
-        again = refine(predictor, starts, iterations=iterations, tick=tick, share=SHARE)
+        again = refine(predictor, starts, iterations=iterations, tick=tick, share=POLISH_SHARE)
         for i, fit in zip(open_, again, strict=True) if len(again) == len(open_) else ():
             rise = fit.evidence - found[i].evidence
             if rise > -APART:
                 found[i] = fit
-                left += [i] * (abs(rise) > SAME)
+                left += [i] * (abs(rise) > EVIDENCE_SETTLED)
         open_ = left
     return [replace(fit, settled=True, fine=True) for fit in found]

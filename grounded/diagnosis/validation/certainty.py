@@ -61,7 +61,9 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 ALONE = 5.0  # times as wide without the priors: as many standard deviations may one be wrong
-PART = 0.2  # part of the variance of a value that a prior has at least if the value rests on it
+PRIOR_SHARE = (
+    0.2  # part of the variance of a value that a prior has at least if the value rests on it
+)
 
 Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
 
@@ -105,7 +107,7 @@ def by_priors(predictor: Predictor, fit: Fitted, worth: float = 1.0) -> ByPriors
     std = np.sqrt(np.diag(C))
     lone = (fisher(G) > ALONE * std) & (std > WELL * np.abs(value))
     parts = C[:, k:] ** 2 / np.maximum(np.diag(C), 1e-300)[:, None]
-    parts[parts < PART] = 0.0
+    parts[parts < PRIOR_SHARE] = 0.0
     rest = {  # of each such value, the parameters that it rests on
         i: {k + j for j in np.flatnonzero(parts[i]).tolist()}
         for i in np.flatnonzero(lone & (parts.sum(axis=1) > HALF)).tolist()
@@ -155,7 +157,7 @@ def _joined(rest: Mapping[int, set[int]]) -> Sequence[list[int]]:
     return [sorted(members) for members, _ in groups]
 
 
-MOST = 50.0  # most nats by which another fit counts as likelier
+LIKELIER_AT_MOST = 50.0  # most nats by which another fit counts as likelier
 
 
 def averaged(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> tuple[Array, Array]:
@@ -189,7 +191,7 @@ def _rivals(search: FittedHypotheses, fit: Fitted, ruler: Ruler) -> list[tuple[F
         likely = other is not fit and list(some) == names and nats > -PICKED
         if likely and set(_values(other.hypothesis)) == set(own):
             worse = ruler.held_out and ruler.gain(other, fit).clear
-            found += [] if worse else [(other, math.exp(min(nats, MOST)))]
+            found += [] if worse else [(other, math.exp(min(nats, LIKELIER_AT_MOST)))]
     return found
 
 

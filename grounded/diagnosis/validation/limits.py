@@ -23,7 +23,7 @@ from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data, pre
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.certainty import PART, information
+from grounded.diagnosis.validation.certainty import PRIOR_SHARE, information
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -388,7 +388,7 @@ def identifiable(
         if name in known and known[name].value and share > DEPENDS * std / priors[i]:
             per = cov[i, held_] @ np.linalg.pinv(cov[np.ix_(held_, held_)], hermitian=True)
             for slope, j in zip(per, held_, strict=True):
-                if slope**2 * cov[j, j] > PART * cov[i, i]:
+                if slope**2 * cov[j, j] > PRIOR_SHARE * cov[i, i]:
                     size = model.params[names[j]].value / known[name].value
                     given[names[j]] = float(slope * priors[i] / priors[j] * size)
         alone = _verdict(share)

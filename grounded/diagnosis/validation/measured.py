@@ -44,7 +44,9 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-FEW = 0.2  # of all errors: at most this share is in a part that holds most of those above the noise
+SMALL_PART = (
+    0.2  # of all errors: at most this share is in a part that holds most of those above the noise
+)
 MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
 
 
@@ -282,7 +284,7 @@ class Measured:
         above = np.maximum(total - count * floor**2, 0.0)
         most = int(np.argmax(above))
         share = above[most] / max(float(above.sum()), 1e-300)
-        if share < HALF or count[most] > FEW * count.sum():
+        if share < HALF or count[most] > SMALL_PART * count.sum():
             return None
         run = int(ruler.run_of[most])
         trial = int(data.trial_of[run])

@@ -373,7 +373,7 @@ def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]
 
 
 LED = 400  # steps of predictions from which how inputs change within a step is left out
-FAR = 1e6  # size of a state above which it has diverged
+DIVERGED = 1e6  # size of a state above which it has diverged
 
 
 def by_fold(data: Data, fit: Fitted) -> tuple[list[Hypothesis], Any]:
@@ -443,7 +443,7 @@ def missed(
         if added is not None:
             inside = (at + j < len(added))[:, None]
             x[:, :n] += np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
-        x = np.fmax(np.fmin(x, FAR), -FAR)  # NaN becomes FAR, too
+        x = np.fmax(np.fmin(x, DIVERGED), -DIVERGED)  # NaN becomes DIVERGED, too
         path.append(x[:, :n])
     states = np.stack(path)
     logged = np.empty_like(states[oldest:])
@@ -498,11 +498,11 @@ def _marched(
     found = np.empty((len(sent) + 1, *x.shape))
     for h, own in each:
         z = predictor.marched(h, x[own], sent[:, own])
-        if z is not None and not (np.abs(z) < FAR).all():
+        if z is not None and not (np.abs(z) < DIVERGED).all():
             return None
         if z is None:
             z = marched(predictor, h, x[own], sent[:, own], t[own])
         if z is None:
             return None
-        found[:, own] = np.fmax(np.fmin(z, FAR), -FAR)
+        found[:, own] = np.fmax(np.fmin(z, DIVERGED), -DIVERGED)
     return found

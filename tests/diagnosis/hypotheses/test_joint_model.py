@@ -15,7 +15,7 @@ from tests.effects.test_effects_joint import PAIRS, arm, real_trials
 
 @pytest.fixture(autouse=True)
 def two_are_many(monkeypatch):
-    monkeypatch.setattr("grounded.diagnosis.hypotheses.joint_model.MANY", 2)
+    monkeypatch.setattr("grounded.diagnosis.hypotheses.joint_model.MANY_JOINTS", 2)
 
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from grounded.accounts.kinematics import unheld
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import gain
-from grounded.diagnosis.excitation import NOTHING, probe
+from grounded.diagnosis.excitation import SEPARABLE_NATS, probe
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
@@ -295,7 +295,7 @@ def _probe(
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
-        worth = not made.little or (write and (not ties or made.expected >= NOTHING))
+        worth = not made.little or (write and (not ties or made.expected >= SEPARABLE_NATS))
         asks = offer and not found.contested  # it is the trial that is asked for, if one
         if not (worth and offer):
             return "", made.step if asks else None
