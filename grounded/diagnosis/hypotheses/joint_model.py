@@ -49,7 +49,7 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
 
     Returns:
         The best fit. None if fewer than MANY_JOINTS joints (two of a simulator, which is slow)
-        share an inertia, if a single effect is likelier, or if fewer than MANY_JOINTS effects remain.
+        share an inertia, if a single effect is likelier, or if fewer effects remain.
     """
     joints = _joints(search)
     if len(joints) < (2 if simulated(search.data.model) else MANY_JOINTS):
