@@ -230,8 +230,7 @@ def delayed(findings):
     return {f.signal: f.delay_s for f in findings if f.kind == "delay" and f.corrected}
 
 
-@pytest.mark.parametrize("by", [0.15])
-def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
+def test_positions_that_are_late_are_told_by_velocities_and_heading(by=0.15):
     found = preflight(BOAT, logged(BOAT, positions_late(by)))
     assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
     assert not delayed(preflight(BOAT, found.trials).findings)

@@ -55,8 +55,7 @@ def test_a_state_that_the_commands_alone_determine_is_an_exact_memory(step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("play", [0.021])
-def test_a_play_before_a_models_own_memory_is_found(play):
+def test_a_play_before_a_models_own_memory_is_found(play=0.021):
     model, trials = dragged(slide, play)
     found = diagnose(model, trials, only("backlash", "dead_zone", "input_gain", "parameter"))
     claimed = [row for row in found.ranking if row.claimed]

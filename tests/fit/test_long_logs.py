@@ -65,8 +65,7 @@ def test_each_stage_is_told_with_the_time_taken(monkeypatch):
     assert told == ["scan, 2 s so far", "refine, 2.5 min so far"]
 
 
-@pytest.mark.parametrize("after", [25])
-def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
+def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after=25):
     count = 0
 
     def stop(stage):

@@ -31,8 +31,9 @@ from ros_bags import (
 from shared_data import data
 
 
-@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3])
-def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
+def test_from_a_bag_to_the_first_candidate_in_four_commands(
+    tmp_path, storage=StoragePlugin.SQLITE3
+):
     log, w = car_bag(tmp_path / "bag", storage), tmp_path / "car"
     made = grounded("init", w, "--from", log, "--json").json
     assert made["kind"] == "car" and made["dt"] == 0.05
@@ -62,8 +63,9 @@ def test_the_joints_of_an_arm_by_name(tmp_path):
     assert any(r.code == "start.follows" for g in found.states for r in g.reasons)
 
 
-@pytest.mark.parametrize("order", [("elbow", "shoulder")])
-def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(tmp_path, order):
+def test_torques_in_an_array_without_names_are_told_by_the_motion_of_each_joint(
+    tmp_path, order=("elbow", "shoulder")
+):
     """A skeleton without gravity fits the smaller torque best, whichever joint it is given to."""
     found = begin(tmp_path / "arm", commanded_arm_bag(tmp_path / "bag", order))
     paths = {guess.name: guess.path for guess in found.inputs}
@@ -115,8 +117,7 @@ def test_joints_that_a_model_does_not_name_are_taken_in_order_and_unsure(tmp_pat
     assert (tmp_path / "arm" / "model.py").read_text() == MODEL
 
 
-@pytest.mark.parametrize(("scale", "expected"), [(180 / np.pi, np.pi / 180)])
-def test_degrees_and_signs_are_noticed(tmp_path, mine, scale, expected):
+def test_degrees_and_signs_are_noticed(tmp_path, mine, scale=180 / np.pi, expected=np.pi / 180):
     found = begin(tmp_path / "arm", arm_bag(tmp_path / "bag", scale), model=mine)
     by = {g.name: g for g in found.states}
     scales = [by["q1"].scale, by["w1"].scale]
@@ -202,8 +203,7 @@ model = Model(
 """
 
 
-@pytest.mark.parametrize("turn", [180 / np.pi])
-def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn):
+def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn=180 / np.pi):
     (tmp_path / "model.py").write_text(TWO_WHEELS)
     log = wheels()
     rows = np.loadtxt(log, delimiter=",", skiprows=1)
@@ -216,8 +216,9 @@ def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn):
     assert "your model" in (tmp_path / "w/grounded.toml").read_text().splitlines()[0]
 
 
-@pytest.mark.parametrize(("left", "right"), [("/thruster_left", "/thruster_right")])
-def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
+def test_a_boat_with_two_thrusters_is_no_drone(
+    tmp_path, left="/thruster_left", right="/thruster_right"
+):
     """The word thrust in a topic's name made it a drone, with z, roll and pitch."""
     found = begin(tmp_path / "w", boat_bag(tmp_path / "bag", left, right))
     assert found.kind == "boat" and not found.unsure
@@ -230,8 +231,7 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path, left, right):
     assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
 
 
-@pytest.mark.parametrize("swapped", [True])
-def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_path, swapped):
+def test_two_thrusters_in_an_unnamed_array_are_told_by_which_way_they_turn(tmp_path, swapped=True):
     found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag", swapped))
     assert found.kind == "boat" and not found.unsure
     order = [f"/thrusters/cmd.data[{k}]" for k in ((1, 0) if swapped else (0, 1))]
@@ -347,8 +347,7 @@ def test_numbers_without_a_fitting_name_are_found_by_their_unit_or_listed(swung,
 # targets
 
 
-@pytest.mark.parametrize("more", [()])
-def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more):
+def test_a_velocity_asked_to_end_at_rest_follows_a_line(tmp_path, more=()):
     w = tmp_path / "w"
     grounded("init", w, "--example", "car-circle")
     done = grounded("-C", w, "target", "line", "--to", "x=2", "--to", "v=0", *more, "--json")

@@ -1,7 +1,6 @@
 """With a delayed speed sensor, the robot is at rest at the end of a plan, not just its log."""
 
 import numpy as np
-import pytest
 
 from grounded.model import Model
 from grounded.search.planner import Planner, planner_with, predicted
@@ -25,8 +24,7 @@ def cart(terminal: float, lag: float = 0.04, change: float = 1e-4, rests: int = 
     return planner_with(task, [("sensor_lag:v", {"tau": lag})] if lag else [])
 
 
-@pytest.mark.parametrize("terminal", [1.0])
-def test_the_end_is_asked_of_the_true_speed(terminal):
+def test_the_end_is_asked_of_the_true_speed(terminal=1.0):
     planner = cart(terminal)
     policy, _ = planner.first_policy()
     run = predicted(planner.plan.problem(exact=True), policy)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from grounded.plant import Noise, Plant
 from grounded.search import original
@@ -14,8 +13,7 @@ from grounded.utility import Reward
 from small_tasks import cart_task, drive
 
 
-@pytest.mark.parametrize("delay, noise", [(0.1, 0.02)])
-def test_a_step_without_the_adopted_delay_is_not_run(delay, noise, monkeypatch):
+def test_a_step_without_the_adopted_delay_is_not_run(monkeypatch, delay=0.1, noise=0.02):
     broken = original.Promises(1e3, -1e3), original.Promises()
     monkeypatch.setattr(original, "promises", lambda *_: broken)
     reward = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([1e-4]), np.array([1e-4]))

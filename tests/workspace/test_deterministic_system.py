@@ -42,8 +42,7 @@ def workspace(tmp_path):
     return Workspace(folder)
 
 
-@pytest.mark.parametrize("repeats", [2])
-def test_learn_ends(workspace, repeats):
+def test_learn_ends(workspace, repeats=2):
     config = workspace.folder / "grounded.toml"
     more = f"max_trials = 12\nrepeats = {repeats}\n{EARLY}"
     config.write_text(config.read_text().replace("max_trials = 12", more))

@@ -81,8 +81,7 @@ def test_a_flipped_optimum_and_a_flipped_result_of_a_study_are_not_read(w, tmp_p
     assert "seed 1" not in store and len(store) == 0
 
 
-@pytest.mark.parametrize("which", [-1])
-def test_a_deleted_trial_is_found_the_last_one_too(w, which):
+def test_a_deleted_trial_is_found_the_last_one_too(w, which=-1):
     w.propose()  # this hand-out has seen the last trial
     trials = sorted(w.store.folder.glob("t*.mcap"))
     assert w.verify().damaged == ()

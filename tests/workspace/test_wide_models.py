@@ -80,8 +80,7 @@ def test_a_diagnosis_says_how_many_names_it_takes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n, m, how", [(10, 60, "step=step")])
-def test_a_wide_model_gets_a_candidate(n, m, how, tmp_path):
+def test_a_wide_model_gets_a_candidate(tmp_path, n=10, m=60, how="step=step"):
     (tmp_path / "ring.py").write_text(RING.format(n=n, m=m, how=how))
     workspace = Workspace.create(tmp_path / "w", model=tmp_path / "ring.py")
     candidate = workspace.propose().candidate

@@ -128,8 +128,7 @@ def late(trials, steps=400, delay=1.5 * DT):
     return model, better, found
 
 
-@pytest.mark.parametrize("trials", [2])
-def test_true_values_behind_a_late_log_begin_where_the_log_is(trials):
+def test_true_values_behind_a_late_log_begin_where_the_log_is(trials=2):
     model, better, found = late(trials)
     memory = better.state_names[model.n :]
     lifted = [

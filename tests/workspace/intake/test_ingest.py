@@ -91,8 +91,7 @@ def test_a_start_is_no_warning_where_earlier_ones_scatter_as_far(w, tmp_path):
     assert not any("run.start_spoils" in some for some in codes[:-1])
 
 
-@pytest.mark.parametrize("data", [True])
-def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
+def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data=True):
     write_trial(tmp_path / "t.mcap", plain(), {}, state_units={"x": "cm", "v": "m / s"})
     with pytest.raises(GroundedError, match=holding("x", "cm", "m")) as refused:
         ingest_log(w, tmp_path / "t.mcap", data=data)
@@ -101,8 +100,7 @@ def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     assert ingest_log(w, tmp_path / "u.mcap", data=True).trial
 
 
-@pytest.mark.parametrize("factor", [1e3])
-def test_stamps_in_another_unit_are_told_from_lost_samples(w, tmp_path, factor):
+def test_stamps_in_another_unit_are_told_from_lost_samples(w, tmp_path, factor=1e3):
     with TrialWriter(tmp_path / "t.mcap", 0.05, {"x": "m", "v": "m/s"}, {"force": "N"}, {}) as log:
         for k in range(11):
             log.append(0.05 * k * factor, np.zeros(2), np.zeros(1) if k < 10 else None)
@@ -214,8 +212,7 @@ def table_in(w, tmp_path, length=4.0):
     return tmp_path / "log.csv", file
 
 
-@pytest.mark.parametrize("mended", ["scale = 0.001"])
-def test_a_log_is_not_stored_again_through_another_table(w, tmp_path, mended):
+def test_a_log_is_not_stored_again_through_another_table(w, tmp_path, mended="scale = 0.001"):
     """Two readings of one run passed for repeats, and their difference for a cause."""
     log, file = table_in(w, tmp_path)
     first = ingest_log(w, log, data=True).trial
@@ -270,8 +267,7 @@ def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
     assert "[estimate]" not in str(refused.value)
 
 
-@pytest.mark.parametrize("judge", ["standing_in"])
-def test_what_can_t_be_judged_is_not_stored(w, tmp_path, monkeypatch, judge):
+def test_what_can_t_be_judged_is_not_stored(w, tmp_path, monkeypatch, judge="standing_in"):
     """A model that failed on a log left it stored, and every later command failed with it."""
     first, second = run(w), tmp_path / "second.mcap"
     trial = read_trial(first)[0]

@@ -23,8 +23,7 @@ def blind(tmp_path):
     return waiting(tmp_path, ONLY_POSITIONS)
 
 
-@pytest.mark.parametrize("before", [0.8])
-def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
+def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before=0.8):
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, before)
     found = blind.ingest(path)
@@ -49,8 +48,7 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
     assert np.sqrt(np.mean(np.square(off))) < 0.03
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed):
+def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed=0):
     policy = blind.candidate("c0002")[0].policy
     path = record(blind, tmp_path / "a.csv", policy, 0.8, seed=seed, differs=16)
     found = blind.ingest(path)
@@ -64,8 +62,7 @@ ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
 ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
 
 
-@pytest.mark.parametrize("before", [0.8])
-def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before):
+def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before=0.8):
     w = waiting(tmp_path, ITS_OWN)
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, before, noise=ROUGH)
@@ -79,8 +76,7 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
     assert not told  # with the log before, see test_estimating.py
 
 
-@pytest.mark.parametrize("after", [1.0])
-def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after):
+def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after=1.0):
     policy = blind.candidate("c0002")[0].policy
     wild = replace(policy, gain=40 * policy.gain)  # the commands don't tell where the run begins
     path = record(blind, tmp_path / "a.csv", wild, 0.5, turned=True, after=after)

@@ -65,8 +65,7 @@ def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discard
     assert found.candidate == "c0002" and found.trial != late.trial and not found.known
 
 
-@pytest.mark.parametrize("said", [True])
-def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path, said):
+def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path, said=True):
     log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, (-5.0, -4.9))
     if said:
         toml = w.folder / "grounded.toml"

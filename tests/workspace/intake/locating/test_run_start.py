@@ -44,8 +44,7 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
 
 
-@pytest.mark.parametrize("before", [1.0])
-def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before):
+def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before=1.0):
     late = LOGGED.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = 0.12\n')
     w = Workspace(make(tmp_path / "w", config=late).folder)
     w.propose()
@@ -135,8 +134,7 @@ def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late)
     assert all(one.code == "log.late" for one in told)
 
 
-@pytest.mark.parametrize(("before", "stale"), [(0.93, 1)])
-def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, before, stale):
+def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, before=0.93, stale=1):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, before, stale=stale))
     told = of_code(found, "log.late", "run.late")
@@ -147,8 +145,9 @@ def test_a_run_on_samples_of_a_step_before_begins_where_it_did(w, tmp_path, befo
     assert found.candidate == "c0002" and begun == pytest.approx(before, abs=0.2 / RATE)
 
 
-@pytest.mark.parametrize("before", [0.5])
-def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w, tmp_path, before):
+def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(
+    w, tmp_path, before=0.5
+):
     policy = w.candidate("c0002")[0].policy
     log = record(w, tmp_path / "a.csv", policy, before, ahead=10)
     with pytest.raises(GroundedError) as refused:
@@ -160,8 +159,7 @@ def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(w
     assert named.then.verb == "discard" and named.findings[0].code == told.code
 
 
-@pytest.mark.parametrize(("before", "part"), [(1.0, 0.6)])
-def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before, part):
+def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before=1.0, part=0.6):
     policy = w.candidate("c0002")[0].policy
     most = part * float(np.abs(policy.feedforward).max())
     log = record(w, tmp_path / "a.csv", policy, before, most=most)
@@ -193,9 +191,8 @@ def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_
     assert w.ingest(path, candidate="c0001").candidate == "c0001"
 
 
-@pytest.mark.parametrize("before", [1.0])
 def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
-    w, tmp_path, before, monkeypatch
+    w, tmp_path, monkeypatch, before=1.0
 ):
     path = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, before)
     first, waiting = w.ingest(path), w.propose().candidate.id

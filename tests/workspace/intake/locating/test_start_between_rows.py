@@ -12,8 +12,7 @@ def w(tmp_path):
     return waiting(tmp_path)
 
 
-@pytest.mark.parametrize("row", [0.011])
-def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
+def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row=0.011):
     policy = w.candidate("c0002")[0].policy
     path = record(w, tmp_path / "a.csv", policy, 0.8)
     table = np.loadtxt(path, delimiter=",", skiprows=1)

@@ -44,8 +44,7 @@ def mapped(w, text=TABLE):
     return w
 
 
-@pytest.mark.parametrize("start", [STAMP])
-def test_what_is_left_of_a_stored_log_is_that_trial(w, tmp_path, start):
+def test_what_is_left_of_a_stored_log_is_that_trial(w, tmp_path, start=STAMP):
     mapped(w)
     first = ingest_log(w, log(tmp_path / "a.csv", start=start), data=True)
     for rows in (slice(0, 120), slice(0, 60)):

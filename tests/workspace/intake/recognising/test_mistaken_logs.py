@@ -103,9 +103,8 @@ def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
     assert w.discard("t0002").then.verb != "ingest"
 
 
-@pytest.mark.parametrize("before", [True])
 def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(
-    w, tmp_path, before
+    w, tmp_path, before=True
 ):
     toml = w.folder / "grounded.toml"
     text = toml.read_text().replace("/csv.port", "/csv.m1").replace("/csv.starboard", "/csv.m2")
@@ -144,9 +143,8 @@ def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path
     assert told.facts["limits"] == (right if wrong else ())
 
 
-@pytest.mark.parametrize("here", [True])
 def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
-    w, tmp_path, monkeypatch, here
+    w, tmp_path, monkeypatch, here=True
 ):
     path = log(w, tmp_path / "a.csv", scale=100.0)
     w.ingest(path, data=True)
@@ -208,8 +206,7 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     assert Workspace(w.folder).ingest(path).candidate == plan.id
 
 
-@pytest.mark.parametrize("before", [True])
-def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before):
+def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before=True):
     if before:
         w.ingest(log(w, tmp_path / "a.csv"), data=True)
     plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"

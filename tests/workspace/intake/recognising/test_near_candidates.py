@@ -85,9 +85,10 @@ def test_no_honest_run_of_nearly_equal_candidates_is_refused(ladder, share, othe
         assert refused(w, noisy(made, share, seed, other=other), made, by_alpha) is None, seed
 
 
-@pytest.mark.parametrize("share, other", [(0.003, True)])
 @pytest.mark.parametrize("ran, said", [(1, 1 / 4)])
-def test_a_run_of_another_candidate_is_refused_and_named(ladder, ran, said, share, other):
+def test_a_run_of_another_candidate_is_refused_and_named(
+    ladder, ran, said, share=0.003, other=True
+):
     w, by_alpha = ladder
     for seed in SEEDS:
         why = refused(w, noisy(by_alpha[ran], share, seed, other=other), by_alpha[said], by_alpha)
@@ -95,8 +96,7 @@ def test_a_run_of_another_candidate_is_refused_and_named(ladder, ran, said, shar
         assert why.facts["other"] != by_alpha[said].id, seed
 
 
-@pytest.mark.parametrize("share", [0.01])
-def test_manual_driving_is_refused(ladder, share):
+def test_manual_driving_is_refused(ladder, share=0.01):
     """A person swings the cart, other than the manoeuvre does; its states follow."""
     w, by_alpha = ladder
     model, made, dt = w.task.model, by_alpha[1 / 8], w.config.task.dt

@@ -89,8 +89,7 @@ def test_the_columns_and_their_factor_are_named(driven, tmp_path, names, factor)
     assert of_code(named, told.code)
 
 
-@pytest.mark.parametrize("before", [0.7])
-def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_path, before):
+def test_a_rate_that_is_logged_in_radians_for_a_model_in_degrees_is_told(tmp_path, before=0.7):
     model = MODEL.replace('"force": "N"', '"force": "deg/s"')
     w = Workspace(make(tmp_path / "w", config=LOGGED, model=model).folder)
     log = record(w, tmp_path / "a.csv", w.propose().candidate.policy, before)

@@ -32,8 +32,7 @@ def refused(w, log):
     return error.value
 
 
-@pytest.mark.parametrize(("before", "by"), [(1.0, -0.4)])
-def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, by, before):
+def test_a_state_from_another_zero_is_named_with_the_offset(w, tmp_path, before=1.0, by=-0.4):
     def moved(table):
         table[:, 1] += by
 
@@ -94,8 +93,7 @@ def test_a_speed_that_stays_at_zero_is_the_reason_that_is_given(w, tmp_path):
     assert (one.code, one.about) == ("log.dead", ("v",))
 
 
-@pytest.mark.parametrize(("waits", "weight"), [(True, 0.5)])
-def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
+def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits=True, weight=0.5):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     toml = w.folder / "grounded.toml"
     written = toml.read_text()
@@ -115,8 +113,7 @@ def test_a_candidate_of_an_earlier_task_is_found(w, tmp_path, waits, weight):
     assert w.ingest(fresh, candidate=own.id).candidate == own.id
 
 
-@pytest.mark.parametrize("waits", [False])
-def test_limits_that_were_changed_since_the_export_are_named(w, tmp_path, waits):
+def test_limits_that_were_changed_since_the_export_are_named(w, tmp_path, waits=False):
     run = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.5)
     low, high = w.task.low[0], w.task.high[0]
     toml = w.folder / "grounded.toml"

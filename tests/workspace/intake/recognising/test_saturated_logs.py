@@ -97,8 +97,7 @@ def log_of(rows):
     return task, recording(series, task, series)
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed):
+def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed=1):
     ran = candidate(30 * HAND)
     rows = balanced(ran, seed)
     assert np.mean(np.abs(rows[WAITS : WAITS + STEPS, 3]) < LIMIT) < 0.05

@@ -263,8 +263,7 @@ def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
     assert not there.ingest(log.trial_file, data=True).notes
 
 
-@pytest.mark.parametrize("before", [0.7])
-def test_a_run_without_its_feedback_is_named(tmp_path, before):
+def test_a_run_without_its_feedback_is_named(tmp_path, before=0.7):
     w = Workspace(make(tmp_path / "w", config=AS_TABLE).folder)
     alone = replace(w.propose().candidate.policy, gain=None, reference=None)
     with pytest.raises(GroundedError) as refused:

@@ -1,7 +1,5 @@
 """A log that ends before the run does: cut off by the recorder, or by a crash."""
 
-import pytest
-
 from cli import grounded
 from facts import holds, of_code
 from grounded_trials import Workspace
@@ -14,8 +12,7 @@ def waiting(folder):
     return w, w.propose().candidate.policy
 
 
-@pytest.mark.parametrize("until", [1.3])
-def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until):
+def test_a_log_that_is_cut_off_is_told_from_a_crash(tmp_path, until=1.3):
     w, policy = waiting(tmp_path)
     log = record(w, tmp_path / "a.csv", policy, 0.7, until=until)
     out = grounded("-C", w.folder, "ingest", log)

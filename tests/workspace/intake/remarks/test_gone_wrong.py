@@ -47,8 +47,7 @@ def run(w, force):
     return w.run("c0002").trial_file
 
 
-@pytest.mark.parametrize("steps", [25])
-def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps):
+def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps=25):
     trial, *_ = read_trial(run(w, "-a.force"))
     assert w.task.utility(trial) < -100
     write_trial(tmp_path / "t.mcap", trial.until(steps), {"kind": "trial", "task": w.task.hash})

@@ -33,8 +33,7 @@ def two_tables(w, path, policy, apart):
     return path
 
 
-@pytest.mark.parametrize("apart", [-APART])
-def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart):
+def test_two_clocks_are_told_with_the_lines_that_bridge_them(tmp_path, apart=-APART):
     config = SPLIT
     w = Workspace(make(tmp_path / "w", config=config).folder)
     ran = w.propose().candidate
