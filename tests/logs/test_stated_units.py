@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import holds, of_code
 from grounded.units import factor_between
+from grounded_trials import Workspace
 from grounded_trials.logs.stated_units import (
     unit_in_name,
     without_unit,
@@ -177,3 +178,37 @@ def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
     signals = {**log["state"], **log["input"]}
     assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
     assert [one["scale"] for one in log["state"].values()] == [pytest.approx(np.pi / 180)] * 4
+
+
+TURNED = """import numpy as np
+
+from grounded import Model, Param
+
+model = Model(
+    states={"yaw": "rad", "v": "m/s"},
+    inputs={"speed": "m/s", "steering": "rad"},
+    params={"L": Param(0.35, "m", 0.1, 1.0), "tau": Param(0.3, "s", 0.05, 1.0)},
+    derivative=lambda s, a, p: {
+        "yaw": s.v * np.tan(a.steering) / p.L,
+        "v": (a.speed - s.v) / p.tau,
+    },
+    angles=("yaw",),
+)
+"""
+
+
+def test_a_heading_in_wrapped_degrees_is_told_when_it_comes_in(tmp_path):
+    rng, dt, t = np.random.default_rng(0), 0.05, 0.05 * np.arange(600)
+    speed = 0.5 + 0.5 * np.repeat(rng.uniform(0, 1, 30), 20)
+    steering, rows, yaw, v = 0.3 * np.sin(0.4 * t) + 0.24, [], 0.0, 0.0
+    for k in range(600):
+        wrapped = (np.degrees(yaw) + rng.normal(0, 0.6) + 180) % 360 - 180
+        rows.append([t[k], wrapped, v + rng.normal(0, 0.01), speed[k], steering[k]])
+        yaw += dt * v * np.tan(steering[k]) / 0.3
+        v += dt * (speed[k] - v) / 0.25
+    head = "t,yaw,v,speed_cmd,steering_cmd"
+    np.savetxt(tmp_path / "run.csv", rows, "%.6g", ",", header=head, comments="")
+    (tmp_path / "m.py").write_text(TURNED)
+    w = Workspace.create(tmp_path / "w", log=tmp_path / "run.csv", model=tmp_path / "m.py")
+    (told,) = of_code(w.ingest(tmp_path / "run.csv", data=True), "log.unit")
+    assert told.about == ("yaw",)
