@@ -52,6 +52,8 @@ class Lag:
         coherence: share of both signals that agrees, 0 to 1.
         scale_std: standard deviation of the scale.
         mean: b is the mean of a over this time [s], centred `delay` ago; 0 if not significant.
+        slow: the scale of slow motion, from the widest window with enough samples.
+        steady: the scale of the means, if a is mostly constant; NaN otherwise.
     """
 
     delay: float
@@ -63,6 +65,8 @@ class Lag:
     coherence: float
     scale_std: float = np.inf
     mean: float = 0.0
+    slow: float = np.nan
+    steady: float = np.nan
 
     @property
     def scale(self) -> float:
@@ -70,8 +74,16 @@ class Lag:
         return float(np.sqrt(self.low * self.high))
 
     def off(self, by: float) -> bool:
-        """Check whether the scale is off by more than `by`."""
-        return self.low > 1 + by or self.high < 1 - by
+        """Check whether the scale is off by more than `by`, for slow motion as well.
+
+        With only a few samples per period, averaging over a step reduces a signal: that is not a
+        scale error. Nor is it if a motion that is mostly constant has the right size and only what
+        little changes has not: in a half circle, noise made 95 % of it.
+        """
+        slow = self.slow if np.isfinite(self.slow) else self.scale
+        steady = self.steady if np.isfinite(self.steady) else slow
+        low, high = min(self.low, slow, steady), max(self.high, slow, steady)
+        return low > 1 + by or high < 1 - by
 
     @property
     def one_size(self) -> bool:
@@ -101,8 +113,16 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
     told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter too much
     sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
+    slow = told[-1].scale if told else np.nan
     std = float(np.hypot(best.std, apart))
-    return replace(best, std=std, mean=best.mean * sure)
+    return replace(best, std=std, mean=best.mean * sure, slow=slow, steady=_steady(pairs))
+
+
+def _steady(pairs: Pairs) -> float:
+    """Return the scale of the means of b and a if a changes by less than its mean; else NaN."""
+    a, b = (np.concatenate(signals) for signals in zip(*pairs, strict=True))
+    mean = float(a.mean())
+    return abs(float(b.mean()) / mean) if abs(mean) > a.std() else np.nan
 
 
 def _reach_of(steps: int, dt: float) -> int:
