@@ -39,7 +39,6 @@ def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
             raise IsADirectoryError(21, "Is a directory", str(path))
         if not stat.S_ISREG(mode):
             what = "pipe" if stat.S_ISFIFO(mode) else "device"
-            what = "pipe" if stat.S_ISFIFO(mode) else "device"
             raise unreadable(path, what)
         return os.fdopen(descriptor, "rb")
     except BaseException:
