@@ -441,6 +441,20 @@ def test_protobuf_from_an_older_or_other_writer() -> None:
                 continue
 
 
+def test_a_protobuf_map_is_a_list_of_entries() -> None:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.struct_pb2 import DESCRIPTOR, Struct
+
+    files = FileDescriptorSet()
+    DESCRIPTOR.CopyToProto(files.file.add())
+    type = parse_protobuf(files.SerializeToString(), "google.protobuf.Struct")
+    message = Struct()
+    message.update({"speed": 1.5})
+    root = lambda b, s, e: protobuf_messages(b, type, s, e)  # noqa: E731
+    path = '/t.fields[:]{key=="speed"}.value.number_value'
+    assert found([message.SerializeToString(), b""], type, root, path) == [[1.5], []]
+
+
 def test_protobuf_definitions_that_are_none() -> None:
     from google.protobuf import descriptor_pb2
 

@@ -30,6 +30,18 @@ from grounded_trials.formats.messages import (
 FIXED64, BYTES = 1, 2
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """A key of a map, and its value."""
+
+    key: Any
+    value: Any
+
+    def HasField(self, name: str) -> bool:
+        """Return that both are there."""
+        return True
+
+
 @dataclass(frozen=True, eq=False)
 class _ProtobufNode(Node):
     """Row i is the value objects[i]; an absent field has its default, an absent message no row."""
@@ -41,7 +53,10 @@ class _ProtobufNode(Node):
         kind, node = self.type.by_name[name].type, self
         if isinstance(kind, Struct):
             node = self.keep(np.array([o.HasField(name) for o in self.objects], dtype=np.bool_))
-        return replace(node, type=kind, objects=as_array([getattr(o, name) for o in node.objects]))
+        inner = [getattr(o, name) for o in node.objects]
+        if isinstance(kind, Array) and isinstance(kind.item, Struct):  # a map is a list of entries
+            inner = [[*map(_Entry, o, o.values())] if hasattr(o, "values") else o for o in inner]
+        return replace(node, type=kind, objects=as_array(inner))
 
     def items(self, start: int, stop: int) -> _ProtobufNode:
         assert isinstance(self.type, Array)
