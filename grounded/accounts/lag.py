@@ -53,7 +53,6 @@ class Lag:
         scale_std: standard deviation of the scale.
         mean: b is the mean of a over this time [s], centred `delay` ago; 0 if not significant.
         slow: the scale of slow motion, from the widest window with enough samples.
-        steady: the scale of the means, if a is mostly constant; NaN otherwise.
     """
 
     delay: float
@@ -66,7 +65,6 @@ class Lag:
     scale_std: float = np.inf
     mean: float = 0.0
     slow: float = np.nan
-    steady: float = np.nan
 
     @property
     def scale(self) -> float:
@@ -77,13 +75,10 @@ class Lag:
         """Check whether the scale is off by more than `by`, for slow motion as well.
 
         With only a few samples per period, averaging over a step reduces a signal: that is not a
-        scale error. Nor is it if a motion that is mostly constant has the right size and only what
-        little changes has not: in a half circle, noise made 95 % of it.
+        scale error.
         """
         slow = self.slow if np.isfinite(self.slow) else self.scale
-        steady = self.steady if np.isfinite(self.steady) else slow
-        low, high = min(self.low, slow, steady), max(self.high, slow, steady)
-        return low > 1 + by or high < 1 - by
+        return min(self.low, slow) > 1 + by or max(self.high, slow) < 1 - by
 
     @property
     def one_size(self) -> bool:
@@ -115,14 +110,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
     slow = told[-1].scale if told else np.nan
     std = float(np.hypot(best.std, apart))
-    return replace(best, std=std, mean=best.mean * sure, slow=slow, steady=_steady(pairs))
-
-
-def _steady(pairs: Pairs) -> float:
-    """Return the scale of the means of b and a if a changes by less than its mean; else NaN."""
-    a, b = (np.concatenate(signals) for signals in zip(*pairs, strict=True))
-    mean = float(a.mean())
-    return abs(float(b.mean()) / mean) if abs(mean) > a.std() else np.nan
+    return replace(best, std=std, mean=best.mean * sure, slow=slow)
 
 
 def _reach_of(steps: int, dt: float) -> int:
