@@ -1,7 +1,6 @@
 """Tell the user what to know about a trial before the next plan relies on it.
 
-Read `trial_check.py` first (gaps, limits, [safety]), then `gone_wrong.py`, which asks whether the
-trial should be discarded, also in `status`. `initial_state.py` warns of a start away from s_0,
-`control_loop.py` of skipped steps and late commands, `log_faults.py` of columns in other units,
-negated or exchanged.
+Read `gone_wrong.py` first, which asks whether the trial should be discarded, also in `status`.
+`initial_state.py` warns of a start away from s_0, `control_loop.py` of skipped steps and late
+commands, `log_faults.py` of columns in other units, negated or exchanged.
 """
