@@ -18,6 +18,7 @@ from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
+from grounded_trials.formats.protobuf import message_class
 from grounded_trials.formats.schemas import parse_protobuf, struct_of
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
@@ -189,6 +190,7 @@ def test_our_own_definitions_are_known_without_the_library(
     found = struct_of(Schema(1, "grounded.State", "protobuf", data))
     assert found.name == wanted.name
     assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]
+    assert message_class(data, "grounded.State")
 
 
 def test_a_live_trial_on_a_full_disk_says_so() -> None:

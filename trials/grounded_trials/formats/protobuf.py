@@ -6,7 +6,7 @@ one form, are read by `uniform_doubles` without it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -34,8 +34,8 @@ FIXED64, BYTES = 1, 2
 class _Entry:
     """A key of a map, and its value."""
 
-    key: Any
-    value: Any
+    f1: Any
+    f2: Any
 
     def HasField(self, name: str) -> bool:
         """Return that both are there."""
@@ -50,7 +50,8 @@ class _ProtobufNode(Node):
 
     def field(self, name: str) -> _ProtobufNode:
         assert isinstance(self.type, Struct)
-        kind, node = self.type.by_name[name].type, self
+        known, node = self.type.by_name[name], self
+        kind, name = known.type, f"f{known.number}"  # see `message_class`
         if isinstance(kind, Struct):
             node = self.keep(np.array([o.HasField(name) for o in self.objects], dtype=np.bool_))
         inner = [getattr(o, name) for o in node.objects]
@@ -96,6 +97,8 @@ def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> No
 def message_class(definition: bytes, name: str) -> Any:
     """Return the class of the messages `name` of a serialised FileDescriptorSet.
 
+    Its fields are called by their numbers, f1 ..., since the library takes ASCII names only.
+
     Raises:
         BadSchema: if the library can't use it.
     """
@@ -108,6 +111,7 @@ def message_class(definition: bytes, name: str) -> Any:
     def add(file: FileDescriptorProto) -> None:  # after the files that it needs
         for needed in [one for one in file.dependency if one in files]:
             add(files.pop(needed))
+        _number(file.message_type)
         pool.Add(file)
 
     try:
@@ -117,6 +121,15 @@ def message_class(definition: bytes, name: str) -> Any:
         return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
     except (DecodeError, TypeError, ValueError, KeyError, RecursionError) as error:
         raise BadSchema("decode", what="definition", why="damaged", at=str(error)[:80]) from None
+
+
+def _number(messages: Iterable[Any]) -> None:
+    """Call the fields of message descriptions by their numbers, but for those of maps' entries."""
+    for message in messages:
+        for field in message.field if not message.options.map_entry else ():
+            field.name = f"f{field.number}"
+            field.ClearField("json_name")
+        _number(message.nested_type)
 
 
 def varint(value: int) -> bytes:
