@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cache, partial
 from itertools import combinations
 from typing import Any
 
@@ -727,7 +728,12 @@ class Suspicion:
     ran: Following | None  # the comparison with its candidate
     why: Finding | None = None  # why it is not its candidate's run
     other: str = ""  # the candidate whose run it is instead, or ""
-    stories: tuple[Story, ...] = ()  # what explains it better than that it is as logged
+    asked: Callable[[], Sequence[Story]] = tuple  # computes `stories`, once
+
+    @property
+    def stories(self) -> Sequence[Story]:
+        """What explains it better than that it is as logged."""
+        return self.asked()
 
 
 def suspicion(
@@ -756,16 +762,16 @@ def suspicion(
         left, name, nats = min(sure)
         near = name if left < max(CLEAR, SAME * ran.error) else ""
         return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
-    some = tuple(stories(task, own, trial, ran, logged=logged))
+    some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:
-        return Suspicion(ran, stories=some)
-    if program := next((one for one in some if one.kind is Kind.PROGRAM), None):
-        return Suspicion(ran, program.finding, stories=some)
+        return Suspicion(ran, asked=some)
+    if program := next((one for one in some() if one.kind is Kind.PROGRAM), None):
+        return Suspicion(ran, program.finding, asked=some)
     moves = np.ptp(own.policy.feedforward, axis=0) > 0
     silent = moves & ~(trial.inputs != 0).any(axis=0)
     if silent.any():
         names = [n for n, is_ in zip(trial.input_names, silent, strict=True) if is_]
-        return Suspicion(ran, found("log.silent", *names, ran=own.id), stories=some)
+        return Suspicion(ran, found("log.silent", *names, ran=own.id), asked=some)
     units, facts = task.model.inputs, dict[str, Any]()
     if ran.beyond:
         j = trial.input_names.index(ran.beyond)
@@ -774,4 +780,4 @@ def suspicion(
     until = Quantity(ran.until_s if ran.opens else 0.0, "s")
     rms = Quantity(ran.rms, units[ran.input])
     why = found("log.not_run", ran.input, ran=own.id, rms=rms, until=until, **facts)
-    return Suspicion(ran, why, stories=some)
+    return Suspicion(ran, why, asked=some)
