@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from grounded.model import Model
     from grounded_trials.workspace.intake.ingest import Ingested
 
-MOST = 3  # findings that are told without --details
+FINDINGS_TOLD = 3  # findings that are told without --details
 ASIDE = "set aside"  # a verdict
 
 
@@ -128,7 +128,7 @@ def following(log: str, candidate: str | None, details: bool, json_: bool) -> No
 def _tell(name: str, one: Ingested, model: Model, details: bool) -> None:
     if one.known:
         show(f"{name}: {one.trial}, stored before")
-    tell(one.findings, name, most=len(one.findings) if details else MOST)
+    tell(one.findings, name, most=len(one.findings) if details else FINDINGS_TOLD)
     if not one.known:
         show(f"{name}: {one.trial}")
     if not one.candidate:

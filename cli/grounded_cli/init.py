@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspection.guess import Guess
     from grounded_trials.starting.begin import Begun
 
-FEW = 8  # alternative signals listed for an unsure state or input
+ALTERNATIVES = 8  # alternative signals listed for an unsure state or input
 
 
 @click.command("init")
@@ -176,8 +176,10 @@ def _tell(begun: Begun) -> None:
             show(aligned("", reason.sentence))
         if guess.others and not guess.sure:
             or_ = "or" if guess.path else "perhaps"
-            more = f" or {len(guess.others) - FEW} more" * (len(guess.others) > FEW)
-            show(aligned("", f"{or_} {', '.join(guess.others[:FEW])}{more}"))
+            more = f" or {len(guess.others) - ALTERNATIVES} more" * (
+                len(guess.others) > ALTERNATIVES
+            )
+            show(aligned("", f"{or_} {', '.join(guess.others[:ALTERNATIVES])}{more}"))
         if known and guess in begun.states and not guess.path:
             names = listed(one.name for one in known)
             show(aligned("", f"the smoother estimates it from {names} ([estimate])"))

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
-MANY = 9  # constant fields of one array (an IMU's covariance has 9) that are folded into one line
+FOLDED_FIELDS = (
+    9  # constant fields of one array (an IMU's covariance has 9) that are folded into one line
+)
 
 
 @click.command("inspect")
@@ -80,7 +82,7 @@ def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
         array = one.path.rpartition("[")[0]
         if array and one.low is not None and one.low == one.high:
             arrays.setdefault(array, []).append(one)
-    many = {array: same for array, same in arrays.items() if len(same) >= MANY}
+    many = {array: same for array, same in arrays.items() if len(same) >= FOLDED_FIELDS}
     folded = {one.path for same in many.values() for one in same}
     rows = []
     for one in fields:

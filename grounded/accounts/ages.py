@@ -34,10 +34,10 @@ from grounded.accounts.kinematics import (
     turned,
 )
 from grounded.accounts.lag import (
-    CLEAR,
+    COHERENT,
     LEAST_S,
+    REPORTED_FROM,
     SAME,
-    SURE,
     SURELY,
     Lag,
     at_samples,
@@ -58,13 +58,13 @@ SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the mot
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
-ENOUGH = 10  # samples per weight
+SAMPLES_PER_WEIGHT = 10  # samples per weight
 FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
 FINE = 0.02  # of the rms: so small a bias would have been seen
-CLOSE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
+AS_LATE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
 AGREE, UNSURE = 2.5, 0.25  # standard deviations; and of a delay: larger ones show none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
@@ -142,7 +142,7 @@ class Ages:
     def clear(self, relation: Integral) -> Lag | None:
         """Return the lag of a velocity behind the rate of its position; None if they differ."""
         lag = lag_of(self.model, relation, self.trials)
-        return lag if lag is not None and lag.coherence > CLEAR else None
+        return lag if lag is not None and lag.coherence > COHERENT else None
 
     def with_message(self, findings: Iterator[Finding], names: Sequence[str]) -> Iterator[Finding]:
         """Correct all states of a message by the delay of one of them, the most certain one."""
@@ -185,9 +185,9 @@ class Ages:
         own = own_lag(self.model, relation, self.trials) if relation.exact else 0.0
         beyond = max(min(own, 0.0) - lag.delay, lag.delay - max(own, 0.0))
         q, w = (self.names[k] for k in (relation.i, relation.j))
-        if beyond + SURE * lag.std < least:  # neither can have a relevant delay of its own
+        if beyond + REPORTED_FROM * lag.std < least:  # neither can have a relevant delay of its own
             self.in_step |= {q, w}
-        if beyond < max(SURE * lag.std, least):
+        if beyond < max(REPORTED_FROM * lag.std, least):
             return
         if lag.delay > 0:
             yield self.in_time(relation.j, lag, q, rate=True)
@@ -367,7 +367,7 @@ def _weighed(
             said.append(velocity[past : past + len(windows)])
             seen.append(own)
     count = sum(map(len, said))
-    if count < ENOUGH * (past + LATER):
+    if count < SAMPLES_PER_WEIGHT * (past + LATER):
         return None
     a, w = np.concatenate(rows), np.concatenate(said)
     weights, _, rank, _ = np.linalg.lstsq(a, w, rcond=None)
@@ -410,12 +410,12 @@ class Bias:
     @property
     def found(self) -> bool:
         """Whether the bias is significant and large enough to report."""
-        return abs(self.value) > max(SURE * self.std, SAME * self.rms)
+        return abs(self.value) > max(REPORTED_FROM * self.std, SAME * self.rms)
 
     @property
     def refuted(self) -> bool:
         """Whether the trials rule a bias out: none is seen, and one would have been."""
-        return abs(self.value) < SURELY * self.std and SURE * self.std < FINE * self.rms
+        return abs(self.value) < SURELY * self.std and REPORTED_FROM * self.std < FINE * self.rms
 
 
 def bias_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Bias | None:
@@ -465,20 +465,20 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
         lag_between([(said[:, k], moved[:, k]) for k in some for moved, said in ways], dt)
         for some in ((0, 1), (0,), (1,))
     )
-    if every is None or every.sign < 0 or every.coherence < CLEAR:
+    if every is None or every.sign < 0 or every.coherence < COHERENT:
         return None
-    if every.delay < max(SURE * every.std, 0.5 * dt):
+    if every.delay < max(REPORTED_FROM * every.std, 0.5 * dt):
         return None
     one, other = each
     if one is not None and other is not None:
         sure = AGREE * float(np.hypot(one.std, other.std))
-        if abs(one.delay - other.delay) > max(sure, CLOSE * every.delay):
+        if abs(one.delay - other.delay) > max(sure, AS_LATE * every.delay):
             return None
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
     if any(std > UNSURE * late for late, std in _left(ways, 0.0, dt, apart=apart)):
         return None  # beside a drift nothing shows it
     for left, std in _left(ways, every.delay / dt, dt, apart=apart):
-        if std > UNSURE * every.delay or abs(left) > max(AGREE * std, CLOSE * every.delay):
+        if std > UNSURE * every.delay or abs(left) > max(AGREE * std, AS_LATE * every.delay):
             return None
     return every
 

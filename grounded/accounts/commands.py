@@ -20,7 +20,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials
-from grounded.accounts.motion import HALF, HINT, HORIZONS, LEAST, LIKE, MARGIN, Ahead, Fit, basis
+from grounded.accounts.motion import (
+    FEWEST_SAMPLES,
+    HALF_ERROR,
+    HINT,
+    HORIZONS,
+    LIKE,
+    MARGIN,
+    Ahead,
+    Fit,
+    basis,
+)
 from grounded.accounts.reported import names_of, tables
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
@@ -140,7 +150,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
             key=lambda fit: fit.score,
         )
     parts = fits[k].rms / before.rms
-    if before.score - fits[k].score < MARGIN or parts.min() > HALF:
+    if before.score - fits[k].score < MARGIN or parts.min() > HALF_ERROR:
         return None
     state = min(seen, key=lambda i: float(parts[i]))
     errors = float(before.rms[state]), float(fits[k].rms[state])
@@ -224,7 +234,7 @@ def _scores(ahead: Ahead) -> tuple[Array, Array]:
         size = np.square(by / ahead.least).sum(axis=(0, 2))
         even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= EVEN**2 * size
         even &= np.isfinite(off).all(axis=(0, 2))
-        if even.sum() < LEAST:
+        if even.sum() < FEWEST_SAMPLES:
             continue
         linear = basis(ahead.first[even][:, ahead.shown])
         each = np.concatenate([off[:1], by])[:, even]

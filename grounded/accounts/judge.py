@@ -27,7 +27,7 @@ from grounded.accounts.kinematics import (
     turned,
 )
 from grounded.accounts.motion import (
-    HALF,
+    HALF_ERROR,
     HINT,
     LIKE,
     MARGIN,
@@ -48,11 +48,11 @@ ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT, GROSSLY, OF_TEN = 0.015, 20.0, 0.1  # tolerance of a unit's ratio; of far larger ones
 TURNED_AWAY = np.deg2rad(20)  # more than any side slip causes
 SNAPPED = np.deg2rad(4)  # offsets this near to a right angle are one
-NEAR = 2.5  # [nats] within which accounts of rows are compared by the motion
+NEAR_NATS = 2.5  # [nats] within which accounts of rows are compared by the motion
 TRIALS, STARTS, FEWER = 4, 80, 40  # trials and samples that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
-FAR = 20.0  # times as large as in other trials: a trial to be examined
+UNLIKE_OTHERS = 20.0  # times as large as in other trials: a trial to be examined
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _dead(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterato
         found, noise = gaps(model, trial, rows), NOISE_ALONE * white_noise(trial.states)
         # most of a motion is missing, and not by a mere current; a hull's speed sideways, one of
         # several in the rate of a position, is often noise alone
-        for row in (r for r, gap in found.items() if gap.share > HALF and gap.varying > BAD):
+        for row in (r for r, gap in found.items() if gap.share > HALF_ERROR and gap.varying > BAD):
             if len(row.by) > 1 and units[row.i] not in ("rad", "deg"):
                 continue
             reach = float(np.nanmax(trial.states[:, row.i]) - np.nanmin(trial.states[:, row.i]))
@@ -248,7 +248,7 @@ def _best(
         return None
     # accounts that mend the same rows are told apart by the motion
     least = min(cost.values())
-    near = [account for account in cost if cost[account] < least + NEAR]
+    near = [account for account in cost if cost[account] < least + NEAR_NATS]
     if len(near) > 1:
         ahead = horizon_of(trials[0], shown)
         for account in near:
@@ -336,7 +336,7 @@ def _strange(account: Account, mended: Trial, usual: Array | None) -> float:
     if usual is None or not some or account.kind == "pace":
         return 0.0
     size = _spread(mended, some)
-    return float(np.minimum(np.abs(np.log(size / usual[some])), NEAR).sum())
+    return float(np.minimum(np.abs(np.log(size / usual[some])), NEAR_NATS).sum())
 
 
 def _spread(trial: Trial, some: Sequence[int]) -> Array:
@@ -430,7 +430,7 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
     size = np.array([_spread(t, shown) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
-    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(FAR))[:TRIALS]})
+    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(UNLIKE_OTHERS))[:TRIALS]})
 
 
 class _Seen:
@@ -513,4 +513,4 @@ def _compared(
         signs = [np.where(np.arange(model.m) == j, -1.0, 1.0) for j in range(model.m)]
         before = logged.best([ones, -ones, 0.0 * ones, *(signs if model.m > 1 else ())])
     better = before.missed - after.missed > MARGIN + account.price
-    return (before, after) if better and (after.share < HALF * before.share).any() else None
+    return (before, after) if better and (after.share < HALF_ERROR * before.share).any() else None

@@ -21,11 +21,11 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial, stretches
 
-SHORT = 1e-6  # [s] time step from which rates are computed
+INSTANT_S = 1e-6  # [s] time step from which rates are computed
 STRETCH = 0.3  # [s] shortest stretch
-LEAST = 8  # stretches that a trial must hold
+FEWEST_STRETCHES = 8  # stretches that a trial must hold
 NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
-SMALL = 1e-4  # of a rate, or of its largest derivative: treated as zero
+ZERO_RATE = 1e-4  # of a rate, or of its largest derivative: treated as zero
 STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
 DEGREES = 180 / np.pi
 
@@ -76,8 +76,8 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
         shown: indices of the states with a sensor.
     """
     model, found = places.direct(model), list[Row]()
-    dt = places.probe(model, SHORT)
-    if dt > SHORT:
+    dt = places.probe(model, INSTANT_S)
+    if dt > INSTANT_S:
         return found
     # rates that no input changes, and a parameter in size only; they double with all velocities
     x, u = places.within_limits(model, 8)
@@ -85,7 +85,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     slopes = (f_x - np.eye(model.n)) / dt
     fast = np.array([unit.endswith("/s") for unit in model.states.values()])
     rates, doubled = (_rates(model, z) for z in (x, np.where(fast, 2 * x, x)))
-    size = SMALL * np.abs(rates).max(axis=0)
+    size = ZERO_RATE * np.abs(rates).max(axis=0)
     fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
     low, high = np.ones((2, model.n))
     for k, one in enumerate(model.params.values()):
@@ -102,7 +102,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
     for i in (i for i in shown if i < model.n):
         slope = np.abs(slopes[:, i]).max(axis=0)
-        by = tuple(int(j) for j in np.flatnonzero(slope > SMALL * slope.max()))
+        by = tuple(int(j) for j in np.flatnonzero(slope > ZERO_RATE * slope.max()))
         if fixed[i] and i not in by and {*by} <= {*shown}:
             found.append(Row(i, by, 0.0, float(low[i]), float(high[i])))
     return found
@@ -136,8 +136,8 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
         each = per_step(model, trial, some)
         moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
         longest = max((len(x) for x in moved), default=0)
-        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // LEAST))
-        while usable := [k for k, x in enumerate(moved) if len(x) > LEAST * steps]:
+        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // FEWEST_STRETCHES))
+        while usable := [k for k, x in enumerate(moved) if len(x) > FEWEST_STRETCHES * steps]:
             far, told = (
                 np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable])
                 for z in (moved, said)
@@ -216,7 +216,7 @@ def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
 def _rates(model: Model, x: Array) -> Array:
     """Return the modelled rates (T, n) at states (T, n), for a fixed input."""
     u = np.full((len(x), model.m), 0.5)
-    return np.asarray((model.system.step(x, u, model.values, SHORT) - x) / SHORT)
+    return np.asarray((model.system.step(x, u, model.values, INSTANT_S) - x) / INSTANT_S)
 
 
 def _size(x: Array) -> Array:
@@ -243,7 +243,7 @@ class Turned:
 def turned(model: Model) -> Turned | None:
     """Return the plane in which a model moves; None if it has none."""
     (x, u), n = places.samples(model, 8), model.n
-    short = places.probe(model, SHORT)
+    short = places.probe(model, INSTANT_S)
     f_x, f_u = model.system.linearise(x, u, model.values, short)
     rates = (model.system.step(x, u, model.values, short) - x) / short
     slopes = (f_x - np.eye(n)) / short

@@ -23,13 +23,13 @@ from grounded.frozen import Array
 
 Pairs = Sequence[tuple[Array, Array]]
 
-MOST = 0.3  # [s] the largest delay tried, or FEW steps if that is more
-FEW = 6
+LARGEST_DELAY_S = 0.3  # [s] the largest delay tried, or LARGEST_DELAY_STEPS steps if that is more
+LARGEST_DELAY_STEPS = 6
 WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
 SHORTEST = 24  # samples in the shortest pair used
-CLEAR = 0.9  # coherence below which a window is ignored
+COHERENT = 0.9  # coherence below which a window is ignored
 BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
-SURE = 5.0  # standard deviations above which a delay or a bias is reported
+REPORTED_FROM = 5.0  # standard deviations above which a delay or a bias is reported
 LEAST_S = 0.0005  # [s] the smallest delay reported
 SAME, ROUNDED = 0.01, 0.003  # scale error that matters, and that discretisation may cause
 SURELY = 3.0  # standard deviations by which the scale must be certain
@@ -101,7 +101,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     reach = _reach_of(longest, dt)
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
     every = [(p, one) for p in found if (one := _measured(p, reach, dt)) is not None]
-    clear = [(p, one) for p, one in every if one.coherence > CLEAR]
+    clear = [(p, one) for p, one in every if one.coherence > COHERENT]
     if not clear:
         return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
     best = min((one for _, one in clear), key=lambda lag: lag.std)
@@ -115,7 +115,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
 
 def _reach_of(steps: int, dt: float) -> int:
     """Return the largest shift [samples] tried for a signal of `steps` steps."""
-    return max(3, min(int(np.ceil(max(MOST / dt, FEW))), steps // 8))
+    return max(3, min(int(np.ceil(max(LARGEST_DELAY_S / dt, LARGEST_DELAY_STEPS))), steps // 8))
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
     s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
     rest = a - s * b - part * curve
     std = max(_scatter(rest * bent, group) for group in pieces.groups) / size
-    sure = -np.sign(s) * part > SURE * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
+    sure = -np.sign(s) * part > REPORTED_FROM * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
     return float(np.sqrt(24 * -part / s)) if sure else 0.0
 
 

@@ -21,20 +21,23 @@ from grounded.places import motion, true_values
 from grounded.rollout import stepper
 from grounded.trial import Trial
 
-AHEAD = 0.25  # [s]
-FAR = 1e9  # bound on predicted states
-HORIZONS, LOUD = (AHEAD, 0.5, 1.0), 4.0  # [s] tried in turn; motion over noise that is enough
+AHEAD_S = 0.25  # [s]
+STATES_BOUND = 1e9  # bound on predicted states
+HORIZONS, LOUD = (AHEAD_S, 0.5, 1.0), 4.0  # [s] tried in turn; motion over noise that is enough
 FLOOR = 0.05  # of a motion: smaller errors count as this
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
-LEAST = 20  # fewest samples
-LITTLE, TINY = 1e-3, 1e-12  # smallest error that counts: of a state's spread, and in its unit
+FEWEST_SAMPLES = 20  # fewest samples
+SMALLEST_ERROR, TINY = (
+    1e-3,
+    1e-12,
+)  # smallest error that counts: of a state's spread, and in its unit
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin
 HINT = MARGIN / 2  # [nats] of plain predictions that are looked at
-HALF = 0.5  # share of one error
+HALF_ERROR = 0.5  # share of one error
 LIKE = 4.0  # factor within which an input must act as in the model
-ENOUGH = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
+LAST_GAIN = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 
 Steps = NDArray[np.intp]
 
@@ -70,7 +73,7 @@ def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
         steps = max(1, round(seconds / trial.dt))
         moved = trial.states[steps:, list(shown)] - trial.states[:-steps, list(shown)]
         known = np.isfinite(moved).all(axis=0)
-        if len(moved) < LEAST or not known.any():
+        if len(moved) < FEWEST_SAMPLES or not known.any():
             return seconds
         if median((moved.std(axis=0) / noise)[known]) > LOUD:
             return seconds
@@ -131,7 +134,7 @@ class Ahead:
         *,
         linear: bool = False,
         constant: bool = True,
-        horizon: float = AHEAD,
+        horizon: float = AHEAD_S,
     ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(horizon / trial.dt))
@@ -145,7 +148,7 @@ class Ahead:
         self.left_out = basis(self.first[:, self.shown] if linear else self.first[:, :0])
         self.left_out = self.left_out if constant else self.left_out[:, :0]
         moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
-        self.least = LITTLE * moves + TINY
+        self.least = SMALLEST_ERROR * moves + TINY
         params = list(model.params.values())
         self.moving = [k for k, param in enumerate(params) if param.uncertain]
         self.spread = np.array([params[k].spread for k in self.moving])
@@ -160,7 +163,7 @@ class Ahead:
     @property
     def enough(self) -> bool:
         """Whether there are enough samples."""
-        return len(self.at) >= LEAST and bool(self.shown)
+        return len(self.at) >= FEWEST_SAMPLES and bool(self.shown)
 
     @property
     def moved(self) -> Array:
@@ -247,7 +250,7 @@ class Ahead:
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
             for part in DAMPING:
                 (new,) = off((theta + part * step)[None])
-                if np.log(self.size(new) / size).sum() < -ENOUGH:
+                if np.log(self.size(new) / size).sum() < -LAST_GAIN:
                     break
             else:
                 break
@@ -280,13 +283,13 @@ class Ahead:
             sent = self.sent[np.maximum(at + j, 0)]
             u = np.broadcast_to(sent * gains[:, None], (K, N, self.model.m))
             x = stepped(x, u.reshape(K * N, -1))
-            x = np.fmax(np.fmin(x, FAR), -FAR)
+            x = np.fmax(np.fmin(x, STATES_BOUND), -STATES_BOUND)
         return np.asarray(self.model.difference(x, last)[:, self.shown].reshape(K, N, -1))
 
     def size(self, off: Array) -> Array:
         """Return the rms of errors (..., N, shown) by state, at least what counts."""
         size = np.sqrt((off**2).mean(axis=0))
-        return np.asarray(np.maximum(np.where(np.isfinite(size), size, FAR), self.least))
+        return np.asarray(np.maximum(np.where(np.isfinite(size), size, STATES_BOUND), self.least))
 
     def _fit(self, size: Array, gains: Array) -> Fit:
         rms = np.ones(self.model.n)
@@ -308,12 +311,12 @@ def plainly_missed(ahead: Ahead, versions: Array) -> Array:
     now = first.reshape(-1, n)
     for j in range(ahead.steps):
         now = stepped(now, versions[:, ahead.at + j, n:].reshape(len(now), -1))
-        now = np.fmax(np.fmin(now, FAR), -FAR)
+        now = np.fmax(np.fmin(now, STATES_BOUND), -STATES_BOUND)
     off = model.difference(now.reshape(first.shape), last)[..., shown]
     moved = model.difference(last, first)[..., shown].std(axis=1)
     size = np.sqrt(off.var(axis=1))  # a constant rate is removed
-    least = LITTLE * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
-    size = np.maximum(np.where(np.isfinite(size), size, FAR), least)
+    least = SMALLEST_ERROR * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
+    size = np.maximum(np.where(np.isfinite(size), size, STATES_BOUND), least)
     share = np.clip(size / np.maximum(moved, TINY), FLOOR, 1.0)
     return np.asarray(np.log(share).sum(axis=-1))
 

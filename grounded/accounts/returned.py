@@ -26,9 +26,9 @@ from grounded.accounts.sent import (
     DECISIVE,
     EXPLAINED,
     FINE,
-    LEAST,
     SAME,
     SLIGHT,
+    STEPS_TO_JUDGE,
     Commanded,
     Following,
     Ran,
@@ -52,7 +52,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 ALIKE = 3.0  # [nats] by which a story must lead where the commands are alike as logged
-MANY = 12  # rows that are compared in full
+ROWS_IN_FULL = 12  # rows that are compared in full
 OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
 NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
@@ -357,7 +357,7 @@ def nearest(rows: Sequence[Row], trial: Trial) -> list[Row]:
             score[k] = float(np.log(error + FINE)) + min(
                 one for one in (rows[k].log, rows[k].program) if one is not None
             )
-    return [rows[k] for k in sorted(score, key=lambda k: score[k])[:MANY]]
+    return [rows[k] for k in sorted(score, key=lambda k: score[k])[:ROWS_IN_FULL]]
 
 
 # --- the table ------------------------------------------------------------------------------------
@@ -603,7 +603,7 @@ def _origins(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Ite
     run = commanded(policy, trial)
     free = (run.sent > policy.low) & (run.sent < policy.high)
     free &= (run.asked > policy.low) & (run.asked < policy.high)
-    if free.any(axis=1).sum() < LEAST:
+    if free.any(axis=1).sum() < STEPS_TO_JUDGE:
         return
     off = ((run.sent - run.asked) / run.size)[free]
     gains = (policy.gain[: len(free), :, : model.n] / run.size[:, None])[free]
@@ -681,7 +681,7 @@ def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
     end = float(u.max(initial=-np.inf))
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
     at, more = u >= end - FINE**2 * size, wanted > end + SLIGHT * size
-    enough = at.sum() >= max(LEAST, CUT * len(u)) and end < limit - SLIGHT * size
+    enough = at.sum() >= max(STEPS_TO_JUDGE, CUT * len(u)) and end < limit - SLIGHT * size
     both = float((at & more).sum())
     return at if enough and both >= 0.8 * max(at.sum(), more.sum()) else None
 
@@ -695,7 +695,7 @@ def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
 
     def left(k: int) -> float:
         T = min(most, policy.horizon - k)
-        if T < LEAST:
+        if T < STEPS_TO_JUDGE:
             return np.inf
         run = commanded(policy.after(k), trial.until(T))
         return float(np.median((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))

@@ -23,8 +23,10 @@ from grounded.policy import Policy, z_difference
 from grounded.task import Task
 from grounded.trial import Trial
 
-LEAST = 10  # smallest number of steps that can be judged
-FEW = 5  # smallest number of steps that are alike and not at the limits, in which others are too
+STEPS_TO_JUDGE = 10  # smallest number of steps that can be judged
+STEPS_ALIKE = (
+    5  # smallest number of steps that are alike and not at the limits, in which others are too
+)
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 DECISIVE = 8.0  # [nats] of evidence that another candidate ran
@@ -53,7 +55,9 @@ class Following:
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
     until_s: float  # the commands are alike up to this time [s]
-    opens: bool  # they are alike until then, at least `LEAST` steps, not only at their limits
+    opens: (
+        bool  # they are alike until then, at least `STEPS_TO_JUDGE` steps, not only at their limits
+    )
     late: int  # steps by which the log is late
     age: float  # of the states that it acted on, where its commands are logged [steps]
     moved: float  # squared difference at `late`, relative to that without shift
@@ -80,7 +84,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     """
     T = min(trial.finite_steps, policy.horizon)
     names = (policy.state_names, policy.input_names)
-    if T < LEAST or (trial.state_names, trial.input_names) != names:
+    if T < STEPS_TO_JUDGE or (trial.state_names, trial.input_names) != names:
         return None
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
@@ -91,7 +95,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
     fits = {}
-    for late in range(-1, min(latest, T - LEAST) + 1):
+    for late in range(-1, min(latest, T - STEPS_TO_JUDGE) + 1):
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
         squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
         usual, mean = median(squares.T), squares.mean(axis=1)
@@ -109,7 +113,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = (with_noise - free[0]) ** 2  # at samples, where it is largest
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
-    parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // LEAST)))
+    parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // STEPS_TO_JUDGE)))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
     drawn_out = np.array([max(1.0, steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
@@ -172,7 +176,7 @@ def as_sent(policy: Policy, trial: Trial) -> bool:
         trial: the run; one with gaps, or of other signals, is not.
     """
     names = (policy.state_names, policy.input_names)
-    if (trial.state_names, trial.input_names) != names or trial.finite_steps < LEAST:
+    if (trial.state_names, trial.input_names) != names or trial.finite_steps < STEPS_TO_JUDGE:
         return False
     run = commanded(policy, trial)
     return bool((np.abs(run.asked - run.sent) < DIGITS * run.size).all())
@@ -184,7 +188,7 @@ def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -
     In a part at rest, the noise of a later fall would excuse any difference; and commands that
     stay at their limits are those of other policies too.
     """
-    if len(off) < LEAST:
+    if len(off) < STEPS_TO_JUDGE:
         return False
     both = np.stack([asked, sent])
     inside = (both > policy.low) & (both < policy.high)
@@ -192,7 +196,7 @@ def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -
     telling = (inside | switched).any(axis=(0, 2))
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     alike = off.mean(axis=0) <= 2 * UNLIKE * unrelated + (0.02 * size) ** 2
-    return bool(telling.sum() >= FEW and alike.all())
+    return bool(telling.sum() >= STEPS_ALIKE and alike.all())
 
 
 def evidence(own: Array, other: Array) -> float:
@@ -211,7 +215,7 @@ def evidence(own: Array, other: Array) -> float:
     """
     T = min(len(own), len(other))
     known = np.isfinite(own[:T] + other[:T]) & (np.maximum(own[:T], other[:T]) > 0)
-    if known.sum() < LEAST:
+    if known.sum() < STEPS_TO_JUDGE:
         return 0.0
     a, b = own[:T][known] / np.sqrt(2), other[:T][known]
     usual = float(np.hypot(median(b), FINE))

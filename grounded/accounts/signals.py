@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding
-from grounded.accounts.lag import LEAST_S, SURE, Lag, lag_between
+from grounded.accounts.lag import LEAST_S, REPORTED_FROM, Lag, lag_between
 from grounded.accounts.table import OVER
 from grounded.findings import Quantity, found
 from grounded.frozen import Array, white_noise
@@ -35,7 +35,7 @@ FULL_TURNS = (2 * np.pi, 360.0)
 OFTEN = 0.1  # share of the time above which it is reported
 COPY = 0.99  # coherence of two identical inputs: two motors of one vehicle have 0.96
 MAYBE = 0.5  # correlation of two inputs that may be copies
-FAR = 20.0  # times the limit: a value in percent exceeds it by more
+PERCENT_FROM = 20.0  # times the limit: a value in percent exceeds it by more
 ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
 
@@ -352,7 +352,7 @@ def in_percent(task: Task, inputs: Array, j: int) -> bool:
     unit = list(task.model.inputs.values())[j]
     most = float(np.nanmax(np.abs(inputs[:, j]), initial=0.0))
     limit = float(max(abs(task.low[j]), abs(task.high[j])))
-    return unit == "1" and FAR * limit < most <= 100 * OVER
+    return unit == "1" and PERCENT_FROM * limit < most <= 100 * OVER
 
 
 def limits_of(task: Task, j: int) -> str:
@@ -393,6 +393,6 @@ def _copy(first: str, second: str, lag: Lag) -> Finding:
     if lag.delay < 0:
         first, second = second, first
     d = abs(lag.delay)
-    late = d if d > max(SURE * lag.std, LEAST_S) else None
+    late = d if d > max(REPORTED_FROM * lag.std, LEAST_S) else None
     said = found("sensor.same", second, of=first, late=late)
     return Finding(second, said, "copy", d, lag.std, lag.low)

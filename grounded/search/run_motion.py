@@ -18,7 +18,7 @@ from enum import Enum
 import numpy as np
 
 from grounded.accounts.commands import STARTS, Acts, how_inputs_act
-from grounded.accounts.motion import HALF, HORIZONS, MARGIN, Ahead
+from grounded.accounts.motion import HALF_ERROR, HORIZONS, MARGIN, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.search.planner import Planner
@@ -58,7 +58,7 @@ def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding |
         plain, *turned = [ahead.size(one) for one in each]
         nats = [float(np.log(plain / one).sum()) for one in turned]
         j = int(np.argmax(nats))
-        shares = np.where(turned[j] > HALF * ahead.moved, 1.0, turned[j] / plain)[own]
+        shares = np.where(turned[j] > HALF_ERROR * ahead.moved, 1.0, turned[j] / plain)[own]
     i = int(np.argmin(shares))
     if nats[j] < 2 * MARGIN or shares[i] > LEFT_BY_FLIP:
         return None

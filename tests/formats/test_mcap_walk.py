@@ -208,7 +208,7 @@ def test_a_chunk_with_a_flipped_bit_is_refused() -> None:
 
 def followed_one_by_one(buffer: bytes) -> tuple[list[int], int]:
     positions, pos = list[int](), 0
-    while len(buffer) - pos >= 9 and len(positions) < mcap_walk.MOST:
+    while len(buffer) - pos >= 9 and len(positions) < mcap_walk.BATCH_MESSAGES:
         opcode, length = struct.unpack_from("<BQ", buffer, pos)
         if opcode != mcap_walk.MESSAGE or length > len(buffer) - pos - 9:
             break
@@ -221,7 +221,7 @@ def followed_one_by_one(buffer: bytes) -> tuple[list[int], int]:
 
 def test_messages_whose_lengths_repeat_are_found_as_if_followed_one_by_one(monkeypatch):
     """Also where the cycle ends: at another length, another record, a short one, the end."""
-    monkeypatch.setattr(mcap_walk, "MOST", 700)
+    monkeypatch.setattr(mcap_walk, "BATCH_MESSAGES", 700)
     rng = np.random.default_rng(0)
     for _ in range(300):
         cycle = rng.integers(22, 60, rng.integers(1, 11))

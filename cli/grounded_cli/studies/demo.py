@@ -34,8 +34,8 @@ from grounded_trials.wording import count, rendered
 from grounded_trials.workspace.candidates.proposing import Status
 from grounded_trials.workspace.candidates.running import optimum
 
-MOST = 3  # effects that are looked for if not all trials are used: each more takes 20 s
-MANY = 1.5  # times as many trials as fit into STEPS: fewer are all used
+EFFECTS_SOUGHT = 3  # effects that are looked for if not all trials are used: each more takes 20 s
+USED_ALL_BELOW = 1.5  # times as many trials as fit into STEPS: fewer are all used
 STEPS = 800  # total steps of the diagnosed trials, so that a demo ends within a minute or two
 
 
@@ -64,7 +64,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         tell("diagnosis")
         some, engine = _few(workspace, status), Engine(idle())
         diagnosed = workspace.diagnose(
-            some, max_effects=MOST if some else None, engine=engine, progress=tell
+            some, max_effects=EFFECTS_SOUGHT if some else None, engine=engine, progress=tell
         )
     with progress("report"):
         html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
@@ -102,7 +102,7 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
     last = sorted((t for one in standing.history for t in one.trials), key=lambda t: t.id)[-1:]
     repeats = [*best.trials] if best else []  # they show how far runs scatter
     chosen = list(dict.fromkeys(one.id for one in (*tried[:1], *last, *repeats, *tried)))
-    return chosen[:most] if standing.trials > MANY * most else []
+    return chosen[:most] if standing.trials > USED_ALL_BELOW * most else []
 
 
 def _tell(document: dict[str, Any], verdict: list[str]) -> None:

@@ -39,13 +39,16 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
-SLOW, STEPS = 0.5, (1, 5, 10)  # [s] control step from which a process counts as slow; its horizons
+SLOW_DT_S, STEPS = (
+    0.5,
+    (1, 5, 10),
+)  # [s] control step from which a process counts as slow; its horizons
 MOST_STARTS, FEWER_STARTS = 400, 75  # the second applies to a simulator, whose steps are slow
 MOST_WHOLE = 8  # most trials that are predicted from start to end
 WHOLE_STEPS = 4000  # most steps of these together, unless that leaves fewer than LEAST_WHOLE
 LEAST_WHOLE = 3
 FINE = 2e-3  # fraction of a channel's spread below which errors are negligible,
-SLIGHT = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
+SLIGHT_ERROR = 1e-2  # and the same fraction of the crude model's error, or of the spread if smaller
 MOMENTS = 20  # most moments at which repeats are compared
 
 
@@ -57,7 +60,7 @@ class Ruler:
         data = self.data
         self.held_out = len(np.unique(data.folds)) > 1
         longest = int(data.lengths.max())
-        fast = data.dt < SLOW
+        fast = data.dt < SLOW_DT_S
         steps = (1, *(max(1, round(s / data.dt)) for s in SECONDS)) if fast else STEPS
         self.steps = tuple(dict.fromkeys(k for k in steps if k < longest))  # and the whole trial
         self.names = [n for i, n in enumerate(data.model.state_names) if i not in data.hidden]
@@ -108,8 +111,12 @@ class Ruler:
         """Set negligible errors relative to those of the crude model at the outset."""
         self.outset = self.errors(crude) if self.origin is None else self._origin(crude)
         missed, spread = np.nan_to_num(self.outset.rms), self.data.filled.std(axis=0)
-        self.fine_whole = np.maximum(self.fine, SLIGHT * np.minimum(missed.max(axis=0), spread))
-        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
+        self.fine_whole = np.maximum(
+            self.fine, SLIGHT_ERROR * np.minimum(missed.max(axis=0), spread)
+        )
+        self.fine = np.maximum(
+            self.fine, SLIGHT_ERROR * np.minimum(missed[:-1].max(axis=0), spread)
+        )
         self._compared.clear()
 
     def since_outset(self, fit: Fitted) -> float:

@@ -32,7 +32,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 # fraction of an input's range within which it counts as at its limit; share of steps that is often
-NEAR, OFTEN = 0.01, 0.3
+NEAR_LIMIT, OFTEN_AT_LIMIT = 0.01, 0.3
 SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
 NEARBY, PERIODIC = 2, 0.5  # frequencies beside the strongest, and their share in a limit cycle
 UNKNOWN_STRENGTH = (
@@ -97,11 +97,11 @@ def plan_range(made: Candidate, task: Task) -> Array:
 def between_limits(tried: Tried, task: Task) -> bool:
     """Return whether an input was at its limits, at both of them, for much of a trial."""
     range_ = task.high - task.low
-    near = np.where(np.isfinite(range_), NEAR * range_, 0.0)
+    near = np.where(np.isfinite(range_), NEAR_LIMIT * range_, 0.0)
     for trial in tried.trials:
         at_low, at_high = trial.inputs <= task.low + near, trial.inputs >= task.high - near
         both = at_low.any(axis=0) & at_high.any(axis=0)
-        if np.any(both & ((at_low | at_high).mean(axis=0) > OFTEN)):
+        if np.any(both & ((at_low | at_high).mean(axis=0) > OFTEN_AT_LIMIT)):
             return True
     return False
 

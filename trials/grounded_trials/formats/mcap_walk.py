@@ -46,9 +46,9 @@ from grounded_trials.formats.mcap_records import (
 
 MAGIC = b"\x89MCAP0\r\n"
 BLOCK = 4 * 2**20  # [bytes] read at a time
-SMALL = 2**16  # [bytes] chunks smaller than this are joined ...
+SMALL_CHUNK = 2**16  # [bytes] chunks smaller than this are joined ...
 TOGETHER = 2**20  # [bytes] ... up to this size
-MOST = 250_000  # messages in a batch
+BATCH_MESSAGES = 250_000  # messages in a batch
 SAMPLE = 32  # messages in which a cycle of lengths is looked for
 PERIOD = 8  # longest such cycle, in messages
 
@@ -210,9 +210,13 @@ class _Walk:
         self.small, self.small_size, self.positions = [], 0, []
 
     def _chunk(self, data: bytes) -> Iterator[Record]:
-        if len(data) >= SMALL or self.small_size > TOGETHER or len(self.positions) > MOST:
+        if (
+            len(data) >= SMALL_CHUNK
+            or self.small_size > TOGETHER
+            or len(self.positions) > BATCH_MESSAGES
+        ):
             yield from self._together()
-        if len(data) < SMALL:
+        if len(data) < SMALL_CHUNK:
             for part in chunk_parts(data):
                 if isinstance(part, list):
                     self.positions += [self.small_size + at for at in part]
@@ -295,7 +299,7 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
             yield part
             continue
         positions += part
-        if len(positions) >= MOST:
+        if len(positions) >= BATCH_MESSAGES:
             yield batch(data, positions)
             positions = []
     yield batch(data, positions)
@@ -325,14 +329,14 @@ def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel 
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
-    """Return the starts of consecutive message records from `pos` on, at most MOST, and their end.
+    """Return the starts of consecutive message records from `pos` on, and their end.
 
     Raises:
         BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
     append, unpack, look = positions.append, _HEAD.unpack_from, SAMPLE
-    while end - pos >= 9 and len(positions) < MOST:
+    while end - pos >= 9 and len(positions) < BATCH_MESSAGES:
         opcode, length = unpack(buffer, pos)
         if opcode != MESSAGE or length > end - pos - 9:
             break
@@ -344,7 +348,9 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
             more, pos = _repeated(buffer, positions[-SAMPLE:], pos, end)
             positions += more
             look = len(positions) + (SAMPLE if more else 8 * SAMPLE)
-    return positions[:MOST], positions[MOST] if len(positions) > MOST else pos
+    return positions[:BATCH_MESSAGES], positions[BATCH_MESSAGES] if len(
+        positions
+    ) > BATCH_MESSAGES else pos
 
 
 def _repeated(buffer: bytes, last: list[int], pos: int, end: int) -> tuple[list[int], int]:
@@ -359,7 +365,7 @@ def _repeated(buffer: bytes, last: list[int], pos: int, end: int) -> tuple[list[
     if not period:
         return [], pos
     cycle = sizes[-period:]
-    count = min((end - pos) // int(cycle.sum()), MOST // period) * period
+    count = min((end - pos) // int(cycle.sum()), BATCH_MESSAGES // period) * period
     if count < SAMPLE:
         return [], pos
     expected = np.tile(cycle, count // period)

@@ -17,7 +17,7 @@ from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import Samples
 
-FEW = 5  # with so few changes, the beginning of the steps can't be found
+FEW_CHANGES = 5  # with so few changes, the beginning of the steps can't be found
 IN_STEP = 0.8  # length of the mean unit vector of phases above which commands are periodic
 IN_ROWS = 0.9  # share of changes that fit one phase, each within its row, to be periodic
 COARSEST = 0.6  # of a step: with longer rows any phase would fit
@@ -28,7 +28,10 @@ HELD = 0.5  # share of repeated rows above which rows are not written at changes
 STEADY_S, STEADY_STEPS = 0.25, 4  # commands are steady if constant for both times
 LOOK_S, LOOK = 3.0, 0.2  # the steady moment is sought within this time and share of a log
 STILL_S = 0.2  # [s] shortest standstill
-STILL, NOISE = 2e-3, 4.0  # at rest: within this share of its range, and this multiple of its noise
+REST_RANGE, REST_NOISE = (
+    2e-3,
+    4.0,
+)  # at rest: within this share of its range, and this multiple of its noise
 
 
 def phase_of(
@@ -50,7 +53,7 @@ def phase_of(
         The latest possible phase, -dt / 2 to dt / 2, and by how much earlier it may be [s]; None if
         the changes have no common phase.
     """
-    if len(changes) <= FEW:
+    if len(changes) <= FEW_CHANGES:
         return None
     if late is not None and 0 < np.median(late) <= COARSEST * dt:
         tried = changes[np.unique(np.linspace(0, len(changes) - 1, TRIED).astype(int))]
@@ -96,12 +99,12 @@ def held_rows(t: Ints, values: Floats) -> float:
     """
     order = np.argsort(t, kind="stable")
     y = values[order]
-    if len(t) <= 2 * FEW or np.mean(np.diff(y) == 0) < HELD:
+    if len(t) <= 2 * FEW_CHANGES or np.mean(np.diff(y) == 0) < HELD:
         return 0.0
     begins = np.flatnonzero(np.diff(y, prepend=np.nan) != 0)
     lasts, here = np.diff(begins, append=len(y)), y[begins]
     inside = (here > y.min()) & (here < y.max())
-    if inside.sum() >= FEW and np.mean(lasts[inside] > 1) < HELD:
+    if inside.sum() >= FEW_CHANGES and np.mean(lasts[inside] > 1) < HELD:
         return 0.0
     return float(np.median(np.diff(t[order]))) * 1e-9
 
@@ -137,7 +140,7 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) 
         moved = round((phase if phase > 0 else phase + dt) * 1e9)
     if unknown:
         moved = _steady(inputs, found, start, moved, dt)
-    return moved, phase is not None or len(later) <= FEW
+    return moved, phase is not None or len(later) <= FEW_CHANGES
 
 
 def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
@@ -156,13 +159,13 @@ def stands_still(states: Sequence[Samples], rates: Sequence[str], until: int) ->
     """
     for one in states:
         y = one.y[one.t < until]
-        if len(y) < 2 * FEW or (until - one.t[0]) * 1e-9 < STILL_S:
+        if len(y) < 2 * FEW_CHANGES or (until - one.t[0]) * 1e-9 < STILL_S:
             return False
         change, half = np.diff(y), len(y) // 2
-        noise = float(np.sqrt((change**2).mean() / 2)) + STILL * float(np.ptp(one.y))
+        noise = float(np.sqrt((change**2).mean() / 2)) + REST_RANGE * float(np.ptp(one.y))
         drift = abs(float(y[half:].mean() - y[:half].mean()))
         off = abs(float(y.mean())) if one.name in rates else 0.0
-        if max(drift, off) > NOISE * noise or np.ptp(y) > 2 * NOISE * noise:
+        if max(drift, off) > REST_NOISE * noise or np.ptp(y) > 2 * REST_NOISE * noise:
             return False
     return bool(states)
 

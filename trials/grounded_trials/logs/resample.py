@@ -46,7 +46,10 @@ START, END = "[log.span] start", "[log.span] end"  # names of the series that a 
 ABSOLUTE_S = 1e8  # larger times are stamps, not relative to the beginning of the log
 STEP_LIMIT = 2_000_000
 UNITS_OF_TIME = (1e3, 1e6, 1e9)  # factors if seconds were read as ms, us or ns
-MANY, STEPS_APART = 10, (0.02, 3.0)  # fewest samples, and plausible intervals in steps, to say so
+SAMPLES_TO_SAY, STEPS_APART = (
+    10,
+    (0.02, 3.0),
+)  # fewest samples, and plausible intervals in steps, to say so
 
 
 @dataclass(frozen=True)
@@ -343,7 +346,7 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
 
 def stamped_otherwise(samples: Iterable[Samples], dt: float) -> float:
     """Return the interval of samples [s] whose times seem to be in another unit; else 0."""
-    many = [one for one in samples if len(one.t) >= MANY]
+    many = [one for one in samples if len(one.t) >= SAMPLES_TO_SAY]
     every = max((one.interval for one in many), default=0.0)
     low, high = (apart * dt for apart in STEPS_APART)
     return every if any(low <= factor * every <= high for factor in UNITS_OF_TIME) else 0.0

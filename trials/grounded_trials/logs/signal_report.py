@@ -23,7 +23,7 @@ SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
 BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
 LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
 COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
-FAR = 10.0  # times the range of all other samples of a signal: a sample is far outside them
+FAR_OUTSIDE = 10.0  # times the range of all other samples of a signal: a sample is far outside them
 LOST = 0.1  # least share of a log that is told if one state lacks it
 DISORDERED = 0.01  # least share of stamps out of order that is told; sorting loses nothing of them
 
@@ -165,7 +165,7 @@ def outliers(series: Sequence[Samples], first: int, last: int) -> list[Finding]:
         alone = np.minimum(jump[:-1], jump[1:])
         i = int(np.argmax(alone)) + 1
         others = np.delete(y, i)
-        if alone[i - 1] > FAR * np.ptp(others) > 0:
+        if alone[i - 1] > FAR_OUTSIDE * np.ptp(others) > 0:
             facts: dict[str, Any] = {"value": float(y[i]), "at": float(t[i] - first) * 1e-9}
             ends: dict[str, Any] = {"low": float(others.min()), "high": float(others.max())}
             far.append(found("file.outlier", samples.name, **facts, **ends))

@@ -39,7 +39,7 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.log_files import log_records, read_apart
 
 Clock = Literal["header", "log", "publish"]
-FEW = 8  # topics of a log that are all named where one is missing
+TOPICS_NAMED = 8  # topics of a log that are all named where one is missing
 JSON_PIECE = 2**20  # [bytes] of JSON parsed at once, at least one message
 
 
@@ -129,7 +129,7 @@ def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
     first = next(iter(missing.values()))
     topic, known = first.path.topic, sorted(first.topics)
     names = tuple(name for name, one in missing.items() if one.path.topic == topic)
-    few = 0 < len(known) <= FEW  # the nearest name may be another's: /left for /port
+    few = 0 < len(known) <= TOPICS_NAMED  # the nearest name may be another's: /left for /port
     others = {"known": tuple(known)} if few else near(topic, known)
     then = NextCommand("inspect", (file,))
     facts: dict[str, Any] = {"kind": "topic", "of": Path(file).name, "where": ", ".join(names)}

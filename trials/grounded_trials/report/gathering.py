@@ -39,9 +39,9 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.next_step import next_command
 
-MOST = 200  # number of runs that are read: the latest, and those of compared candidates
+MOST_RUNS = 200  # number of runs that are read: the latest, and those of compared candidates
 LOGS = 50  # number of logs that are read, the latest
-KEPT = 5  # number of improvements whose runs are always read
+IMPROVEMENTS_READ = 5  # number of improvements whose runs are always read
 RUNAWAY = 1e15  # in any unit: larger values mean that a run diverged
 
 
@@ -97,12 +97,12 @@ def _estimated(task: Task, contents: Contents, drawn: Collection[str]) -> tuple[
 
 def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
     """Return the trials to read: all, or of many the latest and those of compared candidates."""
-    if len(trials) <= MOST:
+    if len(trials) <= MOST_RUNS:
         return trials
     compared = [t for t in now.history if t.trials][:1]
-    compared += selection([t for t in now.history if t.accepted], KEPT)
+    compared += selection([t for t in now.history if t.accepted], IMPROVEMENTS_READ)
     names = {t.candidate.id for t in compared}
-    latest = {t.id for t in trials[-MOST:]}
+    latest = {t.id for t in trials[-MOST_RUNS:]}
     return [t for t in trials if t.id in latest or t.candidate in names]
 
 

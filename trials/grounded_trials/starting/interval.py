@@ -26,10 +26,10 @@ RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10
 STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], rounded as written to files
 GUESSED = 0.05  # [s], if nothing is known
 LONGEST = 0.1  # [s]; slower changes may be the steps of a test signal
-SLOW = 0.95  # [s] from which an interval is rounded to whole seconds
-ENOUGH = 20  # smallest number of times between changes
+WHOLE_SECONDS_FROM = 0.95  # [s] from which an interval is rounded to whole seconds
+FEWEST_TIMES = 20  # smallest number of times between changes
 APART = 1.5  # smallest ratio of an interval to that of the rows
-NEAR = 0.03  # relative tolerance for rounding to one of STEPS
+ROUNDING = 0.03  # relative tolerance for rounding to one of STEPS
 ONCE, WITHIN = 0.25, 0.25  # share of times between changes that are the interval, within a part
 IN_STEP, TOGETHER = 0.6, 40  # coherence of the phases of so many changes, since clocks drift
 
@@ -66,13 +66,13 @@ def round_interval(rows: float) -> float:
     It is at least the smallest of `STEPS`. Slow processes are logged every few seconds.
     """
     usual = min(STEPS, key=lambda step: abs(np.log(step / rows)))
-    if abs(usual / rows - 1) < NEAR or not STEPS[0] < rows:
+    if abs(usual / rows - 1) < ROUNDING or not STEPS[0] < rows:
         return usual
     whole = [1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1)]
-    if rows > SLOW:
+    if rows > WHOLE_SECONDS_FROM:
         whole = [float(round(rows))]
     nearest = min(whole, key=lambda step: abs(step - rows))
-    return float(f"{nearest if abs(nearest / rows - 1) < NEAR else rows:.6g}")
+    return float(f"{nearest if abs(nearest / rows - 1) < ROUNDING else rows:.6g}")
 
 
 def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> tuple[Finding, ...]:
@@ -84,7 +84,7 @@ def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> tuple[F
         dt: the interval that the user asked for [s].
     """
     gaps = _gaps(report, _commanded(inputs))
-    if len(gaps) < ENOUGH or dt < APART * (apart := float(np.median(gaps))):
+    if len(gaps) < FEWEST_TIMES or dt < APART * (apart := float(np.median(gaps))):
         return ()
     return (found("start.interval", every=round_interval(apart), dt=dt),)
 
@@ -107,7 +107,7 @@ def changes_every(gaps: Array, rows: float) -> float | None:
         gaps: times between changes [s].
         rows: time between samples [s], the resolution of `gaps`.
     """
-    if len(gaps) < ENOUGH:
+    if len(gaps) < FEWEST_TIMES:
         return None
     changes, coherence = np.cumsum(gaps), dict[float, float]()
     blocks = np.array_split(changes, max(1, len(changes) // TOGETHER))

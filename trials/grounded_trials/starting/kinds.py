@@ -26,7 +26,7 @@ Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names
 Units = Mapping[str, str]  # unit of a number by its path
 HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
 QUIET = 10.0  # range of a number of noise alone, in standard deviations of that, at most
-MOST, INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
+MOST_STATES, MOST_INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
@@ -113,12 +113,12 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         raise unknown("number", name, found, "the log")
     called = [n for n in reversed(found) if called_input(n, found[n].path)]
     followers = _followers(found, list(inputs) or called)
-    inputs = inputs or list(followers.values())[:MOST] or _inputs_in(found, called, unit)
+    inputs = inputs or list(followers.values())[:MOST_STATES] or _inputs_in(found, called, unit)
 
     # The states, and those whose rate is another one.
     named = [name for name in reversed(found) if name not in inputs]
     moved = [name for name in named if not _noise_only(found[name])]
-    states = (moved or named)[:MOST] or ["x"]
+    states = (moved or named)[:MOST_STATES] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
     for position, rate in rates.items():  # v is logged without a unit, x in m: v is in m/s
         known_as = rate.removeprefix("s.")
@@ -160,7 +160,7 @@ def _inputs_in(
     held = held if 2 * len(held) < len(names) else []
     driven = [n for n in names if ACTUATOR.search(n.lower())]
     efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
-    return (list(called) or held or driven or efforts)[:INPUTS] or ["u"]
+    return (list(called) or held or driven or efforts)[:MOST_INPUTS] or ["u"]
 
 
 def _turns(number: FieldReport) -> bool:

@@ -22,7 +22,7 @@ from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
-NEAR = 1e-3  # of dt: a timestep this near to a part of it divides it
+DIVIDES = 1e-3  # of dt: a timestep this near to a part of it divides it
 SIMULATED = (".xml", ".urdf", ".mjcf")  # suffixes of files that MuJoCo loads
 FILE = "model.py"
 LOADS = """from grounded.adapters import mujoco
@@ -70,7 +70,7 @@ class OwnModel:
     def in_step(self, folder: Path, model: Model, dt: float) -> Model:
         """Return a simulated model whose timestep divides dt, which model.py then states."""
         own = float(getattr(model.step, "timestep", 0.0)) * (self.file.suffix.lower() in SIMULATED)
-        if not own or abs(round(dt / own) * own - dt) <= NEAR * dt:
+        if not own or abs(round(dt / own) * own - dt) <= DIVIDES * dt:
             return model
         said = f", timestep={dt / max(1, round(dt / own)):.12g})"
         text = (folder / FILE).read_text("utf-8")

@@ -26,8 +26,8 @@ STEERS = re.compile("steer|servo|lenk")
 DRIVEN = 0.25  # of the largest command: smaller ones say little, friction stops the robot
 STEADY = 0.05  # of the largest speed: by less it changes within `WITHIN` at a steady speed
 WITHIN = 0.5  # [s]
-ENOUGH = 20  # samples at a steady speed; of fewer the largest ratio is taken
-WIDE = 5.0  # the gain's bounds are that many times smaller and larger
+STEADY_SAMPLES = 20  # samples at a steady speed; of fewer the largest ratio is taken
+GAIN_RANGE = 5.0  # the gain's bounds are that many times smaller and larger
 
 
 def pushed(plain: Skeleton, sent: Mapping[str, str], units: Mapping[str, str]) -> Skeleton:
@@ -73,7 +73,7 @@ def with_gain(plain: Skeleton, found: Mapping[str, Guess], log: LogReport) -> Sk
         return plain
     if not (seen := _gain(v, u, log)):
         return plain
-    low, high = sorted((seen / WIDE, seen * WIDE))
+    low, high = sorted((seen / GAIN_RANGE, seen * GAIN_RANGE))
     text = f'{seen:.3g}, "{told[1]}", {low:.2g}, {high:.2g}'
     return replace(plain, params={**plain.params, "gain": text})
 
@@ -96,6 +96,6 @@ def _gain(v: Guess, u: Guess, log: LogReport) -> float:
     changed = np.full(len(speed), np.inf)
     changed[wide:] = np.abs(speed[wide:] - speed[:-wide])
     steady = (changed < STEADY * np.abs(speed).max()) & (np.abs(command) > DRIVEN * most)
-    if steady.sum() >= ENOUGH:
+    if steady.sum() >= STEADY_SAMPLES:
         return float(np.median(speed[steady] / command[steady]))
     return float(np.abs(speed).max() / most)

@@ -27,7 +27,7 @@ SHAPES = (*PATHS, "step", "swing-up")
 FEWEST = 5  # control steps of a target; at most MAX_HORIZON
 FINE = 2000  # number of points of a path
 AROUND = 720  # angles at which a hinge is tried
-NEAR = 1e-6  # of a velocity: two are the same
+SAME_VELOCITY = 1e-6  # of a velocity: two are the same
 CARRIES = 0.02  # of a path's highest rate: a velocity that makes up for less does not carry it
 BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
 
@@ -153,7 +153,7 @@ def _kept(
 
 def _check_end(shape: str, name: str, asked: float, end: float, model: Model) -> None:
     """Raise if a path ends with another velocity than --to asks for."""
-    if abs(end - asked) > NEAR * max(abs(asked), 1.0):
+    if abs(end - asked) > SAME_VELOCITY * max(abs(asked), 1.0):
         unit = model.states[name]
         facts = {"end": f"{end:.3g} {unit}", "hold": int(asked == 0)}
         raise refused("start.follows_path", name, asked=f"{asked:g}", why="ends", rate=1, **facts)
@@ -193,7 +193,7 @@ def _carrying(
         more = x.copy()
         more[:, index[name]] += 1.0
         missed, g = wanted - rate(x), rate(more) - rate(x)
-        size = np.maximum((g**2).sum(axis=1), NEAR)
+        size = np.maximum((g**2).sum(axis=1), SAME_VELOCITY)
         needed = (g * missed).sum(axis=1) / size
         if np.abs(needed * np.sqrt(size)).max() > CARRIES * np.abs(wanted).max():
             found[name] = x[:, index[name]] + needed

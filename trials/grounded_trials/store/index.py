@@ -121,7 +121,7 @@ class KnownCandidate(Candidate):
         return self._read.predicted_inputs
 
 
-KEPT = 2**20  # [bytes] arrays of larger trials are not kept in the index
+KEPT_BYTES = 2**20  # [bytes] arrays of larger trials are not kept in the index
 _VERSION = 5  # of the tables and of the result of `_about`
 _TABLES = """
 CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
@@ -191,7 +191,7 @@ class Index:
             trial, meta, policy = self._read(stored)
             self._write("DELETE FROM worth WHERE name = ?", (name,))
             self._worth.pop(name, None)
-            if trial.states.nbytes + trial.inputs.nbytes < KEPT:
+            if trial.states.nbytes + trial.inputs.nbytes < KEPT_BYTES:
                 blobs = (trial.states.tobytes(), trial.inputs.tobytes())
                 numbers = (name, *blobs, _proof(_stamp(stored.path), *blobs))
                 self._write("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?, ?)", numbers)

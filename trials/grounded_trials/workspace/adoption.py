@@ -48,8 +48,8 @@ from grounded_trials.workspace.where_to_mend import changed_since, in_time_now, 
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/
-SHORT = 0.1  # fraction of a control step: shorter filters and delays make no difference
-SLIGHT = 1e-3  # relative change of a parameter that counts as none
+NEGLIGIBLE_STEP = 0.1  # fraction of a control step: shorter filters and delays make no difference
+NO_CHANGE = 1e-3  # relative change of a parameter that counts as none
 WRITTEN = 1e-6  # relative difference of a value and what is written of it
 
 Effects = Sequence[Mapping[str, Any]]
@@ -132,7 +132,7 @@ def left_behind(diagnosis: Diagnosis) -> dict[str, Moved]:
         name: Moved(called.get(name, name), old, e.value, e.unit)
         for name, e in diagnosis.parameters.items()
         if name not in kept and (old := made.nominal.get(name)) is not None
-        if abs(e.value - old) > SLIGHT * max(abs(old), e.std)
+        if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
     }
 
 
@@ -144,7 +144,9 @@ def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
     known = {effect["name"] for effect in workspace.config.model.effects}
     known |= set(in_time_now(workspace, diagnosis.preflight))
     late = diagnosis.late_sensors.items()
-    return tuple(n for n, own in late if n not in known and max(own.values()) > SHORT * task.dt)
+    return tuple(
+        n for n, own in late if n not in known and max(own.values()) > NEGLIGIBLE_STEP * task.dt
+    )
 
 
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:

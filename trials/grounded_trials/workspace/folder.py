@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.store.index import Index
 
-MANY = 200  # from this number of trials on, an index is used
+INDEXED_FROM = 200  # from this number of trials on, an index is used
 _ID = re.compile(r"c\d{4,}")
 
 
@@ -349,7 +349,7 @@ class Folder:
 
     @property
     def _many(self) -> bool:
-        return len(self.store.list()) >= MANY
+        return len(self.store.list()) >= INDEXED_FROM
 
     def _read_notes(self, broken: list[Damaged] | None) -> Noted:
         return noted(self.notes.read(broken, self._index[0].known if self._many else None))

@@ -29,15 +29,19 @@ from grounded_trials.workspace.user_files.task_file import equal_weights
 if TYPE_CHECKING:
     pass
 
-FEW = 2  # groups of states reported: positions and angles before their rates, then by cost
-MOST = 0.5  # a group with more than this share of the tracking cost is reported in any case
+GROUPS_TOLD = 2  # groups of states reported: positions and angles before their rates, then by cost
+COST_SHARE_TOLD = (
+    0.5  # a group with more than this share of the tracking cost is reported in any case
+)
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
-SLOW = 0.5  # of the highest speed: below it a path's radius is not computed from its samples
+SPEED_OF_RADIUS = (
+    0.5  # of the highest speed: below it a path's radius is not computed from its samples
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,8 +127,8 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
         ranked.append((rates[k], -cost, k))
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
         errors_of[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
-    told = sorted(k for *_, k in sorted(ranked)[:FEW])
-    dear = MOST * sum(cost for _, cost, _ in ranked)
+    told = sorted(k for *_, k in sorted(ranked)[:GROUPS_TOLD])
+    dear = COST_SHARE_TOLD * sum(cost for _, cost, _ in ranked)
     told += [k for _, cost, k in ranked if cost < dear and k not in told]
     return tuple(errors_of[k] for k in told)
 
@@ -229,7 +233,7 @@ def driven(model: Model, columns: Mapping[str, Array], dt: float) -> tuple[float
     speed = np.hypot(*v)
     turn = v[0, :-1] * v[1, 1:] - v[1, :-1] * v[0, 1:]  # speed^2 times the sine of the turn
     both, mean = speed[:-1] * speed[1:], (speed[:-1] + speed[1:]) / 2
-    fast = np.minimum(speed[:-1], speed[1:]) > SLOW * speed.max()
+    fast = np.minimum(speed[:-1], speed[1:]) > SPEED_OF_RADIUS * speed.max()
     rate = np.arcsin(np.clip(turn[fast] / both[fast], -1, 1)) / dt
     with np.errstate(divide="ignore"):
         radius = mean[fast] / np.abs(rate)

@@ -11,8 +11,8 @@ Every number has points for every role, the sum of named evidence:
     motion      the model's steps, among assignments that are left         (`steps`)
 
 `linear_sum_assignment` takes the assignment of most points, so that no guess overwrites another.
-What leads its rivals by `SURE` and rests on more than one unit or an order is sure; the rest is
-listed. A role that no name fits gets a number only if as many fit as there are such roles.
+What leads its rivals by `SURE_LEAD` and rests on more than one unit or an order is sure; the rest
+is listed. A role that no name fits gets a number only if as many fit as there are such roles.
 """
 
 from __future__ import annotations
@@ -57,11 +57,14 @@ from grounded_trials.logs.stated_units import (
     without_role,
 )
 
-LEAST = 2.0  # points from which a number is proposed whatever else there is
-SURE = 1.5  # lead over the next number, to be sure
+POINTS_TO_PROPOSE = 2.0  # points from which a number is proposed whatever else there is
+SURE_LEAD = 1.5  # lead over the next number, to be sure
 LEAD = 0.75  # lead of a number without a name over those that fit worse
-MOST = 20  # largest number of candidates
-FEW, MANY = 8, 60  # most numbers without a name that are tried as rates beside known ones; at all
+MOST_CANDIDATES = 20  # largest number of candidates
+UNNAMED_BESIDE, UNNAMED_AT_ALL = (
+    8,
+    60,
+)  # most numbers without a name that are tried as rates beside known ones; at all
 LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
 AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
 STATED, HOME, POSE, ALIVE, CAP = 1.8, 0.75, 2.2, -3.0, 5.0  # points, see `_Table`
@@ -229,7 +232,7 @@ class _Table:
         for role in self.roles:
             own = of_joint(role.name, role.unit, self.joints, self.log, sent=role.sent)
             self._joint(role.name, own)
-            fits = own or self.points[self.row[role.name]].max(initial=0.0) >= LEAST
+            fits = own or self.points[self.row[role.name]].max(initial=0.0) >= POINTS_TO_PROPOSE
             bare[role.name] = "" if fits else role.unit
         for name, own in in_order(bare, self.joints, self.log).items():
             self._joint(name, own)
@@ -239,7 +242,7 @@ class _Table:
             self.add(name, path, one.points, one.why)
             if one.doubted:
                 self.doubted.add((name, path))
-            if one.points >= NAMED - SURE:
+            if one.points >= NAMED - SURE_LEAD:
                 self.named.add((name, path))
 
     def _at_home(self) -> None:
@@ -259,7 +262,7 @@ class _Table:
                 points += 0.1 * float(np.log10(1 + number.topic.rate_hz))
                 wheels = reckoned.get(_pose(number.path))
                 often = wheels and number.topic.rate_hz >= AS_OFTEN * wheels.topic.rate_hz
-                near = row[self.at[number.path]] > best - SURE
+                near = row[self.at[number.path]] > best - SURE_LEAD
                 if often and near and wheels and number.topic.type.endswith(words.POSES):
                     points += POSE
                     self.add(role.name, number.path, 0, found("start.pose", wheels.topic.topic))
@@ -279,7 +282,7 @@ class _Table:
     def _fitting(self, name: str) -> list[_Number]:
         """Return the numbers that would be proposed for a role."""
         row = self.points[self.row[name]]
-        return [number for number in self.numbers if row[self.at[number.path]] >= LEAST]
+        return [number for number in self.numbers if row[self.at[number.path]] >= POINTS_TO_PROPOSE]
 
     def factor(self, name: str, path: str) -> float:
         """Return the factor from the unit that the log states for a number to a role's."""
@@ -292,7 +295,7 @@ class _Table:
         roles, numbers = self.points.shape
         order = np.outer(np.arange(roles), np.arange(numbers)) - roles * np.arange(numbers)
         gain = self.points + 1e-6 * order  # ties go in the log's order
-        gain = np.where(self.points >= LEAST, gain, -1e6)
+        gain = np.where(self.points >= POINTS_TO_PROPOSE, gain, -1e6)
         rows, columns = linear_sum_assignment(
             np.hstack([gain, np.zeros((roles, roles))]), maximize=True
         )
@@ -327,10 +330,10 @@ class _Table:
         # What a name fits, else what is free, if that is little.
         own = {name: [p for p in self._near(name) if p not in sent] for name in pair}
         bare = [name for name in pair if not own[name]]
-        if len(free) <= (FEW if first else MANY):
+        if len(free) <= (UNNAMED_BESIDE if first else UNNAMED_AT_ALL):
             own |= {name: self._possible(name, free) for name in bare}
         like = self._likes(own[q], own[w], signals)
-        if not (bare or like) and len(free) <= MANY:  # a name may mislead
+        if not (bare or like) and len(free) <= UNNAMED_AT_ALL:  # a name may mislead
             more = self._likes(own[q][:1], self._possible(w, free), signals)
             like |= more
             for path in own[w] if more else ():
@@ -358,8 +361,8 @@ class _Table:
     def _near(self, name: str) -> list[str]:
         """Return the numbers that rival for a role, best first."""
         row = self.points[self.row[name]]
-        order = [k for k in np.argsort(-row, kind="stable") if row[k] >= LEAST]
-        return [self.numbers[k].path for k in order if row[k] > row[order[0]] - SURE]
+        order = [k for k in np.argsort(-row, kind="stable") if row[k] >= POINTS_TO_PROPOSE]
+        return [self.numbers[k].path for k in order if row[k] > row[order[0]] - SURE_LEAD]
 
     def _possible(self, name: str, free: Iterable[_Number]) -> list[str]:
         """Return the numbers without a name whose unit is possible for a role."""
@@ -418,7 +421,7 @@ class _Table:
                         correlation=like.correlation,
                         slope=like.slope,
                     )
-                    self.add(name, path, LEAST + _capped(like), why)
+                    self.add(name, path, POINTS_TO_PROPOSE + _capped(like), why)
                     self.doubted.add((name, path))
 
     def solved(self) -> list[Guess]:
@@ -454,7 +457,7 @@ class _Table:
             if top and sole and len(top) == len(alike) and (said or len(top) == 1):
                 path = top[alike.index(name)]
                 number = self.numbers[self.at[path]]
-                clear = number.command and self.points[self.row[name], self.at[path]] >= SURE
+                clear = number.command and self.points[self.row[name], self.at[path]] >= SURE_LEAD
                 sure = clear or len(lost) == len(left) == 1
                 why = found("start.left", name, numbers=tuple(top), only=True)
                 rest = tuple(p for p in top if p != path)
@@ -477,7 +480,9 @@ class _Table:
         empty = [t.topic for t in self.log.topics if not t.messages]
         empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
         why = (found("start.still", *empty, empty=True),) if empty and role.sent else ()
-        return Guess(role.name, "", "", False, tuple(n.path for n in some)[:MOST], None, why)
+        return Guess(
+            role.name, "", "", False, tuple(n.path for n in some)[:MOST_CANDIDATES], None, why
+        )
 
     def finished(self, guess: Guess) -> Guess:
         """Return a guess with its clock, its range, and the unit that the log states."""
@@ -618,7 +623,7 @@ def _by_steps(
     measured = joint_units(table.joints)
     signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
     moving = [n.path for n in table.numbers if n.moves]
-    signals.read(moving * (len(moving) <= 2 * FEW))
+    signals.read(moving * (len(moving) <= 2 * UNNAMED_BESIDE))
     bare = [
         pair
         for pair in rate_states(model).items()

@@ -10,7 +10,7 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.toml_table import key
 
-FEW = 8  # alternatives listed
+ALTERNATIVES = 8  # alternatives listed
 LESS = 0.8  # of a value: a rounded one below it has two digits
 DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
 
@@ -49,11 +49,11 @@ def mapping_toml(
 
 def _table(kind: str, guess: Guess, clock: str) -> list[str]:
     head = f"[log.{kind}.{key(guess.name)}]"
-    others = f"; or {', '.join(guess.others[:FEW])}" if guess.others else ""
+    others = f"; or {', '.join(guess.others[:ALTERNATIVES])}" if guess.others else ""
     if not guess.path and not guess.others:
         return [f"# {head}  # nothing in the log fits"]
     if not guess.path:
-        rest = f"  # or {', '.join(guess.others[1:FEW])}" * (len(guess.others) > 1)
+        rest = f"  # or {', '.join(guess.others[1:ALTERNATIVES])}" * (len(guess.others) > 1)
         keys = (_scale(guess), _clock(guess, clock), _unwrap(guess.others[0]))
         more = [f"# {line}" for line in keys if line]
         what = f"no name in the log fits; to use one of these, remove all {len(more) + 2} #"

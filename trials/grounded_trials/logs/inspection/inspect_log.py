@@ -47,7 +47,7 @@ GAP = 10.0  # intervals; longer gaps are reported
 SIMULATED_S = 1.0  # [s] header stamps further from the log's clock are simulation time
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 SAME = 0.95  # correlation above which two signals show the same motion
-LEAST = 30  # fewest samples
+FEWEST_SAMPLES = 30  # fewest samples
 REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
 STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
 KINDS = (
@@ -453,7 +453,7 @@ def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
     """Return the correlation of the slower signal with the other one at its stamps."""
     (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
     inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
-    if inside.sum() < LEAST:
+    if inside.sum() < FEWEST_SAMPLES:
         return 0.0
     one, other = ya[inside], np.interp(ta[inside], tb, yb)
     sizes = one.std(), other.std()

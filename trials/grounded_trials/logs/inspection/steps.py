@@ -20,7 +20,7 @@ from itertools import islice, permutations, product
 
 import numpy as np
 
-from grounded.accounts.motion import HALF, MARGIN, Ahead
+from grounded.accounts.motion import HALF_ERROR, MARGIN, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -33,14 +33,14 @@ from grounded_trials.logs.inspection.relations import COMBINATIONS, Signals
 from grounded_trials.logs.stated_units import may_be
 
 STARTS = 120  # samples to predict from
-MANY = 16  # largest number of signals among which positions and rates are sought
+MOST_SIGNALS = 16  # largest number of signals among which positions and rates are sought
 WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
 PIECES = 8  # pieces of the log, evaluated separately
-LEAST = 20  # steps of a piece; short logs have fewer pieces
+PIECE_STEPS = 20  # steps of a piece; short logs have fewer pieces
 BETTER = 0.2  # [nats] lead of the best in a state's squared error: 10 % of the error
 USE = 0.1  # [nats] lead over no input at all
 SCATTER = 2.0  # standard errors over the pieces by which the lead must be significant
-MOST = 0.75  # share of the pieces that must agree
+PIECES_AGREE = 0.75  # share of the pieces that must agree
 TELLS = 0.05  # [nats] with less difference a state does not distinguish assignments
 Pair = tuple[str, str]  # a position and its rate: names, or paths
 Way = tuple[Pair, ...]  # the paths of each pair of states, in order
@@ -97,7 +97,7 @@ def _in_log(guesses: Mapping[str, Guess], said: Way, signals: Signals) -> list[P
     own = {path for pair in said for path in pair if path}
     taken = {guess.path for guess in guesses.values()} - own
     free = [path for path in signals.found if path not in taken]
-    rates = signals.rates(free if len(free) <= MANY else sorted(own))
+    rates = signals.rates(free if len(free) <= MOST_SIGNALS else sorted(own))
     whole = [pair for pair in said if all(pair)]
     return list(dict.fromkeys([*whole, *((q, w) for q, (w, by) in rates.items() if by == 1)]))
 
@@ -175,7 +175,7 @@ def _ahead(
 def _apart_clearly(best: Array, other: Array) -> bool:
     """Check whether errors are clearly smaller, in total and for at least one state."""
     gained = other - best
-    return float(gained.sum()) > MARGIN and float(gained.max()) > -np.log(HALF)
+    return float(gained.sum()) > MARGIN and float(gained.max()) > -np.log(HALF_ERROR)
 
 
 def _given(
@@ -297,7 +297,7 @@ def _left(model: Model, step: float, values: Floats) -> Array:
     good = np.isfinite(np.column_stack([moved, *each])).all(axis=1)
     moved, does = moved[good], np.stack(each)[:, good]
     own = _explained(model, x[:-k][good])
-    pieces = np.array_split(np.arange(len(moved)), max(1, min(PIECES, len(moved) // LEAST)))
+    pieces = np.array_split(np.arange(len(moved)), max(1, min(PIECES, len(moved) // PIECE_STEPS)))
     squared = np.empty((len(pieces), n, 2))
     for i in range(n):
         both = np.column_stack([moved[:, i], *does[:, :, i]])
@@ -346,5 +346,5 @@ def _clearly(best: Array, other: Array) -> bool:
     if not tells.any():
         return False
     gained, used, error = gained[:, tells], used[:, tells], error[tells]
-    sure = (gained.mean(axis=0) > SCATTER * error) & ((gained > 0).mean(axis=0) >= MOST)
+    sure = (gained.mean(axis=0) > SCATTER * error) & ((gained > 0).mean(axis=0) >= PIECES_AGREE)
     return bool(sure.all() and gained.mean(axis=0).min() > BETTER and used.mean(axis=0).min() > USE)

@@ -23,9 +23,9 @@ OTHERS = 60  # largest number of runs drawn behind the compared ones
 LOGS = 4  # largest number of logs drawn if there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # smallest factor at which enlarged deviations are drawn
-MOSTLY = 0.5  # a path with a larger share beyond FAR is left out
+MOSTLY = 0.5  # a path with a larger share beyond ENLARGED_TO is left out
 FLAT = 0.1  # smallest height of a view from the side, as a fraction of its width
-FAR = 0.4  # limit of enlarged deviations, as a fraction of the desired path's size
+ENLARGED_TO = 0.4  # limit of enlarged deviations, as a fraction of the desired path's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def _enlarged(findings: Findings, view: View) -> list[Panel]:
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
         path = near + factor * (view.place(states) - near)
-        off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
+        off = np.abs(path - near).max(axis=1) > ENLARGED_TO * np.ptp(desired, axis=0).max()
         if off.mean() > MOSTLY:
             note = f"{role} outside"
             continue

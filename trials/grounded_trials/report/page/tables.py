@@ -42,7 +42,9 @@ from grounded_trials.wording import (
 )
 from grounded_trials.workspace.last_diagnosis import Since
 
-FEW = 4  # columns of errors from which the table of forecasts has a row for each trial instead
+ROWS_FROM = (
+    4  # columns of errors from which the table of forecasts has a row for each trial instead
+)
 MOST_COLUMNS = 6  # of errors beside a trial; more take a row for each model
 UNKNOWN = "–"
 
@@ -148,7 +150,7 @@ def forecast_table(findings: Findings) -> list[Block]:
     names = [(t.id or t.candidate, words) for t in trials for words, _ in planners]
     errors = [forecast_error(planner, t, ahead) for t in trials for _, planner in planners]
     title = Block("heading", f"Prediction error {ahead:.3g} s ahead, rms")
-    if len(errors) <= max(FEW, model.n):
+    if len(errors) <= max(ROWS_FROM, model.n):
         words = (f"{trial}, {name}" for trial, name in names)
         made = table("forecasts", ("state", "unit", *words), by_state(model, errors))
     else:  # many logs are rows: as columns they left the screen

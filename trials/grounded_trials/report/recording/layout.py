@@ -20,7 +20,7 @@ from grounded_trials.report.findings import Findings
 from grounded_trials.report.scene import Scene
 from grounded_trials.wording import figure, labelled
 
-FAR = 1.1  # distance of the camera, times the size of the contents
+CAMERA_DISTANCE = 1.1  # distance of the camera, times the size of the contents
 TALL = 1.35  # the distance in a view that is higher than wide, times that
 ASIDE = 1.5  # the same for a mechanism, whose parts have a width
 
@@ -49,7 +49,7 @@ class Space:
         import rerun.blueprint as rrb
 
         (centre, extent), up = self._bounds, (0, 0, 1)
-        distance = max(extent, 1e-3) * FAR
+        distance = max(extent, 1e-3) * CAMERA_DISTANCE
         if is_mechanism(self.body):
             direction, distance = np.array([0.0, -1.0, 0.1]), max(extent, 1e-3) * ASIDE
         elif self.scene.volume:

@@ -30,7 +30,7 @@ from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracked, usual_weights
 from grounded_trials.workspace.user_files.config import OFFERED
-from grounded_trials.workspace.user_files.task_file import LEAST
+from grounded_trials.workspace.user_files.task_file import SMALLEST_RANGE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -150,8 +150,10 @@ def drift(values: Array) -> Array:
 
 FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
 UNGIVEN = 3  # largest number of states without a start value that are solved for
-STILL = 1e-3  # the robot is at rest if it moves less than this share of the motion as configured
-NOTHING = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
+AT_REST_SHARE = (
+    1e-3  # the robot is at rest if it moves less than this share of the motion as configured
+)
+ZERO_INPUT = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
@@ -194,14 +196,14 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
     stands[:n] = np.where(base.model.angle_mask, turned, stands[:n])  # no whole turns
     span = np.append(np.ones(n), task.high - task.low)
     span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
-    stands[np.abs(stands) < NOTHING * span] = 0.0
-    if not (np.abs(stands - given) > (MOVED if chosen else NOTHING) * span).any():
+    stands[np.abs(stands) < ZERO_INPUT * span] = 0.0
+    if not (np.abs(stands - given) > (MOVED if chosen else ZERO_INPUT) * span).any():
         return None
     moved = moved_at_start(task, task.past) / task.dt
     rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
     for memory_state, own in true_values(states, states[n:]).items():
         rate[own] = max(rate[own], moved[memory_state], key=abs)
-    told = np.abs(stands - given) > STILL * (1 + np.abs(stands))
+    told = np.abs(stands - given) > AT_REST_SHARE * (1 + np.abs(stands))
     told[n:] = True
     k = int(np.argmax(np.abs(rate)))
     other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
@@ -263,7 +265,7 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
             one = replace(one, target=still, input_target=None, past=u)
             x, u = (row[0] for row in trim(one, np.stack([x, still[1]]), ~free))
             moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
-            if (moved <= STILL * away).all():
+            if (moved <= AT_REST_SHARE * away).all():
                 return np.append(x, u)
     return None
 
@@ -287,11 +289,11 @@ def rest_value(workspace: Folder, at: Mapping[str, float], name: str) -> float:
     logged = {i: names[k] for i, k in true_values(names, names[workspace.task.model.n :]).items()}
     x = np.array([at.get(logged.get(i, own), 0.0) for i, own in enumerate(names)])
     free = np.array([logged.get(i, own) == name for i, own in enumerate(names)])
-    room = NOTHING * NOTHING * (1 + np.abs(task.past))  # the input is held
+    room = ZERO_INPUT * ZERO_INPUT * (1 + np.abs(task.past))  # the input is held
     held = replace(task, start=x, low=task.past - room, high=task.past + room)
     found_at = resting(held, free)
     value = 0.0 if found_at is None else float(found_at[names.index(name)])
-    return value if abs(value) > NOTHING else 0.0
+    return value if abs(value) > ZERO_INPUT else 0.0
 
 
 def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
@@ -402,7 +404,7 @@ def rest_at_end(
         begins, at = start.get(name, 0.0), rest_value(workspace, last, name)
         last[name] = at
         found[name] = np.linspace(begins, at, rows)
-        ranges[name] = np.linspace(min(begins, at - LEAST), at, rows)
+        ranges[name] = np.linspace(min(begins, at - SMALLEST_RANGE), at, rows)
         if (rate := rates.get(name)) is not None and rate not in columns:
             found[rate], ranges[rate] = np.zeros(rows), ranges[name]  # only for its usual weight
     usual = usual_weights(model, {**columns, **ranges})

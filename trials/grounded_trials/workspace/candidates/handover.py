@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
 PROPOSE = NextCommand("propose")
-NEAR = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
+NEAR_BOUND = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
 NEARER = 0.01  # fraction of that range by which a run must approach a bound from its start
 AGREES = 1e-6  # tolerance, relative to an input's size, for a policy to repeat its prediction
 
@@ -344,7 +344,7 @@ class Check:
                 if (
                     np.isfinite(room[t])
                     and room[0] - room[t] > NEARER * far
-                    and room[t] < NEAR * far
+                    and room[t] < NEAR_BOUND * far
                 ):
                     near.append((room[t] / far, name, side, Quantity(room[t], unit), t * task.dt))
         if not near:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.placing import FromStarts
 
 LAST = 3  # recent predictions whose errors are told
-MUCH = 0.2  # share of a cost above which its part due to sensor noise is told
+NOISE_SHARE = 0.2  # share of a cost above which its part due to sensor noise is told
 PLACED = 0.02  # share of a predicted utility: where runs began is told if it changes more
 STATES = 3  # target states whose range is told; final values of models with 8 states at most
 ENDS = 8
@@ -146,7 +146,7 @@ def so_far(made: Candidate, best: Tried, missed: float) -> Finding:
 
 def much_noise(noise: float, utility: float) -> float | None:
     """Return how much of a logged run's cost is due to sensor noise, if it is much."""
-    return min(noise, -utility) if noise > MUCH * -utility else None
+    return min(noise, -utility) if noise > NOISE_SHARE * -utility else None
 
 
 def predicted(made: Candidate, cost: float, whole: float, begun: FromStarts | None) -> Finding:

@@ -30,7 +30,9 @@ from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.adapters.stepper import library
 
 Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
-STILL = 2e-3  # relative change of a joint's inertia with the pose below which it is constant
+INERTIA_CONSTANT = (
+    2e-3  # relative change of a joint's inertia with the pose below which it is constant
+)
 POSES = 8  # poses at which that is looked at
 HINGE, SLIDE, JOINT = 3, 2, 0  # mjtJoint, mjTRN_JOINT
 
@@ -150,7 +152,7 @@ class Held:
             mj.mj_solveM(model, data, row[None], unit)
         own = pushed[0, dof]
         apart = np.abs(pushed - own * unit).max()
-        return float(1 / own) if apart < STILL * own else 0.0
+        return float(1 / own) if apart < INERTIA_CONSTANT * own else 0.0
 
     def _called(self, kind: str, index: int) -> str:
         name = self.mj.mj_id2name(self.file, _object(self.mj, kind), index)

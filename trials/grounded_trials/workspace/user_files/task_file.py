@@ -131,10 +131,10 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 SHAPE = NextCommand("target", ("SHAPE",))
 ROW_LIMIT = MAX_HORIZON + 2  # of target.csv; a longer one is not read to its end
-LEAST = 0.1  # smallest range of a target column used for its weight
-# a column counts as constant if its range is below STILL of its size (of LEAST if that is less), or
-# below HARDLY in its unit
-STILL, HARDLY = 0.01, 1e-4
+SMALLEST_RANGE = 0.1  # smallest range of a target column used for its weight
+# a column counts as constant if its range is below STILL_SHARE of its size (of SMALLEST_RANGE if
+# that is less), or below HARDLY in its unit
+STILL_SHARE, HARDLY = 0.01, 1e-4
 RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
 NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
 UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
@@ -288,7 +288,7 @@ def equal_weights(
     together: Collection[str] = (),
     rates: Collection[str] = (),
 ) -> dict[str, float]:
-    """Return weights by which an error as large as a column's range (at least LEAST) costs 1.
+    """Return weights by which an error as large as a column's range costs 1.
 
     That of a velocity beside its position costs RATE: its noise is a larger part of its range, and
     a plan would leave the path for the sake of the speed.
@@ -314,7 +314,7 @@ def equal_weights(
         size[unit] = max(size.get(unit, 0.0), own or float(np.abs(columns[name]).max()))
     rest = {*without_range(columns, units)}
     widths = {
-        name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), LEAST)
+        name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), SMALLEST_RANGE)
         for name, own in ranges.items()
     }
     return {name: (RATE if name in rates else 1.0) * w**-2 for name, w in widths.items()}
@@ -323,7 +323,11 @@ def equal_weights(
 def range_of(values: Array) -> float:
     """Return the range of a target column, 0 if it hardly moves (from 0.02591 to 0.0259 rad)."""
     own = float(np.ptp(values))
-    return own if own > max(STILL * min(float(np.abs(values).max()), LEAST), HARDLY) else 0.0
+    return (
+        own
+        if own > max(STILL_SHARE * min(float(np.abs(values).max()), SMALLEST_RANGE), HARDLY)
+        else 0.0
+    )
 
 
 def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:

@@ -19,7 +19,7 @@ import numpy as np
 from grounded.accounts.sent import (
     EXACT,
     FINE,
-    LEAST,
+    STEPS_TO_JUDGE,
     WINDOWS,
 )
 from grounded.frozen import Array
@@ -58,7 +58,7 @@ class ActedOn:
         An input at its limits most of the time leaves few.
         """
         few = self.told.sum() >= FEW and float(self.off[self.told].max()) < EXACT
-        return bool(few or self.told.sum() >= LEAST)
+        return bool(few or self.told.sum() >= STEPS_TO_JUDGE)
 
     @property
     def exact(self) -> bool:
@@ -89,7 +89,7 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
         The differences; None if the log can't be cut there, or is too short.
     """
     trial = log.trial_from(start)
-    if trial is None or (T := min(trial.finite_steps, policy.horizon)) < LEAST:
+    if trial is None or (T := min(trial.finite_steps, policy.horizon)) < STEPS_TO_JUDGE:
         return None
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
     past = policy.past if trial.start_inputs is None else trial.start_inputs

@@ -20,7 +20,7 @@ from grounded_trials.logs.stated_units import LENGTHS, bare_command, is_angle, u
 UNNAMED = ("data", "value")  # field names without meaning: the topic is the name
 PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
 ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest to each component
-SMALL = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
+SMALL_ANGLE_SCALE = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
 
 
 def crossed(model: Model, mapping: LogMapping) -> list[Finding]:
@@ -91,7 +91,7 @@ def no_angles(model: Model, mapping: LogMapping | None) -> list[Finding]:
     for name, one in (mapping.states if mapping else {}).items():
         part = PART.search(one.path)
         angle = name in model.angles or model.states.get(name) in ("rad", "deg")
-        if part and angle and abs(one.scale) != SMALL:
+        if part and angle and abs(one.scale) != SMALL_ANGLE_SCALE:
             instead = f"{one.path[: part.end(1)]}.@rpy.{ABOUT[part[2]]}"
             what = "a part of a quaternion"
             some.append(found("log.path", name, path=one.path, what=what, instead=instead))

@@ -39,10 +39,12 @@ from grounded_trials.toml_table import Table
 FINEST = 8  # largest number of smoother rows in a control step
 PIECE_S, PIECE = 5.0, 100  # least length of the pieces that are smoothed in parallel [s], rows
 OVERLAP_S, OVERLAP = 1.5, 30  # least overlap of the pieces on each side [s], rows
-LEAST = 3  # smallest number of rows that can be smoothed
+FEWEST_ROWS = 3  # smallest number of rows that can be smoothed
 MARGIN_S = 0.5  # time after the last change of a command that still counts as motion [s]
-WIDE = 10.0  # std of an initial state, relative to the state's size
-STILL = 0.02  # std of the state of a robot that waits at a run's start, relative to the same
+START_SPREAD = 10.0  # std of an initial state, relative to the state's size
+WAITING_SPREAD = (
+    0.02  # std of the state of a robot that waits at a run's start, relative to the same
+)
 EXACT = 1e-3  # relative tolerance for a step to be a multiple of a simulator's own
 ANGLE = 1.0  # largest std of an initial angle [rad]: an angle half a turn off may fit as well
 SIZED = 256  # instants at which the size of states is computed
@@ -189,7 +191,7 @@ def _records(
     return [
         Record(times[a:b], measured[a:b], command_times, commands, past)
         for a, b in zip(edges[::2], edges[1::2], strict=True)
-        if b - a >= LEAST and np.isfinite(measured[a:b]).any(axis=0).all()
+        if b - a >= FEWEST_ROWS and np.isfinite(measured[a:b]).any(axis=0).all()
     ]
 
 
@@ -197,7 +199,7 @@ def _sizes(samples: Sequence[Samples], task: Task) -> Array:
     """Estimate the size of states, (n,), from the changes of measured ones they cause in a step.
 
     It is 1 for measured states, and for states that no measured one depends on, but at most
-    ANGLE / WIDE for an angle that does not wrap: wheels hardly turn a car that stands, as here.
+    ANGLE / START_SPREAD for an angle that does not wrap: wheels hardly turn a car that stands.
     """
     model, n = task.model, task.model.n
     own = [model.state_names.index(s.name) for s in samples]
@@ -216,7 +218,7 @@ def _sizes(samples: Sequence[Samples], task: Task) -> Array:
     sizes = np.where(np.isfinite(sizes), sizes, 1.0)
     for i, (name, unit) in enumerate(model.states.items()):
         if unit == "rad" and i not in own and name not in model.angles:
-            sizes[i] = min(sizes[i], ANGLE / WIDE)
+            sizes[i] = min(sizes[i], ANGLE / START_SPREAD)
     return sizes
 
 
@@ -229,7 +231,7 @@ def _smoothed(
     model, known = task.model, np.array(list(table.measured.values()))
     measurement = of_states(model, list(table.measured))
     options = {"latency": task.latency, "measurement": measurement}
-    records = [replace(record, start_std=WIDE * sizes) for record in records]
+    records = [replace(record, start_std=START_SPREAD * sizes) for record in records]
 
     def fitted(records: list[Record]) -> NoiseStd:
         found = noise_of(model, _moving(records), known=known, sizes=sizes, **options)  # type: ignore[arg-type]
@@ -241,8 +243,12 @@ def _smoothed(
     noise = fitted(records)
     first = records[0]
     if np.any(task.latency) and np.any(first.past != task.past):
-        std = np.tile(WIDE * sizes, (len(first.times), 1))  # of pieces of it that begin later
-        std[0, [name not in table.measured for name in model.state_names]] *= STILL / WIDE
+        std = np.tile(
+            START_SPREAD * sizes, (len(first.times), 1)
+        )  # of pieces of it that begin later
+        std[0, [name not in table.measured for name in model.state_names]] *= (
+            WAITING_SPREAD / START_SPREAD
+        )
         held = replace(first, past=task.past)
         rivals = [first, held, replace(held, start=task.start, start_std=std)]
         begun = [next(_overlapping(one))[0] for one in rivals]
@@ -285,7 +291,7 @@ def _moving(records: Sequence[Record]) -> list[Record]:
     found = []
     for record in records:
         rows = np.flatnonzero((record.times >= first) & (record.times <= last))
-        if len(rows) >= LEAST:
+        if len(rows) >= FEWEST_ROWS:
             found.append(part(record, int(rows[0]), int(rows[-1])))
     pieces = [piece for record in found or records for piece in cut(record, span)]
     return [piece for piece in pieces if np.isfinite(piece.measured).any(axis=0).all()]

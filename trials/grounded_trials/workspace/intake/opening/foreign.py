@@ -62,8 +62,8 @@ from grounded_trials.workspace.where_to_mend import hashed, read_by, twice_in_ti
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
-SLIGHT = 0.002  # of a control step, by which interpolated states may be early
-FEW = 12  # largest number of a log's signals that a message lists
+EARLY_SHARE = 0.002  # of a control step, by which interpolated states may be early
+SIGNALS_LISTED = 12  # largest number of a log's signals that a message lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,7 +312,7 @@ def _unmapped(
 ) -> GroundedError:
     """Return the error for a state or an input that [log] does not map."""
     numbers = inspect_log(path, mapping.layout).moving
-    few = {"path": path.name, "numbers": tuple(numbers) if len(numbers) <= FEW else None}
+    few = {"path": path.name, "numbers": tuple(numbers) if len(numbers) <= SIGNALS_LISTED else None}
     if name in model.input_names:
         return refused("log.no_signal", name, what="input", **few)
     if estimated:
@@ -391,7 +391,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     trial, grid = log.cut(candidate, start)
     facts = about(log.workspace, candidate) | log.source
     facts |= {ROWS: f"{grid.row_s:.6g}"} if grid.row_s and not candidate else {}
-    early = grid.interpolated_s / trial.dt > SLIGHT
+    early = grid.interpolated_s / trial.dt > EARLY_SHARE
     facts |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
     encoded = encode(log.workspace, trial, facts, grid.start_ns)
     remarks = [one for file in log_files(log.path) for one in about_table(file).findings]

@@ -23,10 +23,10 @@ import numpy as np
 from grounded.accounts.sent import EXACT as TO_DIGITS
 from grounded.accounts.sent import (
     FINE,
-    LEAST,
     RESEMBLES,
     SAME,
     SLIGHT,
+    STEPS_TO_JUDGE,
     UNLIKE,
     follows,
 )
@@ -48,7 +48,7 @@ KNOWN = 0.25  # largest std, in rows, with which feedback determines the start w
 EXACT = 0.1  # share of the effect of a late row below which the logged states were the policy's
 SOUGHT = 24  # number of instants at which samples of different ages are tried
 QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
-SHORT = 4  # at least 1 / SHORT of a run must be in the log
+LOGGED_PART = 4  # at least 1 / LOGGED_PART of a run must be in the log
 BATCH = 256  # instants compared at once
 
 
@@ -172,7 +172,9 @@ class Recording:
 
     def _rival(self, found: Start, others: Sequence[Start]) -> float | None:
         """Return the likeliest of the other starts far from the one found [s], or None."""
-        apart = [one for one in others if abs(one.seconds - found.seconds) > LEAST * self.dt]
+        apart = [
+            one for one in others if abs(one.seconds - found.seconds) > STEPS_TO_JUDGE * self.dt
+        ]
         return min(apart, key=lambda one: one.apart).seconds if apart else None
 
     def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
@@ -187,7 +189,7 @@ class Recording:
             """Return the median difference of the first commands; infinite if they don't move."""
             fit = acted_on(self, policy, at)
             told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
-            if fit is None or len(told) < LEAST:
+            if fit is None or len(told) < STEPS_TO_JUDGE:
                 return np.inf
             moves = bool((np.ptp(fit.asked[told], axis=0) > RESEMBLES * fit.size).any())
             return float(np.median(fit.off[told])) if moves else np.inf
@@ -217,7 +219,7 @@ class Recording:
         tried = [first - k * self.dt for k in range(1, MISSED + 1)]
         k = int(np.argmin(self._misfits(policy, tried)))
         there, least = acted_on(self, policy, tried[k]), UNLIKE * (usual.left if usual else 0.0)
-        if there is None or there.told.sum() < LEAST or there.left > max(least, TO_DIGITS):
+        if there is None or there.told.sum() < STEPS_TO_JUDGE or there.left > max(least, TO_DIGITS):
             return None
         return Start(tried[k], found.apart if found else np.inf, True, True, missed=k + 1)
 
@@ -265,7 +267,9 @@ class Recording:
     def _misfits(self, policy: Policy, starts: Sequence[float]) -> list[float]:
         """Return the mean difference of the commands from each start on, in units of their size."""
         found = [self.trial_from(start) for start in starts]
-        trials = {k: one for k, one in enumerate(found) if one and one.finite_steps >= LEAST}
+        trials = {
+            k: one for k, one in enumerate(found) if one and one.finite_steps >= STEPS_TO_JUDGE
+        }
         misfits = [np.inf] * len(found)
         if not trials:
             return misfits
@@ -299,7 +303,7 @@ class Recording:
         if late is None or early is None:
             return start, 0.0
         T = min(late.finite_steps, early.finite_steps, policy.horizon)
-        if T < LEAST:
+        if T < STEPS_TO_JUDGE:
             return start, 0.0
         states = np.stack([late.states[:T], early.states[:T]])
         asked, before = policy.commands(states, policy.past)
@@ -421,7 +425,7 @@ def instants_apart(
 
 def least_of(horizon: int) -> int:
     """Return the number of steps at the beginning that identify a run."""
-    return max(LEAST, horizon // SHORT)
+    return max(STEPS_TO_JUDGE, horizon // LOGGED_PART)
 
 
 def _off(

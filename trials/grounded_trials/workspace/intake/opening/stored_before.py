@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
-LEAST = 10  # rows that two recordings must share to count as the same
+SHARED_ROWS = 10  # rows that two recordings must share to count as the same
 
 
 def refuse_as_another(
@@ -223,7 +223,7 @@ def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
     before = one.measured
     names = (before.state_names, before.input_names)
     rows = min(before.finite_steps, here.finite_steps) - EDGE
-    if rows < LEAST or names != (here.state_names, here.input_names):
+    if rows < SHARED_ROWS or names != (here.state_names, here.input_names):
         return "none"
     guessed = one.meta.get("estimated", "").split(",")
     known = [i for i, name in enumerate(here.state_names) if name not in guessed]

@@ -20,11 +20,11 @@ from grounded.accounts.returned import Suspicion, suspicion
 from grounded.accounts.sent import (
     DECISIVE,
     EXPLAINED,
-    FEW,
     FINE,
     LATEST,
-    LEAST,
     RESEMBLES,
+    STEPS_ALIKE,
+    STEPS_TO_JUDGE,
     Following,
     evidence,
     follows,
@@ -287,25 +287,26 @@ def fall_in(
     Returns:
         The steps of the run before it failed, and the finding.
         None if the commands are the candidate's to the end, or never were; if the run was inside
-        [safety] for `LEAST` steps before and after they ceased to be; or if it was almost complete.
+        [safety] for `STEPS_TO_JUDGE` steps before and after they ceased to be; or if it was almost
+        complete.
     """
     ceased = None if ran is None else _ceased(task, trial, ran)
-    if ceased is None or ceased < LEAST:
+    if ceased is None or ceased < STEPS_TO_JUDGE:
         return None
     assert task.safety_low is not None and task.safety_high is not None
     whole = interpolate_gaps(trial).trial
     states = whole.states[: whole.finite_steps + 1]
     beyond = np.maximum(task.safety_low - states, states - task.safety_high)
     out = beyond.max(axis=1) > 0
-    begin = max(0, ceased - LEAST)
-    about = out[begin : ceased + LEAST + 1]
+    begin = max(0, ceased - STEPS_TO_JUDGE)
+    about = out[begin : ceased + STEPS_TO_JUDGE + 1]
     if not about.any():
         return None
     first = begin + int(np.argmax(about))
     inside = np.flatnonzero(~out[:first])
     first = int(inside[-1]) + 1 if len(inside) else 0
     steps = min(first, ceased)
-    if steps < LEAST or steps + LAST >= task.horizon:
+    if steps < STEPS_TO_JUDGE or steps + LAST >= task.horizon:
         return None
     i = int(np.argmax(beyond[first]))
     state, unit = list(task.model.states.items())[i]
@@ -334,6 +335,6 @@ def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
     moves = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > ran.fine).any(axis=1))
     held = int(moves[-1]) + 1 if len(moves) else 0
     before, after = (float((part**2).mean()) for part in (off[: max(held, 1)], off[held:]))
-    if T - held >= FEW and after > max(EXPLAINED**2, 4 * before):
+    if T - held >= STEPS_ALIKE and after > max(EXPLAINED**2, 4 * before):
         return held
     return None if ran.alike else round(ran.until_s / task.dt)

@@ -18,8 +18,8 @@ import numpy as np
 
 from grounded.accounts.sent import (
     LATEST,
-    LEAST,
     RESEMBLES,
+    STEPS_TO_JUDGE,
     UNLIKE,
     Following,
     as_sent,
@@ -119,7 +119,7 @@ def steps_skipped(task: Task, own: Candidate, trial: Trial) -> Finding | None:
     """
     policy = own.policy
     T = min(trial.finite_steps, policy.horizon)
-    if T < LEAST:
+    if T < STEPS_TO_JUDGE:
         return None
     run = commanded(policy, trial)
     sent, asked, past, size = run.sent, run.asked, run.past, run.size
@@ -132,7 +132,7 @@ def steps_skipped(task: Task, own: Candidate, trial: Trial) -> Finding | None:
     tells = (np.abs(after - asked[:-1]) > np.maximum(CHANGES * size, finest)).any(axis=1)
     changed = np.flatnonzero(moved.any(axis=1))
     held = tells & ~moved.any(axis=1)
-    if min(tells.sum(), len(changed)) < LEAST or held.sum() < LOST * tells.sum():
+    if min(tells.sum(), len(changed)) < STEPS_TO_JUDGE or held.sum() < LOST * tells.sum():
         return None
     every = float(np.median(np.diff(changed)))
     if every < 2:
@@ -149,7 +149,7 @@ def _unsent(off: Array, held: Array) -> int:
         held: (T, m) differences from what was held before the run.
     """
     begins = int(np.argmax((held > CHANGES).any(axis=1)))
-    if not UNSENT < begins < len(off) - LEAST:
+    if not UNSENT < begins < len(off) - STEPS_TO_JUDGE:
         return 0
     lacking, sent = (
         float(np.median(off[part].max(axis=1))) for part in (slice(begins), slice(begins, None))

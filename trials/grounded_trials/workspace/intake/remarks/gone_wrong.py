@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.accounts.sent import LEAST, as_planned, like_predicted
+from grounded.accounts.sent import STEPS_TO_JUDGE, as_planned, like_predicted
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.frozen import median
@@ -39,10 +39,12 @@ from grounded_trials.workspace.last_diagnosis import diagnosable
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
 
-FAR = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
-NEAR = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
+SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
+NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
-END = LEAST // 2  # last steps, in most of which a state has to be that far off: noise is not
+END = (
+    STEPS_TO_JUDGE // 2
+)  # last steps, in most of which a state has to be that far off: noise is not
 
 
 def gone_wrong(
@@ -58,7 +60,7 @@ def gone_wrong(
     """
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
     missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
-    astray = missed > FAR * usual
+    astray = missed > SIGN_ASKED_FROM * usual
     run = trial.until(workspace.task.horizon) if trial.candidate else trial
     if tried is None or not as_planned(tried.candidate, run):
         from grounded.search.run_motion import reversed_input
@@ -70,7 +72,7 @@ def gone_wrong(
     ran, each = tried.candidate.id, zip(tried.trials, tried.utilities, strict=True)
     same = {one.id: -u for one, u in each if one.id != trial.id and math.isfinite(u)}
     cost, most = -workspace.task.utility(trial), max(same.values(), default=math.inf)
-    if most > 0 and FAR * most < cost < math.inf:
+    if most > 0 and SIGN_ASKED_FROM * most < cost < math.inf:
         one = found("run.astray", ran=ran, trial=trial.id, cost=cost, times=cost / most)
         return one.also(others=tuple(same))
     if others and astray and STRAYED * usual < missed < math.inf:
@@ -144,13 +146,15 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
         own: the candidate that was run.
         run: its run, shorter than the task.
     """
-    if run.finite_steps < max(run.steps, 2 * LEAST) or not like_predicted(own, run):
+    if run.finite_steps < max(run.steps, 2 * STEPS_TO_JUDGE) or not like_predicted(own, run):
         return False
     said = own.predicted_states
     off = np.abs(task.model.difference(run.states, said[: len(run.states)]))
-    known = np.maximum(GROWN * off[:-LEAST].max(axis=0), NEAR * np.ptp(said, axis=0))
+    known = np.maximum(GROWN * off[:-STEPS_TO_JUDGE].max(axis=0), NO_CRASH * np.ptp(said, axis=0))
     end = median(off[-END:])
-    soon = 2 * run.states[-1] - run.states[-1 - LEAST]  # as many steps later, at the same rate
+    soon = (
+        2 * run.states[-1] - run.states[-1 - STEPS_TO_JUDGE]
+    )  # as many steps later, at the same rate
     assert task.safety_low is not None and task.safety_high is not None
     inside = [((x >= task.safety_low) & (x <= task.safety_high)).all() for x in run.states]
     inside.append(((soon >= task.safety_low) & (soon <= task.safety_high)).all())

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.sent import LEAST
+from grounded.accounts.sent import STEPS_TO_JUDGE
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.search.scatter import Repeats, sample_noise
@@ -21,7 +21,7 @@ from grounded_trials.workspace.candidates.search_state import standing_without
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.placing import FEWEST, placing
 
-SURE = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
+START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
 # share of the run's cost by which the start changes it: told, and too much to count; and that
 # while too few other runs tell how the robot is placed
 TOLD, SPOILT, UNKNOWN = 0.05, 0.2, 0.5
@@ -46,7 +46,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     own, _ = workspace.candidate(trial.candidate)
     states = _inside(task, trial.states[: trial.finite_steps + 1])
     noise = sample_noise(trial.until(len(states) - 1), own.predicted_states)
-    far = np.flatnonzero(np.abs(off) > np.maximum(SURE * noise, 1e-9))
+    far = np.flatnonzero(np.abs(off) > np.maximum(START_IS_OFF * noise, 1e-9))
     if not len(far):
         return None
     cost = abs(task.utility(trial))
@@ -59,7 +59,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
         return None
     placed, whole = placing(workspace, but=trial.id), _changes(workspace, trial, off)
     unknown = max(placed.runs) < FEWEST
-    usual = np.abs(off) <= SURE * np.nan_to_num(placed.rms)
+    usual = np.abs(off) <= START_IS_OFF * np.nan_to_num(placed.rms)
     most = (UNKNOWN if unknown else SPOILT) * cost
     facts = {
         "ran": trial.candidate,
@@ -89,7 +89,7 @@ def _inside(task: Task, states: Array) -> Array:
     """Return the states before they left [safety], at least a few; all if they never did."""
     assert task.safety_low is not None and task.safety_high is not None
     out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=1)
-    return states[: max(int(np.argmax(out)), LEAST)] if out.any() else states
+    return states[: max(int(np.argmax(out)), STEPS_TO_JUDGE)] if out.any() else states
 
 
 def _to_repeat(workspace: Folder, trial: Trial) -> bool:
