@@ -40,7 +40,7 @@ def test_few_candidates_are_the_first_the_improvements_and_the_latest():
 
 def test_a_report_reads_few_of_many_trials_and_its_numbers_are_the_same(learnt, monkeypatch):
     whole = gathering.gather(learnt)
-    for name, most in (("MOST", 1), ("KEPT", 2), ("LOGS", 2)):
+    for name, most in (("MOST_RUNS", 1), ("IMPROVEMENTS_READ", 2), ("LOGS", 2)):
         monkeypatch.setattr(gathering, name, most)
     part = gathering.gather(learnt)
     assert whole.left_runs == whole.left_logs == 0

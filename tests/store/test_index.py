@@ -40,14 +40,14 @@ def made(tmp_path_factory):
 @pytest.fixture
 def indexed(made, monkeypatch):
     """Small enough for a test, large enough for the index."""
-    monkeypatch.setattr(folder_module, "MANY", 100)
+    monkeypatch.setattr(folder_module, "INDEXED_FROM", 100)
     file = made.store.folder / ".index.sqlite"
     file.unlink(missing_ok=True)
     return made, file
 
 
 def plainly(made, monkeypatch):
-    monkeypatch.setattr(folder_module, "MANY", 10**6)
+    monkeypatch.setattr(folder_module, "INDEXED_FROM", 10**6)
     return Workspace(made.folder)
 
 
