@@ -50,6 +50,20 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     assert found.then.verb == "propose"
 
 
+@pytest.mark.parametrize(("share", "code"), [(-0.9, "run.start_spoils"), (0.9, "run.start")])
+def test_a_run_that_is_better_from_either_start_counts(w, monkeypatch, share, code):
+    """`share` of its cost is what its start has lost, or won if below 0."""
+    worse = run(w)
+    ingest_log(w, worse)
+    worse, better = (read_trial(file)[0] for file in (worse, run(w)))
+    utility = w.task.utility(better)
+    assert utility > w.task.utility(worse)
+    monkeypatch.setattr(initial_state, "_changes", lambda *_: share * utility)
+    moved = np.array(better.states)
+    moved[0, 0] += 0.01
+    assert initial_state.begun_elsewhere(w, replace(better, states=moved)).code == code
+
+
 def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, tmp_path):
     ran, *_ = read_trial(run(w))
     for off in (0.01, -0.01, 0.9):

@@ -1,7 +1,8 @@
 """Tell of a run that started away from [task] start, and whether that spoils its utility.
 
 By how much a start changes the utility, the model says: it runs the candidate from there and from
-s_0. A run whose utility it changes much says nothing about its candidate, and must be run again.
+s_0. A run whose utility it changes much says nothing about its candidate, and must be run again;
+unless it is better than the best from either start.
 """
 
 from __future__ import annotations
@@ -68,7 +69,10 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     }
     facts |= {"change": whole} if abs(whole) > least else {}
     names = tuple(task.model.state_names[i] for i in told)
-    if any(each[i] > most and not usual[i] for i in told):
+    best = standing_without(workspace, {trial.id}).incumbent
+    lead = np.nan if best is None else task.utility(trial) - best.utility
+    stands = min(lead, lead - whole) > 0  # better than the best from either start
+    if any(each[i] > most and not usual[i] for i in told) and not stands:
         return found("run.start_spoils", *names, **facts)
     repeats = _to_repeat(workspace, trial)
     if usual[told[0]] and not repeats:
