@@ -175,7 +175,7 @@ def test_the_span() -> None:
     with pytest.raises(GroundedError, match="0 steps"):
         grid(x, u, span=Span(1.0, 0.5))
     late = grid(pose(np.sin), command(-1.0))
-    assert late.late_s == pytest.approx(0.495, abs=0.001) and of_code(late, "file.vanished")
+    assert late.late_s == pytest.approx(0.5, abs=0.001) and of_code(late, "file.vanished")
 
 
 def driven(rows: np.ndarray, every: float, **spec: object) -> Series:

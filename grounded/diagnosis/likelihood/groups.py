@@ -48,8 +48,8 @@ class Signals:
         self.names, self.named = tuple(names), np.array(named)
         self.lengths = np.array([len(one) for one in each])
         self.means = np.stack([_tenths(one) for one in each])  # (S, TENTHS, k)
-        self.spread = self.means.var(axis=(0, 1))
-        self.moves = self.spread > 1e-9 * (self.means**2).mean(axis=(0, 1))
+        self.power = (self.means**2).mean(axis=(0, 1))
+        self.moves = self.means.var(axis=(0, 1)) > 1e-9 * self.power
 
     def group_of(self) -> Any:
         """Return the group of each trial, (S,) of int: alike, directly or by way of others."""
@@ -66,7 +66,7 @@ class Signals:
     def _like(self, i: int) -> Any:
         """Return which trials belong to the same group as trial i, (S,) of bool."""
         apart = 0.5 * ((self.means - self.means[i]) ** 2).mean(axis=1)
-        same = (apart <= REPEATS * self.spread)[:, self.moves].all(axis=1)
+        same = (apart <= REPEATS * self.power)[:, self.moves].all(axis=1)
         longer = np.maximum(self.lengths, self.lengths[i])
         same &= longer <= (1 + ALIKE) * np.minimum(self.lengths, self.lengths[i])
         named = (self.named != "") | (self.named[i] != "")

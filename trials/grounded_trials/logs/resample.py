@@ -168,7 +168,7 @@ def to_grid(
         if how[name] == "linear":
             samples[name].check_linear(dt)
     known, until = _extent(samples, states, inputs, dt)
-    origin = min(s.first_stamp for s in samples.values())
+    origin = min(s.first_stamp if s.spec.before is None else _begun(s) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
     whole = dict(samples)
     for name, value in zip(inputs, [] if past is None else past, strict=False):
@@ -287,6 +287,11 @@ def _extent(
     return max(first), min(last)
 
 
+def _begun(samples: Samples) -> int:
+    """Return the stamp of the first sample in the log [ns], behind the one that `before` adds."""
+    return int(samples.t[0 if samples.spec.before is None else 1])
+
+
 def _start(
     span: Span,
     series: Mapping[str, Series],
@@ -295,14 +300,20 @@ def _start(
     known: int,
     origin: int,
 ) -> tuple[int, float]:
-    """Return t = 0 [ns], and by how much it was moved because a state was not known yet [s]."""
+    """Return t = 0 [ns], and by how much it was moved because a state was not known yet [s].
+
+    A start that is moved is at a sample, a given one may be a little before the first (`slack`).
+    """
     if isinstance(span.start, Crossing):
         start = _crossing(span.start, series[START], "start", None)
     elif isinstance(span.start, str):
-        start = max(int(samples[name].t[0]) for name in inputs)
+        start = max(_begun(samples[name]) for name in inputs)
     else:
         start = _time(span.start, origin)
-    return max(start, known), max(0.0, (known - start) * 1e-9)
+    if start >= known:
+        return start, 0.0
+    first = max(int(samples[name].t[0]) for name in samples if name not in inputs)
+    return first, (first - start) * 1e-9
 
 
 def _end(span: Span, series: Mapping[str, Series], start: int, origin: int, until: int) -> int:
