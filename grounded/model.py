@@ -32,9 +32,8 @@ ROLES = (
     *("steering_angle", "hanging", "upright", "level", "rail"),
 )
 BELIEVED = 3.0  # prior standard deviations (as given by the user) that a parameter may move
-SMALLEST_SHARE = (
-    0.2  # smallest fraction of its value, without a bound towards zero: the sign is known
-)
+# smallest fraction of its value, without a bound towards zero: the sign is known
+SMALLEST_SHARE = 0.2
 MAX_SIZE = 200  # states plus inputs: the cost of a step grows with the cube of this number
 
 

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
-FOLDED_FIELDS = (
-    9  # constant fields of one array (an IMU's covariance has 9) that are folded into one line
-)
+# constant fields of one array (an IMU's covariance has 9) that are folded into one line
+FOLDED_FIELDS = 9
 
 
 @click.command("inspect")

@@ -24,9 +24,8 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 STEPS_TO_JUDGE = 10  # smallest number of steps that can be judged
-STEPS_ALIKE = (
-    5  # smallest number of steps that are alike and not at the limits, in which others are too
-)
+# smallest number of steps that are alike and not at the limits, in which others are too
+STEPS_ALIKE = 5
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 DECISIVE = 8.0  # [nats] of evidence that another candidate ran

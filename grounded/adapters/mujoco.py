@@ -62,9 +62,8 @@ from grounded.model import Model
 SHIFT = 1e-6  # relative step of the forward differences, as in mjd_transitionFD
 CHUNK = 4096  # samples stepped in one call
 EXACT = 1e-6  # relative tolerance for a control step that is a multiple of the simulation's step
-TIMESTEP_FIT = (
-    1e-3  # relative change of the simulation's step that may be made to fit the control step
-)
+# relative change of the simulation's step that may be made to fit the control step
+TIMESTEP_FIT = 1e-3
 MOST_THREADS, SHARED = 8, 64  # most threads; samples from which on threads are used
 MOST_COPIES = 20  # most copies of the model with other parameters at a time
 PRIVATE = ("_lock", "_data", "_base", "_copies", "_pools")  # attributes private to a process

@@ -40,9 +40,8 @@ from grounded.frozen import Array
 
 SWEEPS = 20  # most sweeps
 TRACK_SETTLED = 1e-2  # change of the track, in standard deviations, at which sweeps end,
-LIKELIHOOD_SETTLED = (
-    1e-3  # [nats] or change of the likelihood; at a kink a track may alternate for ever,
-)
+# [nats] or change of the likelihood; at a kink a track may alternate for ever,
+LIKELIHOOD_SETTLED = 1e-3
 ACCEPTED_AFTER_SWEEPS = 0.05  # [nats] so this change is accepted after SWEEPS
 
 

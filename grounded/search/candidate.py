@@ -33,14 +33,12 @@ Slopes = Literal[
     "original, corrected",
 ]
 
-DOUBTFUL_GAIN = (
-    0.1  # fraction of the best cost below which a doubtful gain is no reason to continue
-)
+# fraction of the best cost below which a doubtful gain is no reason to continue
+DOUBTFUL_GAIN = 0.1
 IMPROVED = 0.95  # probability of an improvement from which it counts as one
 UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
-START_SHARE = (
-    0.3  # share of a gain or loss due to different start states from which on it is reported
-)
+# share of a gain or loss due to different start states from which on it is reported
+START_SHARE = 0.3
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 

@@ -26,9 +26,8 @@ from grounded.trial import Trial
 
 BEYOND = 6  # steps beyond the lag in question that are tried: a delay may be missing
 LEFT_BY_FLIP = 0.3  # share left of one state's error if the sign of an input is flipped
-PREDICTS_BETTER = (
-    MARGIN / 4
-)  # [nats] by which one explanation must predict the run better than the other
+# [nats] by which one explanation must predict the run better than the other
+PREDICTS_BETTER = MARGIN / 4
 NEAR_EXPECTED_LAG = 0.35  # of the lag: how near the motion must be to what an explanation expects
 
 

@@ -25,9 +25,8 @@ from grounded.trial import Trial
 
 COASTS = 2.0  # [s] time after a run that is checked
 MAX_GAIN = 1e6  # input units per state unit; a larger gain is a numerical error
-ONE_RUN_SHARE = (
-    0.6  # share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
-)
+# share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
+ONE_RUN_SHARE = 0.6
 
 
 @dataclass(frozen=True, eq=False)

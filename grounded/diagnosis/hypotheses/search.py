@@ -43,9 +43,8 @@ SHORTLIST = 14  # effects of a scan that are refined, and half as many parameter
 TAUS = (0.05, 0.1, 0.3)  # correlation times of coloured noise [s]
 STEPS_TAUS = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
 FREED_BESIDE = 4  # effects that are fitted with the parameters freed
-LATE_NOISE = (
-    0.45  # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
-)
+# initial noise of a delayed sensor, as a fraction of its one-step residual's variance
+LATE_NOISE = 0.45
 SOME_DELAYS = 3  # grid values at which the delay of one sensor is tried
 LATE = slice(1, 4, 2)  # grid values from which the common delay of two states starts
 LARGE_GAIN = 50.0  # nats above which a hypothesis is also fitted from a start of its own

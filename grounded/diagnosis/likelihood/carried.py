@@ -28,9 +28,8 @@ from grounded.effects.losses import NUDGE, ahead, loads_from, solved
 from grounded.frozen import Array
 
 STEPS_PER_ANSWER = 5  # steps after which B is computed anew
-REPEATED_ABOVE = (
-    0.1  # change of a loss, as a fraction of the input's peak, above which a step is repeated
-)
+# change of a loss, as a fraction of the input's peak, above which a step is repeated
+REPEATED_ABOVE = 0.1
 
 
 def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:

@@ -41,13 +41,11 @@ SHORTEST_STRETCH = 4  # fewest steps of a stretch
 # single one, an interval would double by the last bit
 CHANCE, CLEAR = 0.02, 0.005
 DROP = 3.67  # [nats] within which a threshold has its 95 % interval
-FARTHEST_MOVE = (
-    12**0.5
-)  # standard deviations of the prior between two bounds, and the farthest move
+# standard deviations of the prior between two bounds, and the farthest move
+FARTHEST_MOVE = 12**0.5
 HALVINGS, ZOOMS, PARTS = 10, 3, 4  # of the widest move; then in parts between two of them
-LEFT_WITHOUT_STRETCH = (
-    0.2  # smallest fraction of the information taken to be left without a stretch
-)
+# smallest fraction of the information taken to be left without a stretch
+LEFT_WITHOUT_STRETCH = 0.2
 
 
 def standard_deviations(

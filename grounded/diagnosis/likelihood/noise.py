@@ -39,9 +39,8 @@ from grounded.frozen import Array
 DOF = 4.0
 UNSEEN = 1e-2  # initial disturbance of a state that is never measured, as a fraction of its scale
 REMEMBERED = 20  # steps after which a start is taken to be forgotten
-ZERO_VARIANCE = (
-    1e-4  # fraction of a channel's one-step variance below which a variance counts as zero
-)
+# fraction of a channel's one-step variance below which a variance counts as zero
+ZERO_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True)

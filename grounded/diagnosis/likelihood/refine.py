@@ -58,9 +58,8 @@ MOST_NUMBERS = 1e5  # size of one (L, B, N, N) array of a block; what fits in th
 SHORTEST = 0.05  # smallest fraction of a step that is tried
 RIVAL_NATS = 10.0  # nats behind the best within which all rivals continue
 RIVAL_PROMISE = 2.0  # times what its next step promises that a rival may gain
-ITERATIONS_PER_ROUND = (
-    4  # iterations of a round of a simulator, whose slopes are kept during a round
-)
+# iterations of a round of a simulator, whose slopes are kept during a round
+ITERATIONS_PER_ROUND = 4
 PROMISE_SHORTENED = 0.1  # nats that a shortened step must promise to be tried
 PROMISE_LAST = 0.01  # nats: after a rise below RISE_MAY_END, a step that promises less is not tried
 RISE_MAY_END = 1.0  # nats: smaller rises may end a fit

@@ -61,9 +61,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 ALONE = 5.0  # times as wide without the priors: as many standard deviations may one be wrong
-PRIOR_SHARE = (
-    0.2  # part of the variance of a value that a prior has at least if the value rests on it
-)
+PRIOR_SHARE = 0.2  # of a value's variance, from which on it rests on a prior
 
 Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
 

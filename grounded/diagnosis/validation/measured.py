@@ -44,9 +44,8 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-SMALL_PART = (
-    0.2  # of all errors: at most this share is in a part that holds most of those above the noise
-)
+# of all errors: at most this share is in a part that holds most of those above the noise
+SMALL_PART = 0.2
 MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
 
 

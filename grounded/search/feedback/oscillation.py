@@ -35,9 +35,8 @@ from grounded.trial import Trial
 NEAR_LIMIT, OFTEN_AT_LIMIT = 0.01, 0.3
 SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
 NEARBY, PERIODIC = 2, 0.5  # frequencies beside the strongest, and their share in a limit cycle
-UNKNOWN_STRENGTH = (
-    0.5  # share of the strength that oscillated, if none weaker than that ran quietly
-)
+# share of the strength that oscillated, if none weaker than that ran quietly
+UNKNOWN_STRENGTH = 0.5
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
 HUGE = 1e100  # bound on the motion of a diverged run in a step, in the state's unit
 STRONGER = 1.05  # ratio to the bound from which feedback counts as stronger

@@ -31,9 +31,8 @@ from grounded.trial import Trial
 
 PROBED = 0.1  # age for the derivative of the commands, in steps
 OLDEST = 2.0  # largest age, in steps; a program that acts on older samples needs another remedy
-EXPLAINED_SHARE = (
-    0.25  # smallest share of the squares of the commands' differences that an age explains
-)
+# smallest share of the squares of the commands' differences that an age explains
+EXPLAINED_SHARE = 0.25
 # ages differ if by more than both, in s and in steps: less costs little, and noise gives it too
 DIFFERENT_S, DIFFERENT = 3e-3, 0.1
 ROUNDING_OF_COMMANDS = 1e-6  # rms difference of commands, relative to their size, that is rounding

@@ -22,9 +22,10 @@ from grounded.findings import found as finding
 from grounded.fit import fit
 from grounded.result import Result
 from grounded_trials.workspace.adopted import settled
+from grounded_trials.workspace.adoption import not_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, ids_of, write_fit
+from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_diagnosis, write_fit
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
@@ -132,6 +133,11 @@ def fit_in(
     if apply and found.worse:
         raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
+        lacks = not_adopted(workspace, readable_diagnosis(workspace.folder))
+        if lacks is not None and lacks.then is not None and lacks.then.verb == "adopt":
+            # parameters alone stand for what the last diagnosis has found beside them
+            told = replace(found, findings=(*found.findings, lacks))
+            return replace(fitted(applied=False, then=lacks.then), fit=told)
         if not found.helps:
             return fitted(applied=False, then=after_fit(workspace))
         return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))

@@ -30,18 +30,16 @@ if TYPE_CHECKING:
     pass
 
 GROUPS_TOLD = 2  # groups of states reported: positions and angles before their rates, then by cost
-COST_SHARE_TOLD = (
-    0.5  # a group with more than this share of the tracking cost is reported in any case
-)
+# a group with more than this share of the tracking cost is reported in any case
+COST_SHARE_TOLD = 0.5
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
 NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
-SPEED_OF_RADIUS = (
-    0.5  # of the highest speed: below it a path's radius is not computed from its samples
-)
+# of the highest speed: below it a path's radius is not computed from its samples
+SPEED_OF_RADIUS = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -42,9 +42,8 @@ from grounded_trials.wording import (
 )
 from grounded_trials.workspace.last_diagnosis import Since
 
-ROWS_FROM = (
-    4  # columns of errors from which the table of forecasts has a row for each trial instead
-)
+# columns of errors from which the table of forecasts has a row for each trial instead
+ROWS_FROM = 4
 MOST_COLUMNS = 6  # of errors beside a trial; more take a row for each model
 UNKNOWN = "–"
 

@@ -150,9 +150,8 @@ def drift(values: Array) -> Array:
 
 FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
 UNGIVEN = 3  # largest number of states without a start value that are solved for
-AT_REST_SHARE = (
-    1e-3  # the robot is at rest if it moves less than this share of the motion as configured
-)
+# the robot is at rest if it moves less than this share of the motion as configured
+AT_REST_SHARE = 1e-3
 ZERO_INPUT = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0

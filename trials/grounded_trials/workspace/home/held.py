@@ -30,9 +30,8 @@ from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.adapters.stepper import library
 
 Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
-INERTIA_CONSTANT = (
-    2e-3  # relative change of a joint's inertia with the pose below which it is constant
-)
+# relative change of a joint's inertia with the pose below which it is constant
+INERTIA_CONSTANT = 2e-3
 POSES = 8  # poses at which that is looked at
 HINGE, SLIDE, JOINT = 3, 2, 0  # mjtJoint, mjTRN_JOINT
 

@@ -42,9 +42,8 @@ OVERLAP_S, OVERLAP = 1.5, 30  # least overlap of the pieces on each side [s], ro
 FEWEST_ROWS = 3  # smallest number of rows that can be smoothed
 MARGIN_S = 0.5  # time after the last change of a command that still counts as motion [s]
 START_SPREAD = 10.0  # std of an initial state, relative to the state's size
-WAITING_SPREAD = (
-    0.02  # std of the state of a robot that waits at a run's start, relative to the same
-)
+# std of the state of a robot that waits at a run's start, relative to the same
+WAITING_SPREAD = 0.02
 EXACT = 1e-3  # relative tolerance for a step to be a multiple of a simulator's own
 ANGLE = 1.0  # largest std of an initial angle [rad]: an angle half a turn off may fit as well
 SIZED = 256  # instants at which the size of states is computed

@@ -42,9 +42,8 @@ if TYPE_CHECKING:
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
-END = (
-    STEPS_TO_JUDGE // 2
-)  # last steps, in most of which a state has to be that far off: noise is not
+# last steps, in most of which a state has to be that far off: noise is not
+END = STEPS_TO_JUDGE // 2
 
 
 def gone_wrong(
