@@ -232,11 +232,11 @@ class Model:
         return partial(Model, **given), ()
 
     def _check_names(self) -> None:
-        names = [*self.states, *self.inputs, *self.params]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise refused("given.twice", f"model '{self.name}'", name=twice[0])
-        for name in names:
+        of_kind = {"state": self.states, "input": self.inputs, "parameter": self.params}
+        for name in [name for names in of_kind.values() for name in names]:
+            kinds = tuple(kind for kind, names in of_kind.items() if name in names)
+            if len(kinds) > 1:
+                raise refused("given.twice", f"model '{self.name}'", name=name, kinds=kinds)
             if not name.isidentifier():
                 raise wrong(f"a name of model '{self.name}'", name, must="name")
         units: dict[str, object] = {**self.states, **self.inputs}

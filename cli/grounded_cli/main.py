@@ -63,7 +63,7 @@ COMMANDS = {
     "demo": ("studies.demo", "Run a whole example in a new folder: learn, diagnose, report."),
     "experiment": ("studies.experiment", "Reproduce the paper's studies."),
     "challenge": ("studies.challenge", "Make, diagnose and score blind cases for the diagnosis."),
-    "explain": ("explain", "Say what the code of a finding means and what to do."),
+    "explain": ("explain", "Say what the code of a finding, or an effect, means."),
     "completion": ("console.completion", "Print the shell's completion script."),
 }
 

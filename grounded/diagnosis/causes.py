@@ -58,6 +58,22 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 
 
+def in_words(sentence: str, target: str = "") -> str:
+    """Return the sentence of a family of effects without values: <names>, both words of a choice.
+
+    Args:
+        sentence: of the family, in whose notation it is written.
+        target: of the effect; "" leaves it open.
+    """
+    driven, _, source = target.partition("<-")
+    words = {"s": "s", "es": "es", "has": "has", "source": source}
+    words |= {"target": listed(target.split("+")), "driven": driven}
+    text = re.sub(r"[\[\]]", "", sentence.replace(" & ", " and "))
+    text = re.sub(r"\{\w+>([^{}|]+)\|([^{}|]+)\}", r"\1 (or \2)", text)
+    text = re.sub(r"\{(\w+)%([^{}|]+)\|([^{}|]+)\}", r"{\1} \2 (or \3)", text)
+    return re.sub(r"\{(\w+)%?\}", lambda match: words.get(match[1]) or f"<{match[1]}>", text)
+
+
 def _changed(name: str, by: Estimate, was: float, unit: str) -> str:
     return f"{name} = {by.moved(was).text}, was {with_unit(number(was), unit)}"
 

@@ -14,12 +14,12 @@ from grounded.findings.numbers import filled, slots
 
 
 class Weight(StrEnum):
-    """What a finding asks of the reader; the heaviest first."""
+    """What a finding asks of the reader, in the words of `WEIGHTS`; the heaviest first."""
 
-    REFUSE = "refuse"  # the command stops
-    ASIDE = "aside"  # the trial does not count until a person decides
-    WARN = "warn"  # what was done may be wrong
-    NOTE = "note"  # good to know
+    REFUSE = "refuse"
+    ASIDE = "aside"
+    WARN = "warn"
+    NOTE = "note"
 
 
 @dataclass(frozen=True)

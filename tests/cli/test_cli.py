@@ -14,6 +14,8 @@ import pytest
 
 from cli import COMMAND, grounded, plain, process
 from facts import holds
+from grounded.effects import Library
+from grounded.findings.catalogue import WEIGHTS
 from grounded.policy import load
 from grounded_cli.main import COMMANDS
 from grounded_trials.starting.examples import EXAMPLES
@@ -70,12 +72,35 @@ def test_help_needs_no_numpy():
 
 
 def test_a_code_is_explained():
-    one = grounded("explain", "log.unit")
-    assert one.code == 0 and "log.unit" in one.out
-    listed = grounded("explain", "--json").json["findings"]
-    assert {"log.unit", "plan.no_limits"} <= {*listed} and len(listed) > 200
-    wrong = grounded("explain", "log.unti")
-    assert wrong.code == 1 and "log.unit" in wrong.err
+    one = grounded("explain", "plan.doubtful")
+    assert one.code == 0 and WEIGHTS["note"].split(";")[0] in one.out
+    listed = grounded("explain", "--json").json
+    assert {"log.unit", "plan.no_limits"} <= {*listed["findings"]}
+    assert {*listed["effects"]} == {family.name for family in Library().families}
+
+
+@pytest.mark.parametrize(
+    ("name", "example", "units"),
+    [
+        ("side_slip", "side_slip:x+y", {"k": "s^2/m"}),
+        ("sensor_bias:theta", "sensor_bias:theta", {"b": "rad"}),
+        ("sensor_bias:elsewhere", "sensor_bias:delta", {"b": "rad"}),
+    ],
+)
+def test_an_effect_is_explained(name, example, units):
+    family = name.partition(":")[0]
+    told = grounded("explain", name, "--json").json["effects"][family]
+    assert (told["example"], told["quantities"]) == (example, units)
+    assert not re.search(r"[{}|&]|\[|\]", told["sentence"]) and told["lookalikes"]
+    assert told["equation"].split()[0] in grounded("explain", name).out
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"), [("log.unti", "log.unit"), ("dead_zonne:u", "dead_zone"), ("qqqq", "")]
+)
+def test_an_unknown_name_gets_one_of_either_kind(wrong, near):
+    done = grounded("explain", wrong)
+    assert done.code == 1 and near in done.err and len(done.err) < 200
 
 
 def test_version():

@@ -316,15 +316,28 @@ class EntryJson(TypedDict):
     """The words of a code."""
 
     weight: str
+    means: str
     short: str
     remedy: str
     hides: list[str]
+
+
+class FamilyJson(TypedDict):
+    """A family of effects, with the units of its quantities at an example."""
+
+    equation: str
+    sentence: str
+    example: str
+    quantities: dict[str, str]
+    lookalikes: list[str]
+    read: str
 
 
 class ExplainJson(TypedDict):
     """`explain`."""
 
     findings: dict[str, EntryJson]
+    effects: dict[str, FamilyJson]
 
 
 class InstrumentsJson(TypedDict):

@@ -25,13 +25,20 @@ AREAS = (
     "target",
 )
 
+WEIGHTS = {
+    "refuse": "the command stops",
+    "aside": "the trial does not count until a person decides",
+    "warn": "what was done may be wrong",
+    "note": "good to know; nothing stops and everything counts",
+}
+
 
 @dataclass(frozen=True)
 class Entry:
     """The words of one code.
 
     Args:
-        weight: refuse, aside, warn or note.
+        weight: one of `WEIGHTS`, which says what it means.
         short: what was found, a clause without a full stop.
         remedy: what to do about it, "" for nothing.
         hides: codes of findings that follow from it.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
+from grounded.places import samples
 from grounded.search.feedback.oscillation import jumps
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
@@ -110,14 +111,17 @@ def no_limits(plan: Plan) -> Iterator[Finding]:
 
 
 def without_effect(plan: Plan) -> Iterator[Finding]:
-    """An input changes no step of the model along the plan, at either of its limits.
+    """An input changes no step of the model, along the plan or elsewhere, at either of its limits.
 
-    An example is a gain that is still 0 in a model skeleton.
+    An example is a gain that is still 0 in a model skeleton. A rudder acts only at some speed, and
+    a plan may stay at rest: so the model is also probed at other states and inputs.
     """
     if plan.made is None:
         return
     task, sent, idle = plan.task, plan.made.predicted_inputs, []
-    x = plan.made.predicted_states[: len(sent)]
+    states, inputs = samples(task.model, 8)
+    x = np.concatenate([plan.made.predicted_states[: len(sent)], states])
+    sent = np.concatenate([sent, np.clip(inputs, task.low, task.high)])
     for j, name in enumerate(task.model.input_names):
         after = []
         for end, other in ((task.low[j], sent[:, j] - 1), (task.high[j], sent[:, j] + 1)):
