@@ -165,10 +165,12 @@ def _tell(begun: Begun) -> None:
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
     show(field("start", begun.start, "  "))
-    show("")
     both, known = (*begun.states, *begun.inputs), estimating(begun.states)
     aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))
-    for guess in both:
+    heads = {len(begun.states): "inputs", 0: "states"}
+    for k, guess in enumerate(both):
+        if k in heads:
+            show(f"\n{heads[k]}")
         mark = "" if guess.sure else "UNSURE "
         none = f"{'no name' if guess.others else 'nothing'} in the log fits"
         show(aligned(guess.name, f"{mark}{guess.path or none}"))

@@ -267,6 +267,23 @@ def test_a_robot_that_balances_gets_its_equations(tmp_path, names, kind):
     assert moved[1, 1] > 0 > moved[1, 3]  # driven forwards, it leans back
 
 
+@pytest.mark.parametrize(
+    ("names", "inputs"),
+    [
+        ("x,y,psi,u,r,rudder,thruster", ["rudder", "thruster"]),  # u is the speed ahead
+        ("a,b,c,d,e,u,aileron", ["u", "aileron"]),
+        ("a,b,c,d,u,fan,e", ["u"]),
+    ],
+)
+def test_the_inputs_of_a_generic_model_are_named_like_commands(tmp_path, names, inputs):
+    t, log = 0.05 * np.arange(300), tmp_path / "log.csv"
+    rows = np.column_stack([t, *(np.sin((1 + k / 3) * t + k) for k in range(7))])
+    np.savetxt(log, rows, "%.5f", ",", header=f"t,{names}", comments="")
+    found = begin(tmp_path / "w", log, kind="generic")
+    assert [one.name for one in found.inputs] == inputs and not found.unsure
+    assert ",".join(inputs) in found.why
+
+
 def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
     log = wheels("aa,bb")
     rows = np.loadtxt(log, delimiter=",", skiprows=1)

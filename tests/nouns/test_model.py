@@ -48,7 +48,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"inputs": {}}, holding("input", "free motion", "column of zeros")),
         ({"inputs": {"x": "N"}}, holding("'x'", "twice")),
         ({"params": {"mass": 1.0}}, holding("'mass'", "Param", "float")),
-        ({"params": {"v": Param(1.0)}}, holding("'v'", "twice")),
+        ({"params": {"v": Param(1.0)}}, holding("'v'", "state", "parameter")),
         ({"states": {"my state": "m"}}, holding("'my state'")),
         ({"angles": ("psi",)}, holding("angle", "'psi'", "x and v")),
         ({"angles": ("vv",)}, holding("angle", "'vv'", "'v'")),

@@ -83,6 +83,22 @@ def test_the_first_plan_says_what_the_task_leaves_open(sled):
     assert [one.facts["used"] for one in of_code(told, "file.rows")] == [31]
 
 
+BOAT = """from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"u": a.thrust - s.u, "r": p.k * s.u * a.rudder - s.r}
+
+model = Model(states={"u": "m/s", "r": "rad/s"}, inputs={"rudder": "1", "thrust": "1"},
+              params={"k": Param(1.0, "rad/m/s")}, derivative=rate)
+"""
+
+
+@pytest.mark.parametrize(("k", "idle"), [("1.0", []), ("0.0", [("rudder",)])])
+def test_an_input_that_acts_only_in_motion_has_an_effect(tmp_path, k, idle):
+    w = blank(tmp_path / "w", BOAT.replace("Param(1.0", f"Param({k}"))
+    assert [one.about for one in of_code(w.propose(), "plan.without_effect")] == idle
+
+
 HOVER = """from grounded import Model, Param
 
 def rate(s, a, p):

@@ -48,9 +48,7 @@ ENTRIES: dict[str, Entry] = {
         "[[with it the model's steps fit {share:%} better than the next best]][[!share? the "
         "model's steps don't clearly favour one]]",
     ),
-    "given": Entry(
-        "note", "[[asked? as you specified]][[!asked? a guess: only its name is in the log]]"
-    ),
+    "given": Entry("note", "as you specified"),
     "unused": Entry(
         "note", "{about} {about:is/are} not used of the log", "[log] can name {about:it/them}"
     ),

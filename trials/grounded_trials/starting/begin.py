@@ -278,6 +278,8 @@ class _Draft:
             self._match()
             return
         self._match({name: one.path for name, one in numbers.items()})
+        if not self.named:
+            self.why += f"; other inputs than by --inputs {','.join(self.model.inputs)}"
         left = [n for n in numbers if n not in {**self.model.states, **self.model.inputs}]
         odd = [found("start.unused", *reversed(left))] * bool(left)
         if not set(self.model.inputs) & set(numbers):
@@ -355,7 +357,7 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
     if path == guess.path:
         return replace(guess, sure=bool(path))
     scale = Stated.by(report.files).factor(path, units[guess.name]) if path else 1.0
-    why = (found("start.given", guess.name, asked=True),)
+    why = (found("start.given", guess.name),)
     field, clock = report.number(path), report.clock(report.topic_of(path))
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)
 

@@ -7,7 +7,7 @@ bounds on the parameters. Users are expected to edit it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from grounded.checks import refused, unknown
 from grounded.findings import found as found_
@@ -30,9 +30,11 @@ MOST_STATES, MOST_INPUTS = 6, 4  # largest number of states and of guessed input
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
+    "|rudder|aileron|elevator|thruster"
     r"|goal|control|\baction\b|\.reference\.|\.output\.|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
     "|comando"
 )
+SURGE = "u", {"x", "y", "psi", "r"}  # a name of an input, but beside these the speed ahead
 DONE = re.compile(r"\.(feedback|actual)\.")  # what a controller's joints did
 ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
 EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
@@ -82,10 +84,17 @@ def _noise_only(field: FieldReport) -> bool:
     return field.high - field.low < QUIET * field.noise
 
 
-def called_input(name: str, path: str) -> bool:
-    """Return whether a number of a log is named like a command."""
-    called = COMMANDED.search(path.lower()) or SIDES.search(name)
-    return bool(called and not DONE.search(path))
+def called_input(name: str, path: str, beside: Collection[str]) -> bool:
+    """Return whether a number of a log is named like a command: more speaks for it than against.
+
+    Args:
+        name: of the number.
+        path: of the number.
+        beside: names of all numbers of the log.
+    """
+    speaks_for = bool(COMMANDED.search(path.lower())) + bool(SIDES.search(name))
+    surge = name == SURGE[0] and {*beside} >= SURGE[1]
+    return speaks_for > surge + 2 * bool(DONE.search(path))
 
 
 def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
@@ -111,7 +120,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
         if any(_word(one.path) == name for one in log.numbers):
             raise refused("start.still", name)
         raise unknown("number", name, found, "the log")
-    called = [n for n in reversed(found) if called_input(n, found[n].path)]
+    called = [n for n in reversed(found) if called_input(n, found[n].path, found)]
     followers = _followers(found, list(inputs) or called)
     inputs = inputs or list(followers.values())[:MOST_STATES] or _inputs_in(found, called, unit)
 
@@ -282,7 +291,9 @@ def _hung(log: LogReport, joints: Joints) -> str:
     slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
     if len(others) == 1:
         return f"{topic}: {slide}, {others[0]}"
-    angles = [n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path)]
+    angles = [
+        n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path, found)
+    ]
     if others or not angles:
         return ""
     return f"{topic}: {slide}, {found[angles[0]].path}"
@@ -414,7 +425,8 @@ def _car(log: LogReport, units: Units) -> Skeleton:
 
 def sent_in(log: LogReport) -> dict[str, str]:
     """Return the paths of the numbers that are named like commands, by their names."""
-    return {name: one.path for name, one in moving(log).items() if called_input(name, one.path)}
+    found = moving(log)
+    return {n: one.path for n, one in found.items() if called_input(n, one.path, found)}
 
 
 def skeleton(

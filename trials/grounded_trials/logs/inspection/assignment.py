@@ -115,13 +115,13 @@ def assigned(
         inputs: units of the inputs by name.
         model: whose equations relate them; None: names and units alone decide.
         joints: the result of `joint_names`, if already known.
-        given: numbers that are taken for some states and inputs, as guesses.
+        given: numbers after which some states and inputs are named.
     """
     joints = joint_names(log) if joints is None else joints
     table = _Table(log, states, inputs, joints)
     for name, path in ((n, p) for n, p in given.items() if n in table.row):
-        table.add(name, path, 2 * CAP, found("start.given", name))
-        table.doubted.add((name, path))
+        table.add(name, path, 2 * CAP)
+        table.named.add((name, path))
     signals = None
     if model is not None and table.numbers:
         angles = {n.path for n in table.numbers if n.known == "rad" or n.said in ("", "rad", "deg")}
