@@ -59,15 +59,10 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
 
 
 def in_words(sentence: str, target: str = "") -> str:
-    """Return the sentence of a family of effects without values: <names>, both words of a choice.
-
-    Args:
-        sentence: of the family, in whose notation it is written.
-        target: of the effect; "" leaves it open.
-    """
+    """Return a family's sentence at a target, "" for any: <names> for values, both choices."""
     driven, _, source = target.partition("<-")
-    words = {"s": "s", "es": "es", "has": "has", "source": source}
-    words |= {"target": listed(target.split("+")), "driven": driven}
+    words = {"target": target, "driven": driven, "source": source}
+    words |= {"s": "s", "es": "es", "has": "has"}
     text = re.sub(r"[\[\]]", "", sentence.replace(" & ", " and "))
     text = re.sub(r"\{\w+>([^{}|]+)\|([^{}|]+)\}", r"\1 (or \2)", text)
     text = re.sub(r"\{(\w+)%([^{}|]+)\|([^{}|]+)\}", r"{\1} \2 (or \3)", text)

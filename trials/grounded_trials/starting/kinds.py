@@ -85,13 +85,7 @@ def _noise_only(field: FieldReport) -> bool:
 
 
 def called_input(name: str, path: str, beside: Collection[str]) -> bool:
-    """Return whether a number of a log is named like a command: more speaks for it than against.
-
-    Args:
-        name: of the number.
-        path: of the number.
-        beside: names of all numbers of the log.
-    """
+    """Return whether more in a number's name, beside all names, speaks for a command than not."""
     speaks_for = bool(COMMANDED.search(path.lower())) + bool(SIDES.search(name))
     surge = name == SURGE[0] and {*beside} >= SURGE[1]
     return speaks_for > surge + 2 * bool(DONE.search(path))
