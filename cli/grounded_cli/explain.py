@@ -28,10 +28,9 @@ def command(name: str, json_: bool) -> None:
     from grounded_trials.workspace.adopted import installed_effects
 
     family, _, target = name.partition(":")
-    entries = {one: entry_of(one) for one in codes() if name in ("", one)}
-    findings = {one: vars(e) | {"means": WEIGHTS[e.weight]} for one, e in entries.items()}
+    findings = {one: vars(entry_of(one)) for one in codes() if name in ("", one)}
     library = {one.name: one for one in installed_effects().families}
-    chosen = [one for one in library.values() if family in ("", one.name)]
+    chosen = [library[one] for one in library if family in ("", one)]
     if not findings and not chosen:
         near = alike(name, codes()) or alike(family, library) or None
         known = None if near else "those that `grounded explain` lists"
@@ -39,19 +38,23 @@ def command(name: str, json_: bool) -> None:
     effects = _described(chosen, target) if chosen else {}
     if json_:
         show_json({"findings": findings, "effects": effects})
-        return
-    if name:
-        show(f"{name}: <name> stands for a value, [text] is told where it applies")
-    for one, told in (findings | effects).items():
-        whole = told if name else {one: told.get("weight") or told["equation"]}
-        show("\n".join(field(key, _text(v), width=20) for key, v in whole.items() if v))
+    elif name:
+        read = f"read docs/effects.md, {family}" if effects else "[text] is told where it applies"
+        show(f"{name}: <name> stands for a value; {read}")
+        (told,) = (findings | effects).values()
+        show("\n".join(field(key, _text(value)) for key, value in told.items() if value))
+    else:
+        first = {one: next(iter(told.values())) for one, told in (findings | effects).items()}
+        show("\n".join(field(one, text, width=20) for one, text in first.items()))
 
 
 def _text(value: Any) -> str:
     """Return a text to be read without facts, names in a line, or names with their units."""
     if isinstance(value, dict):
         return ", ".join(f"{name} [{unit}]" for name, unit in value.items())
-    return bare(value) if isinstance(value, str) else ", ".join(value)
+    if isinstance(value, str):
+        return f"{value}: {WEIGHTS[value]}" if value in WEIGHTS else bare(value)
+    return ", ".join(value)
 
 
 def _described(families: Sequence[Family], target: str) -> dict[str, dict[str, Any]]:
@@ -73,6 +76,5 @@ def _described(families: Sequence[Family], target: str) -> dict[str, dict[str, A
             "quantities": {q.name: q.unit for site in sites for q in family.quantities(site)},
             "example": "".join(f"{family.name}:{site.joined}" for site in sites),
             "lookalikes": list(family.lookalikes),
-            "read": "docs/effects.md",
         }
     return told

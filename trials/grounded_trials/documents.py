@@ -27,6 +27,7 @@ from typing import (
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
+from grounded.findings.catalogue import Entry
 from grounded_trials.logs.recover import Recovery
 from grounded_trials.workspace.adoption import Adopted, Undone
 from grounded_trials.workspace.candidates.exporting import Exported
@@ -312,16 +313,6 @@ class NextJson(TypedDict):
     findings: list[Finding]
 
 
-class EntryJson(TypedDict):
-    """The words of a code."""
-
-    weight: str
-    means: str
-    short: str
-    remedy: str
-    hides: list[str]
-
-
 class FamilyJson(TypedDict):
     """A family of effects, with the units of its quantities at an example."""
 
@@ -330,13 +321,12 @@ class FamilyJson(TypedDict):
     example: str
     quantities: dict[str, str]
     lookalikes: list[str]
-    read: str
 
 
 class ExplainJson(TypedDict):
     """`explain`."""
 
-    findings: dict[str, EntryJson]
+    findings: dict[str, Entry]
     effects: dict[str, FamilyJson]
 
 

@@ -20,10 +20,8 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import rate_states
 from grounded.result import Document, or_zero
-from grounded.search.scatter import beyond_noise
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import with_unit
 from grounded_trials.workspace.user_files.task_file import equal_weights
 
 if TYPE_CHECKING:
@@ -264,21 +262,6 @@ def asked_for(task: Task) -> list[int]:
 def tracking_error(task: Task, trial: Trial) -> Array:
     """Return s_t - target_t, (T + 1, n), with angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
-
-
-def began_elsewhere(task: Task, trials: Sequence[Trial], predicted: Array) -> dict[str, str]:
-    """Return how far from [task] start runs of one candidate began, `{"x": "+0.02 m in x"}`.
-
-    Differences within the sensors' noise or below their resolution do not count.
-    """
-    off = np.array([task.model.difference(t.began, task.start) for t in trials])
-    mean = off.mean(axis=0)
-    told = beyond_noise(trials, off, task.start, predicted) & (np.abs(mean) > _resolution(trials))
-    return {
-        name: f"{with_unit(f'{mean[i]:+.2g}', unit)} in {name}"
-        for i, (name, unit) in enumerate(task.model.states.items())
-        if told[i]
-    }
 
 
 def _resolution(trials: Sequence[Trial]) -> Array:
