@@ -117,6 +117,8 @@ def following(log: str, candidate: str | None, details: bool, json_: bool) -> No
     _tell(log, done.taken, workspace.base_model, details)
     show("")
     tell_proposed(done.proposed, last=done.exported is None)
+    if done.removed:
+        show(field("removed", ", ".join(map(str, done.removed)), "  "))
     if done.exported is not None:
         files = filter(None, (done.exported.file, done.exported.runner))
         show(field("files", ", ".join(map(str, files)), "  "))

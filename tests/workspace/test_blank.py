@@ -1,6 +1,7 @@
 """A workspace from a model alone, and the robot's program that comes with it."""
 
 import importlib.util
+import re
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from facts import holding, of_code
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.policy import load
 from grounded_trials import Workspace
 from workspaces import blank, edit
@@ -73,6 +74,17 @@ def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(sled, tmp_path
     taken = sled.ingest(tmp_path / "run.mcap")
     assert taken.candidate == "c0001"
     assert sled.status().standing.incumbent.candidate.id == "c0001"
+
+
+def test_run_comes_next_only_once_the_program_was_completed(sled):
+    """Somebody who exports candidates and ingests logs was told to `run` an empty skeleton."""
+    edit(sled.folder, limits="force = [-50, 50]")
+    drive = sled.folder / "drive.py"
+    assert (sled.propose().then.verb, sled.status().then.verb) == ("export", "export")
+    sled.export("c0001", sled.folder / "c0001.npz")
+    assert sled.status().then == NextCommand("next", ("LOG",))
+    drive.write_text(re.sub("raise SystemExit.*", "return [0.0, 0.0]", drive.read_text()))
+    assert (sled.propose().then.verb, sled.status().then.verb) == ("run", "run")
 
 
 def test_the_first_plan_says_what_the_task_leaves_open(sled):

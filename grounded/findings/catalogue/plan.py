@@ -214,8 +214,8 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "{candidate} was not run and is void[[: {why}]][[: {trials}, which it was made from, "
         "{trials:is/are} {gone}]][[; run {instead} instead]]",
-        "if the robot has run it meanwhile, ingest that log with --candidate {candidate}: it "
-        "counts",
+        "[[!other? if the robot has run it meanwhile, ingest that log with --candidate "
+        "{candidate}: it counts]]",
     ),
     "lost": Entry(
         "note",

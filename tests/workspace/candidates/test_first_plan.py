@@ -181,7 +181,7 @@ def test_a_plan_that_leaves_safety_after_its_end_is_drawn_again_at_rest(ball):
     then = Workspace(ball.folder).propose().then
     line = ("line", "--to", "x=0.3", "--seconds", "1", "--hold", "1", "--rest")
     assert (then.verb, then.arguments) == ("target", line)
-    assert Workspace(ball.folder).propose().then.verb == "run"  # asked again, it is handed out
+    assert Workspace(ball.folder).propose().then.verb == "export"  # asked again, it is handed out
     old = (ball.folder / "target.csv").read_text().splitlines()
     drawn(ball, *line)
     new = (ball.folder / "target.csv").read_text().splitlines()

@@ -26,13 +26,13 @@ from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.starting.own_model import own_model
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.at_rest import resting
-from grounded_trials.workspace.user_files.config import FILE
+from grounded_trials.workspace.user_files.config import DRIVE, FILE, UNWRITTEN
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target
 
 DT, HORIZON = 0.05, 100  # [s], steps
 COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'
 CHANGES = "# for inputs from -1 to 1: `target` updates it from the limits until you change it"
-DRIVE = '''"""The robot's program: runs a candidate and writes its trial. `grounded run` calls it as
+RUNS = '''"""The robot's program: runs a candidate and writes its trial. `grounded run` calls it as
 
     python drive.py candidates/c0001.mcap runs/c0001-1.mcap
 """
@@ -54,12 +54,12 @@ INPUTS = {inputs}
 
 def measure():
     """Return the robot's current states in the order of STATES, one number each."""
-    raise SystemExit("drive.py: complete measure() and send() for your robot")
+    raise SystemExit("{unwritten}")
 
 
 def send(u):
     """Send the inputs u, in the order of INPUTS; they are within [limits]."""
-    raise SystemExit("drive.py: complete measure() and send() for your robot")
+    raise SystemExit("{unwritten}")
 
 
 def main(candidate, trial):
@@ -95,13 +95,14 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
             already holds a workspace.
     """
     own = own_model(file)
-    with fresh_folder(folder, (FILE, "target.csv", "drive.py", *own.missing(folder))):
+    with fresh_folder(folder, (FILE, "target.csv", DRIVE, *own.missing(folder))):
         model = own.bring(folder)
         task = _task(model, dt or DT)
         columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
         write_target(folder / "target.csv", task.dt, columns)
-        drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
-        write_atomically(folder / "drive.py", drive.encode())
+        names = {"states": dict(model.states), "inputs": dict(model.inputs)}
+        drive = RUNS.format(**names, unwritten=f"{DRIVE}: {UNWRITTEN}")
+        write_atomically(folder / DRIVE, drive.encode())
         name = f"{model.name or own.file.stem}: set your own target, weights and limits"
         text = toml_of(task, name, COMMAND, explicit=True)
         text = text.replace("\ninput_change", f"\n{CHANGES}\ninput_change")

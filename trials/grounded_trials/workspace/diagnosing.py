@@ -34,7 +34,11 @@ from grounded_trials.workspace.adoption import (
     tied_when_adopted,
 )
 from grounded_trials.workspace.candidates.handover import outside_limits
-from grounded_trials.workspace.candidates.search_state import candidate_named, standing_in
+from grounded_trials.workspace.candidates.search_state import (
+    candidate_named,
+    overtaken,
+    standing_in,
+)
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
     chosen,
@@ -105,7 +109,7 @@ def diagnose_in(
     share = chosen(workspace, trials)
     second = chosen(workspace, compare) if compare else Share([])
     used, others = share.trials, second.trials
-    told = filter(None, [share.finding, second.finding])
+    told = filter(None, [overtaken(workspace), share.finding, second.finding])
     memory = planner.plan.model.state_names[planner.task.model.n :]
     rows, early = unsure_times(workspace.whole_trials(), {one.id for one in (*used, *others)})
     options = DiagnosisOptions(

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli import grounded
+from cli import grounded, plain
 from facts import of_code
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Plant
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
-from workspaces import REAL, make
+from workspaces import MODEL, REAL, make
 
 TURNED = (
     REAL.replace("import model as crude", "import model as plain")
@@ -44,7 +44,7 @@ def w(tmp_path):
 
 def run(w, force):
     (w.folder / "real.py").write_text(TURNED.replace("FORCE", force))
-    return w.run("c0002").trial_file
+    return w.run().trial_file
 
 
 def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps=25):
@@ -106,9 +106,9 @@ def test_a_loop_slower_than_dt_is_told(w, every):
     assert all(one.facts["every"] == pytest.approx(every * dt) for one in told)
 
 
-def by_hand(w, wired, drag=3.0):
+def by_hand(w, wired, drag=3.0, seed=5):
     """Drive the cart by hand, with a motor wired right or wrong and a drag the model lacks."""
-    rng, (x, v) = np.random.default_rng(5), (0.0, 0.0)
+    rng, (x, v) = np.random.default_rng(seed), (0.0, 0.0)
     states, inputs, goals = [(x, v)], [], rng.uniform(-1.0, 1.0, 10)
     for k in range(120):
         force = np.clip(4.0 * (goals[k // 15] - x) + 0.5 * rng.normal(), -5.0, 5.0)
@@ -119,7 +119,7 @@ def by_hand(w, wired, drag=3.0):
         inputs.append((force,))
     noisy = np.array(states) + 1e-4 * rng.normal(size=(121, 2))
     trial = Trial(noisy, np.array(inputs), 0.05, w.task.model.state_names, ("force",))
-    file = w.folder / f"hand{wired:g}.mcap"
+    file = w.folder / f"hand{wired:g}{seed}.mcap"
     write_trial(file, trial, {"kind": "trial", "task": w.task.hash})
     return w.ingest(file, data=True)
 
@@ -132,3 +132,53 @@ def test_a_log_that_contradicts_the_model_is_told_and_the_next_contradicts_it(tm
     by_hand(w, 1.0)
     with pytest.raises(GroundedError, match="t0001"):
         w.diagnose()
+
+
+@pytest.mark.parametrize("before", [(), (-1.0, -1.0), (1.0,)])
+def test_no_run_is_at_fault_if_an_input_acts_alike_in_all_of_them(tmp_path, before):
+    """A sign flipped in model.py let the next run be blamed, and set aside."""
+    w = Workspace(make(tmp_path / "w").folder)
+    w.propose()
+    for k, wired in enumerate(before):
+        by_hand(w, wired, seed=k)
+    done = w.ingest(run(w, "-a.force"))
+    (told,) = of_code(done, "run.reversed")
+    alone = before != (-1.0, -1.0)
+    assert ("trial" in told.facts) is alone
+    assert (done.then.verb == "discard") is alone
+    assert (w.status().then.verb == "discard") is alone
+
+
+@pytest.mark.parametrize("text", ["Param(5.0", "(-a.force"])
+def test_a_model_that_was_edited_is_told_by_every_command_and_no_run_is_blamed(w, text):
+    """It was told that no candidate waits."""
+    file = run(w, "a.force")
+    trial, *_ = read_trial(file)
+    bare = w.folder / "bare.mcap"
+    write_trial(bare, replace(trial, candidate=""), {"kind": "trial", "task": w.task.hash})
+    old = "Param(1.0" if text.startswith("Param") else "(a.force"
+    (w.folder / "model.py").write_text(MODEL.replace(old, text))
+    w = Workspace(w.folder)
+    for verb in ("ingest", "next"):
+        with pytest.raises(GroundedError) as caught:
+            getattr(w, verb)(bare)
+        assert (caught.value.finding.code, caught.value.finding.about) == ("plan.void", ("c0002",))
+        assert caught.value.then == NextCommand(verb, (str(bare), "--candidate", "c0002"))
+    with pytest.raises(GroundedError) as caught:
+        w.run()
+    assert (caught.value.finding.code, caught.value.then.verb) == ("plan.void", "propose")
+    assert w.status().findings[0].code == w.diagnose().findings[0].code == "plan.void"
+    done = w.ingest(bare, candidate="c0002")
+    assert done.findings[0].code == "plan.outdated" and done.then.verb != "discard"
+    assert w.status().findings[0].code == "plan.outdated"
+    made = w.next(bare, candidate="c0002").proposed
+    assert made.candidate.id == "c0003" and of_code(made, "plan.outdated")
+    assert not of_code(w.status(), "plan.*") and not of_code(w.propose(), "plan.outdated")
+
+
+def test_a_deleted_export_of_a_void_candidate_is_told(w):
+    log, export = w.run("c0001").trial_file, w.folder / "c0002.npz"
+    w.export("c0002", export)
+    (w.folder / "model.py").write_text(MODEL.replace("Param(1.0", "Param(1.5"))
+    out = grounded("-C", w.folder, "next", log, "--candidate", "c0001").out
+    assert export.name in plain(out).replace("\n", "") and not export.exists()

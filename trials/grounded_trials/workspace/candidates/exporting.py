@@ -171,7 +171,7 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
         candidate: the candidate's id.
         named: the name to use in the command; () for the outstanding candidate.
     """
-    if workspace.config.system.reachable:
+    if workspace.config.reachable:
         waits = not_stored(workspace, candidate)
         return NextCommand("run", named) if waits is None else NextCommand("ingest", (str(waits),))
     name = named[0] if named else candidate

@@ -127,7 +127,7 @@ def unmapped(workspace: Folder) -> Finding | None:
     mapping = workspace.log_mapping
     if mapping is None or not (mapping.states or mapping.inputs):
         return None
-    if workspace.config.system.reachable:
+    if workspace.config.reachable:
         return None
     lost = [name for name in workspace.base_model.input_names if name not in mapping.inputs]
     file = workspace.config.model.file or workspace.config.model.module

@@ -25,10 +25,15 @@ from grounded_trials.workspace.candidates.handover import (
     in_words,
     unmapped,
 )
-from grounded_trials.workspace.candidates.search_state import answered, planned, standing_in
+from grounded_trials.workspace.candidates.search_state import (
+    MODEL,
+    answered,
+    overtaken,
+    planned,
+    standing_in,
+)
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.last_diagnosis import (
     Since,
     left_out,
@@ -164,20 +169,21 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not workspace.config.task.target:
         raise GroundedError(found("plan.no_target", then=NextCommand("target", ("SHAPE",))))
     check_log(workspace)
-    before, told = workspace.candidate_ids(), bool(workspace.noted.since)
+    told, changed = bool(workspace.noted.since), [*filter(None, [overtaken(workspace)])]
     proposal, void = _handed_over(workspace, tick)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate, now = proposal.candidate, proposal.standing
     notes = [found("plan.void", name, candidate=name, why=why) for name, why in void.items()]
     left = [] if told else _disowned(now, workspace.discarded())  # told when it was replaced
     if candidate is not None:
-        notes = notes + left if not proposal.is_new else notes or left or _void(workspace, before)
+        notes = notes + left if not proposal.is_new else notes or left or changed
         notes = [one.knowing({"instead": candidate.id}) for one in notes]
     first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open
 
-        first = left_open(workspace, proposal, _other_model(workspace, before))
+        again = any(one.facts.get("why") == MODEL for one in changed)
+        first = left_open(workspace, proposal, again)
         notes += first
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)
@@ -302,17 +308,6 @@ def _proposal(
     return planned(workspace, replace(contents, candidates=candidates), tick)
 
 
-def _not_run(workspace: Folder, before: Sequence[str]) -> tuple[Candidate, dict[str, str]] | None:
-    """Return the last candidate of the search with its metadata if no trial ran it, else None."""
-    for name in reversed(before):
-        made, meta = workspace.candidate(name)
-        if meta.get("kind") == "search":
-            return (
-                None if any(t.trial.candidate == name for t in workspace.trials()) else (made, meta)
-            )
-    return None
-
-
 def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
     """Return which latest candidates, never run, are void since a trial was discarded."""
     void = []
@@ -322,26 +317,6 @@ def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
         if tried.void:
             void.append(disowned(tried, aside))
     return void
-
-
-def _other_model(workspace: Folder, before: Sequence[str]) -> bool:
-    """Return whether the search's last candidate was planned with another model, and never run."""
-    last = _not_run(workspace, before)
-    if last is None or last[1].get("task") != workspace.task.hash:
-        return False
-    return last[0].model != workspace.planner.fingerprint
-
-
-def _void(workspace: Folder, before: Sequence[str]) -> list[Finding]:
-    """Return why the search's last candidate, never run, is replaced; [] if it is not."""
-    if (last := _not_run(workspace, before)) is None:
-        return []
-    made, meta = last
-    why = other_task(workspace.task, made)
-    if meta.get("task") == workspace.task.hash:
-        same = made.model == workspace.planner.fingerprint
-        why = "the trial that it followed was set aside" if same else "the model was changed"
-    return [found("plan.void", made.id, candidate=made.id, why=why)]
 
 
 def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = ()) -> Status:
@@ -362,6 +337,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *notes,
         *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
+        *filter(None, [overtaken(workspace)]),
         *_namesakes(workspace),
         *not_counted(uncounted(workspace, workspace.trials(), standing)),
         *left_out(workspace),

@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,11 +21,12 @@ import grounded
 from grounded.checks import refused
 from grounded.compile.run.jit import store, stored
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, found
+from grounded.findings import Finding, Weight, found
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Contents, Folder
+from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.last_diagnosis import (
     readable_diagnosis,
     since_diagnosis,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
 KIND = ".ended"
 LATEST = 4  # latest hand-outs that are looked at
+MODEL = "the model was changed"  # why a candidate is void
 UNSAID = (Ending.NOT_ALLOWED, Ending.GAINS)  # ends that are told with the refused candidate
 
 
@@ -167,7 +170,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     if name is None:
         waiting = standing_in(workspace).outstanding
         if waiting is None:
-            raise refused("search.none_waits", then=NextCommand("propose"))
+            raise GroundedError(none_waits(workspace))
         return waiting.id
     if (name := name.lower()) != "best":
         workspace.candidate_bytes(name)  # raises if there is none
@@ -176,6 +179,46 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     if best is None:
         raise refused("search.no_trial")
     return best.candidate.id
+
+
+def overtaken(workspace: Folder) -> Finding | None:
+    """Return that task or model is not the one that the search's latest candidate was made with.
+
+    A candidate that was not run is void then. If it was run, its prediction is outdated.
+    """
+    trials = workspace.whole_trials()
+    for name in reversed(workspace.candidate_ids()):
+        with suppress(GroundedError):  # a damaged file is named elsewhere
+            made, meta = workspace.candidate(name)
+            if meta.get("kind") != "search":
+                continue
+            ran = any(one.trial.candidate == name for one in trials)
+            if meta.get("task") != workspace.task.hash:
+                why = other_task(workspace.task, made)
+                void = found("plan.void", name, candidate=name, why=why, other=1)
+                return None if ran else void
+            if made.model == workspace.planner.fingerprint:
+                return None
+            if ran:
+                return found("plan.outdated", name, candidate=name)
+            return found("plan.void", name, candidate=name, why=MODEL)
+    return None
+
+
+def none_waits(workspace: Folder, log: str = "", best: str = "") -> Finding:
+    """Return that no candidate waits for a trial; if the model was changed, that this is why.
+
+    Args:
+        workspace: the workspace.
+        log: the log of a run that was to be ingested, if any.
+        best: the candidate that it may have run instead, if any.
+    """
+    told = overtaken(workspace)
+    if told is None or told.facts.get("why") != MODEL:
+        told = found("search.none_waits", log=log or None)
+    ran = best if told.code == "search.none_waits" else told.about[0]
+    then = NextCommand("ingest", (log, "--candidate", ran)) if ran else None
+    return replace(told, weight=Weight.REFUSE, then=then if log else NextCommand("propose"))
 
 
 def latest_candidates(workspace: Folder, most: int) -> tuple[list[Candidate], list[Candidate]]:

@@ -195,7 +195,7 @@ def trust(
     if same:
         return _tested(made, now, same, replayed)
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
-    exact = not now.trials and not workspace.config.system.reachable
+    exact = not now.trials and not workspace.config.reachable
     measured = _by_diagnosis(workspace.task, diagnosis, since)
     untested = found("plan.untested", made.id, changed=int(bool(ran)), exact=int(exact))
     return untested.knowing(measured or {"logs": logs})

@@ -33,6 +33,7 @@ from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
     odd_run,
+    overtaken,
     standing_in,
     standing_without,
 )
@@ -206,10 +207,10 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         some.append(found("log.aside", added.id, waits=waits.id if waits else ""))
     if read.before:
         some.append(read.before.finding(used=not aside))
-    some += _of_trial(workspace, read, trial)
-    some += filter(None, _of_run(workspace, read, trial, tried, history))
     if now:
         some += _of_search(workspace, read, added, now)
+    some += _of_trial(workspace, read, trial)
+    some += filter(None, _of_run(workspace, read, trial, tried, history))
     told = settle(some)
     verdict = ASIDE if aside else _verdict(workspace, trial, tried)
     if ahead and verdict == "run again":
@@ -264,7 +265,9 @@ def _of_run(
 
 
 def _of_search(workspace: Folder, read: Read, added: Added, now: Standing) -> Iterator[Finding]:
-    """Yield what a run changed in the search."""
+    """Yield what a run changed in the search, and that it is judged by another model."""
+    if changed := overtaken(workspace):
+        yield changed.weighing(Weight.WARN)
     if read.doubted and added.id not in workspace.discarded():
         yield from odd_run(workspace, now, added.id, aside=_aside(read))
 

@@ -24,6 +24,8 @@ from grounded_trials.toml_table import Table, read_toml
 MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
 OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 FILE = "grounded.toml"
+DRIVE = "drive.py"  # the robot's program, as `init` writes it
+UNWRITTEN = "complete measure() and send() for your robot"  # in it until the user does
 OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
 
@@ -60,11 +62,6 @@ class SystemTable:
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     seed: int = 0
 
-    @property
-    def reachable(self) -> bool:
-        """Whether `run` can reach the system; otherwise the user runs candidates by hand."""
-        return bool(self.command or self.model)
-
 
 @dataclass(frozen=True)
 class Config:
@@ -80,6 +77,17 @@ class Config:
     system: SystemTable
     log: Table
     estimate: Table
+
+    @property
+    def reachable(self) -> bool:
+        """Whether `run` can reach the system; otherwise the user runs candidates by hand.
+
+        A program that `init` wrote can't before the user has completed it.
+        """
+        program, command = self.file.with_name(DRIVE), self.system.command
+        if DRIVE in command and program.is_file():
+            return UNWRITTEN not in program.read_text("utf-8", "replace")
+        return bool(command or self.system.model)
 
 
 def read_config(folder: Path) -> Config:

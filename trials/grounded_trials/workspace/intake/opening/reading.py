@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from grounded.checks import refused, same_dt, same_names
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.findings import Finding, Weight, found
 from grounded.trial import Trial
 from grounded.units import same_unit
@@ -22,7 +22,7 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.workspace.candidates.search_state import asked_again, standing_in
+from grounded_trials.workspace.candidates.search_state import asked_again, none_waits, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
@@ -152,10 +152,9 @@ def check_candidate(
 class NoneWaits(GroundedError):
     """Raised if no candidate is waiting for a trial; `best` may have been run again."""
 
-    def __init__(self, path: Path, best: str) -> None:
-        then = NextCommand("ingest", (str(path), "--candidate", best)) if best else None
-        super().__init__(refused("search.none_waits", log=str(path), then=then).finding)
-        self.best = best
+    def __init__(self, workspace: Folder, path: Path, best: str) -> None:
+        super().__init__(none_waits(workspace, str(path), best))
+        self.best = best if self.finding.code == "search.none_waits" else ""
 
 
 def outstanding(workspace: Folder, path: Path) -> str:
@@ -164,7 +163,7 @@ def outstanding(workspace: Folder, path: Path) -> str:
     if now.outstanding is None and (asked := asked_again(workspace)):
         return asked
     if now.outstanding is None:
-        raise NoneWaits(path, now.incumbent.candidate.id if now.incumbent else "")
+        raise NoneWaits(workspace, path, now.incumbent.candidate.id if now.incumbent else "")
     return now.outstanding.id
 
 

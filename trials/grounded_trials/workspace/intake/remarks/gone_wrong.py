@@ -93,7 +93,10 @@ def _missed(
 
 
 def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
-    """Return that an input acted the other way round, given the other trials."""
+    """Return that an input acted the other way round, given the other trials.
+
+    If it did so in all of them, the model has the wrong sign: no run is at fault.
+    """
     from grounded.search.run_motion import signs_of
 
     each = [
@@ -102,8 +105,10 @@ def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
         if one.id != trial.id
     ]
     right, wrong = (tuple(name for name, sign in each if sign == s) for s in (1, -1))
-    said = turned.also(others=right, alike=() if right else wrong, trial=trial.id)
-    return said if right or trial.candidate else said.weighing(Weight.WARN)
+    said = turned.also(others=right, alike=() if right else wrong)
+    if right or (trial.candidate and not wrong):
+        return said.also(trial=trial.id)
+    return said.weighing(Weight.WARN)
 
 
 def ended_early(workspace: Folder, trial: Trial, silent: Sequence[str] = ()) -> Finding | None:
