@@ -29,10 +29,10 @@ def command(name: str, json_: bool) -> None:
 
     family, _, target = name.partition(":")
     findings = {one: vars(entry_of(one)) for one in codes() if name in ("", one)}
-    library = {one.name: one for one in installed_effects().families}
-    chosen = [library[one] for one in library if family in ("", one)]
+    library = installed_effects().families
+    chosen = [one for one in library if family in ("", one.name)]
     if not findings and not chosen:
-        near = alike(name, codes()) or alike(family, library) or None
+        near = alike(name, codes()) or alike(family, [one.name for one in library]) or None
         known = None if near else "those that `grounded explain` lists"
         raise refused("given.name", name, kind="code or effect", near=near, known=known)
     effects = _described(chosen, target) if chosen else {}

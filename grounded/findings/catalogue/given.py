@@ -43,9 +43,7 @@ ENTRIES: dict[str, Entry] = {
         "[[{of} has]][[!of? there is]] no {kind} '{about}'[[: did you mean '{near}'?]][[: there "
         "are {known}]]",
     ),
-    "twice": Entry(
-        "refuse", "'{name}' stands twice in {about}[[, as {kinds}]]", "change one of them"
-    ),
+    "twice": Entry("refuse", "'{name}' stands twice in {about}[[, as {kinds}]]", "change one"),
     "either": Entry(
         "refuse",
         "{about}: expected {how:one=exactly one of them,both=both or none,first=the second only "

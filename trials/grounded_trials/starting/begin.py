@@ -279,7 +279,7 @@ class _Draft:
             return
         self._match({name: one.path for name, one in numbers.items()})
         if not self.named:
-            self.why += f"; other inputs than by --inputs {','.join(self.model.inputs)}"
+            self.why += f"; inputs guessed, as by --inputs {','.join(self.model.inputs)}"
         left = [n for n in numbers if n not in {**self.model.states, **self.model.inputs}]
         odd = [found("start.unused", *reversed(left))] * bool(left)
         if not set(self.model.inputs) & set(numbers):

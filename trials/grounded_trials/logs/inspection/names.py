@@ -68,13 +68,11 @@ _COMMANDED = (
     *("action", "output"),
 )
 COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target|^/action$")
-_ANGLES = ("roll", "pitch", "yaw")
 # no signals by themselves
 PARTS = re.compile(
     r"covariance|variance|\.error\.(positions|velocities|accelerations|effort)\[|_var(\[\d+\])?$|\.(eph|epv|evh|evv)$|layout"
     r"|(orientation|rotation|quaternion)\.[xyzw]$|\.q(_d)?\[\d\]$"
 )
-_QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels
     "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
