@@ -54,12 +54,12 @@ INPUTS = {inputs}
 
 def measure():
     """Return the robot's current states in the order of STATES, one number each."""
-    raise SystemExit("{unwritten}")
+    raise SystemExit("{left}")
 
 
 def send(u):
     """Send the inputs u, in the order of INPUTS; they are within [limits]."""
-    raise SystemExit("{unwritten}")
+    raise SystemExit("{left}")
 
 
 def main(candidate, trial):
@@ -100,8 +100,7 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         task = _task(model, dt or DT)
         columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
         write_target(folder / "target.csv", task.dt, columns)
-        names = {"states": dict(model.states), "inputs": dict(model.inputs)}
-        drive = RUNS.format(**names, unwritten=f"{DRIVE}: {UNWRITTEN}")
+        drive = RUNS.format(states=dict(model.states), inputs=dict(model.inputs), left=UNWRITTEN)
         write_atomically(folder / DRIVE, drive.encode())
         name = f"{model.name or own.file.stem}: set your own target, weights and limits"
         text = toml_of(task, name, COMMAND, explicit=True)

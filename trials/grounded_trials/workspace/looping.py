@@ -126,6 +126,9 @@ def next_in(
     if taken.then.verb == "discard":
         return NextRun(taken, None, None)
     proposed, exported = propose_in(workspace), None
+    told = {(one.code, one.about) for one in taken.findings}
+    more = tuple(one for one in proposed.findings if (one.code, one.about) not in told)
+    proposed = replace(proposed, findings=more)
     if proposed.candidate is not None:
         name, form = proposed.candidate.id, exported_as(workspace, taken.candidate or "")
         runner = runner and form in ("", "npz")

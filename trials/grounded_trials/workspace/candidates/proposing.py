@@ -182,8 +182,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open
 
-        again = any(one.facts.get("why") == MODEL for one in changed)
-        first = left_open(workspace, proposal, again)
+        first = left_open(workspace, proposal, MODEL in [c.facts.get("why") for c in changed])
         notes += first
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)

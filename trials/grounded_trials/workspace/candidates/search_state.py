@@ -193,15 +193,13 @@ def overtaken(workspace: Folder) -> Finding | None:
             if meta.get("kind") != "search":
                 continue
             ran = any(one.trial.candidate == name for one in trials)
-            if meta.get("task") != workspace.task.hash:
-                why = other_task(workspace.task, made)
-                void = found("plan.void", name, candidate=name, why=why, other=1)
-                return None if ran else void
-            if made.model == workspace.planner.fingerprint:
-                return None
+            other = meta.get("task") != workspace.task.hash
+            changed = not other and made.model != workspace.planner.fingerprint
             if ran:
-                return found("plan.outdated", name, candidate=name)
-            return found("plan.void", name, candidate=name, why=MODEL)
+                return found("plan.outdated", name, candidate=name) if changed else None
+            why = other_task(workspace.task, made) if other else MODEL
+            void = found("plan.void", name, candidate=name, why=why, other=int(other))
+            return void if other or changed else None
     return None
 
 

@@ -25,7 +25,7 @@ MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
 OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 FILE = "grounded.toml"
 DRIVE = "drive.py"  # the robot's program, as `init` writes it
-UNWRITTEN = "complete measure() and send() for your robot"  # in it until the user does
+UNWRITTEN = "drive.py: complete measure() and send() for your robot"  # in it until the user does
 OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
 
