@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from grounded.checks import of_type, wrong
 from grounded.effects import param_name
@@ -31,9 +31,6 @@ from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 from grounded_trials.plain_file import unreadable
-
-if TYPE_CHECKING:
-    pass
 
 LINEAR = ("c", "k", "A", "B", "a", "b")  # parameters that an added rate is proportional to
 STEEP = 3.0  # largest change of speed by dry friction in one step, in units of its width
