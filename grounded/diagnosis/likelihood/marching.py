@@ -136,7 +136,10 @@ class Arrival(NamedTuple):
                 still = {names[j]: before[j] for group in self.order[k:] for j in group}
                 now = [sent[n] + still.get(n, 0.0) for n in names]
                 after = base(s, Named("input", names, now), p, (end - at) * dt)
-                s, at = Named("state", model.state_names, [after[n] for n in after]), end
+                s, at = (
+                    Named("state", model.state_names, [after[n] for n in model.state_names]),
+                    end,
+                )
             return dict(s)
 
         def led(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
@@ -171,8 +174,8 @@ def _compiled(predictor: Predictor, h: Hypothesis, arrival: Arrival | None) -> M
         return None
     if arrival is not None and any(getattr(f, "parts", 0) for f in families):
         return None  # limits of rates step without leads
-    model = data.model if arrival is None else arrival.around(data.model)
     try:
+        model = data.model if arrival is None else arrival.around(data.model)
         for effect, values in sorted(h.pairs, key=lambda pair: _outer(pair[0])):
             if isinstance(effect.family, LossFamily | RateFamily):
                 at = replace(effect.site, model=model)

@@ -13,6 +13,7 @@ from grounded.diagnosis.likelihood.joint_memory import remembering
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ruler import missed
 from grounded.effects import Library
+from grounded.effects.plain_step import plain_step
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 
@@ -41,6 +42,16 @@ def valued(effect, part):
         low, high = max(q.low, -0.2), min(q.high, 0.4)
         found[q.name] = float(np.quantile(q.grid, part)) if q.grid else low + part * (high - low)
     return found
+
+
+def turned(model):
+    """The model as a step that returns its states in another order."""
+    step = plain_step(model)
+
+    def backwards(s, a, p, dt):
+        return dict(reversed(step(s, a, p, dt).items()))
+
+    return replace(model, derivative=None, step=backwards)
 
 
 @pytest.mark.parametrize(("model", "freed"), [(pendulum, True), (car, False)])
@@ -75,8 +86,8 @@ def test_all_folds_together_are_each_alone(model, freed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("before", ["", "delay", "first_order_lag"])
-def test_a_compiled_hypothesis_goes_where_its_steps_lead(before, monkeypatch):
-    model = pendulum
+@pytest.mark.parametrize("model", [pendulum, turned(pendulum)], ids=["derivative", "step"])
+def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, before, monkeypatch):
     monkeypatch.setattr(marching, "STEPS_TO_COMPILE", 1)
     data = data_of(model)
     predictor, compiled, refused = Predictor(data), set(), set()
