@@ -7,6 +7,7 @@ unless it is better than the best from either start.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from grounded.accounts.sent import STEPS_TO_JUDGE
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
+from grounded.search.candidate import Tried
 from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
 from grounded.task import Task
@@ -53,7 +55,8 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     cost = abs(task.utility(trial))
     if not np.isfinite(cost) or len(states) <= trial.finite_steps:
         cost = -own.predicted_utility
-    least = max(_scatter(workspace, trial, cost), TOLD * cost)
+    others = standing_without(workspace, {trial.id})
+    least = max(_scatter(others.history, cost), TOLD * cost)
     each = {int(i): abs(_changes(workspace, trial, off * (np.arange(len(off)) == i))) for i in far}
     told = sorted((i for i in each if each[i] > least), key=lambda i: -each[i])
     if not told:
@@ -69,7 +72,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     }
     facts |= {"change": whole} if abs(whole) > least else {}
     names = tuple(task.model.state_names[i] for i in told)
-    best = standing_without(workspace, {trial.id}).incumbent
+    best = others.incumbent
     lead = np.nan if best is None else task.utility(trial) - best.utility
     stands = min(lead, lead - whole) > 0  # better than the best from either start
     if any(each[i] > most and not usual[i] for i in told) and not stands:
@@ -102,15 +105,13 @@ def _to_repeat(workspace: Folder, trial: Trial) -> bool:
     return any(t.in_doubt and t.to_settle == t.candidate.id == trial.candidate for t in history)
 
 
-def _scatter(workspace: Folder, trial: Trial, cost: float) -> float:
+def _scatter(others: Sequence[Tried], cost: float) -> float:
     """Return the std of single runs of about this cost, by repeats among the others; 0 if unknown.
 
     Args:
-        workspace: the workspace with the other runs.
-        trial: the run, whose own start must not count as scatter.
+        others: the history without the run, whose own start must not count as scatter.
         cost: what such runs cost.
     """
-    others = standing_without(workspace, {trial.id}).history
     return float(np.nan_to_num(np.sqrt(Repeats(others).near(-cost).variance)))
 
 
