@@ -448,30 +448,36 @@ def _kind(wrong: str) -> str:
     return "hang" if wrong == "hang" else "traceback"
 
 
-def _attacked(
-    rng: random.Random, seconds: float, attack: Callable[[Tally, list[str], str], None]
-) -> Tally:
-    """Attack each writing command in a copy of a workspace, repeat it alone, verify the copy."""
-    tally = Tally()
+def _copies(seconds: float) -> Iterator[tuple[int, Path, Path, set[str]]]:
+    """Yield numbered copies of a workspace, with a run to ingest and the trials it has."""
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder, "prepared")
         base.mkdir()
         original, run = prepared(base)
         before = {path.name for path in (original / "trials").glob("*.mcap")}
         for k in during(seconds):
-            command = WRITING[k % len(WRITING)]
             copy = Path(folder, f"copy{k}")
             shutil.copytree(base, copy)
-            words = words_of(command, copy / "w", run)
-            tally.tries += 1
-            tally.note[command[0]] += 1
-            attack(tally, words, f"{command[0]} {k}")
-            shutil.rmtree(copy / "saved.mcap", ignore_errors=True)
-            (copy / "w" / "saved.mcap").unlink(missing_ok=True)
-            if wrong := _starved(words):
-                tally.add(_kind(wrong), f"{command[0]} {k}, again: {wrong}")
-            _proved(tally, f"{command[0]} {k}", copy / "w", before)
+            yield k, copy, run, before
             shutil.rmtree(copy)
+
+
+def _attacked(
+    rng: random.Random, seconds: float, attack: Callable[[Tally, list[str], str], None]
+) -> Tally:
+    """Attack each writing command in a copy of a workspace, repeat it alone, verify the copy."""
+    tally = Tally()
+    for k, copy, run, before in _copies(seconds):
+        command = WRITING[k % len(WRITING)]
+        words = words_of(command, copy / "w", run)
+        tally.tries += 1
+        tally.note[command[0]] += 1
+        attack(tally, words, f"{command[0]} {k}")
+        shutil.rmtree(copy / "saved.mcap", ignore_errors=True)
+        (copy / "w" / "saved.mcap").unlink(missing_ok=True)
+        if wrong := _starved(words):
+            tally.add(_kind(wrong), f"{command[0]} {k}, again: {wrong}")
+        _proved(tally, f"{command[0]} {k}", copy / "w", before)
     return tally
 
 
@@ -504,31 +510,23 @@ def short_writes(rng: random.Random, seconds: float) -> Tally:
 def crowds(rng: random.Random, seconds: float) -> Tally:
     """Run six commands of all kinds at once in one workspace, then `verify`."""
     tally = Tally()
-    with tempfile.TemporaryDirectory() as folder:
-        base = Path(folder, "prepared")
-        base.mkdir()
-        original, run = prepared(base)
-        before = {path.name for path in (original / "trials").glob("*.mcap")}
-        for k in during(seconds):
-            copy = Path(folder, f"copy{k}")
-            shutil.copytree(base, copy)
-            chosen = [rng.choice((*WRITING[1:-1], ("status",), ("verify",))) for _ in range(6)]
-            running = [
-                subprocess.Popen(
-                    [*COMMAND, *words_of(words, copy / "w", run)],
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                )
-                for words in chosen
-            ]
-            for words, child in zip(chosen, running, strict=True):
-                tally.tries += 1
-                out, _ = child.communicate()
-                if "Traceback" in out or child.returncode not in (0, 1, 3):
-                    tally.add("traceback", f"{words} among {chosen}: {out}")
-            _proved(tally, f"crowd {k}: {chosen}", copy / "w", before)
-            shutil.rmtree(copy)
+    for k, copy, run, before in _copies(seconds):
+        chosen = [rng.choice((*WRITING[1:-1], ("status",), ("verify",))) for _ in range(6)]
+        running = [
+            subprocess.Popen(
+                [*COMMAND, *words_of(words, copy / "w", run)],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            for words in chosen
+        ]
+        for words, child in zip(chosen, running, strict=True):
+            tally.tries += 1
+            out, _ = child.communicate()
+            if "Traceback" in out or child.returncode not in (0, 1, 3):
+                tally.add("traceback", f"{words} among {chosen}: {out}")
+        _proved(tally, f"crowd {k}: {chosen}", copy / "w", before)
     return tally
 
 
