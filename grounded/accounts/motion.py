@@ -27,10 +27,8 @@ HORIZONS, LOUD = (AHEAD_S, 0.5, 1.0), 4.0  # [s] tried in turn; motion over nois
 FLOOR = 0.05  # of a motion: smaller errors count as this
 DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
 FEWEST_SAMPLES = 20  # fewest samples
-SMALLEST_ERROR, TINY = (
-    1e-3,
-    1e-12,
-)  # smallest error that counts: of a state's spread, and in its unit
+# smallest error that counts: of a state's spread, and in its unit
+SMALLEST_ERROR, TINY = 1e-3, 1e-12
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin

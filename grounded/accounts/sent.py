@@ -54,9 +54,7 @@ class Following:
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
     until_s: float  # the commands are alike up to this time [s]
-    opens: (
-        bool  # they are alike until then, at least `STEPS_TO_JUDGE` steps, not only at their limits
-    )
+    opens: bool  # they are alike for at least `STEPS_TO_JUDGE` steps, not only at their limits
     late: int  # steps by which the log is late
     age: float  # of the states that it acted on, where its commands are logged [steps]
     moved: float  # squared difference at `late`, relative to that without shift

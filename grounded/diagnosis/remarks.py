@@ -23,7 +23,6 @@ from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model, all_at_bounds
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Diagnosis
     from grounded.diagnosis.validation.claims import Claims
     from grounded.task import Task
     from grounded.trial import Trial

@@ -80,9 +80,8 @@ class Work:
     given_up: bool = False  # can't catch up with its rivals
     moving: bool = True  # the track moves with the step; at kinks of the model this may not help
     along: Predictor | None = None  # predictor of its own track, during the fit
-    share: float = (
-        1.0  # of the thresholds PROMISE_SHORTENED, PROMISE_LAST and RISE_ENDS, below which it ends
-    )
+    # of the thresholds PROMISE_SHORTENED, PROMISE_LAST and RISE_ENDS, below which it ends
+    share: float = 1.0
 
     def shorten(self, data: Data) -> None:
         """Retry the step with the track held, then shorter ones; stop if they are too short."""
