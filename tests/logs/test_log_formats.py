@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.formats.tables import npz_records
+from grounded_trials.formats.tables import npz_tables
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import log_files
@@ -279,7 +279,7 @@ def test_zstd_files_of_any_log(tmp_path):
 def test_an_exported_candidate_is_no_log(cart_candidate):
     folder, file = cart_candidate
     with pytest.raises(GroundedError, match=holding("c0001.npz", "candidate c0001")):
-        list(npz_records(file))
+        list(npz_tables(file))
     for k in range(4):
         (folder / f"drive{'abcd'[k]}.csv").write_text("t,x\n0,0\n")
     with pytest.raises(GroundedError, match=holding(4)):

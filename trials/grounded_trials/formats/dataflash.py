@@ -1,4 +1,4 @@
-"""Convert ArduPilot's logs, `.bin`, to log records.
+"""Read ArduPilot's logs, `.bin`.
 
 A log is a sequence of messages: A3 95, a type, a body of fixed length. Messages FMT say the name,
 length, fields and names of each type; FMTU, UNIT and MULT the fields' units. A type becomes a topic
@@ -20,11 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.findings import found
-from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import Columns, column_name, table_records
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout, Tables, column_name
 
 BEGINS = b"\xa3\x95\x80"  # a log's first message is an FMT
 HEAD, FMT, FMT_LENGTH = BEGINS[:2], 0x80, 89
@@ -58,22 +55,11 @@ class _Type:
         return np.dtype(list(zip(self.columns, kinds, strict=True)))
 
 
-def dataflash_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a log.
-
-    Raises:
-        GroundedError: if no message in it has numbers and a time.
-    """
+def dataflash_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the messages of a log that have numbers and a time."""
     data = path.read_bytes()
-    tables: dict[str, Columns] = {}
-    for kind in _types(data):
-        for topic, rows in _instances(kind, _rows(data, kind)):
-            columns = _numbers(kind, rows)
-            if columns:
-                tables[topic] = columns
-    if not tables:
-        raise GroundedError(found("file.no_times", str(path)))
-    yield from table_records(tables, "dataflash", path)
+    instances = (one for kind in _types(data) for one in _instances(kind, _rows(data, kind)))
+    return {topic: columns for kind, topic, rows in instances if (columns := _numbers(kind, rows))}
 
 
 def dataflash_units(path: Path) -> dict[str, str]:
@@ -84,7 +70,7 @@ def dataflash_units(path: Path) -> dict[str, str]:
     return {
         f"{topic}.{column_name(column)}": SPELLED.get(labels[letter], labels[letter])
         for kind in types
-        for topic, _ in _instances(kind, _rows(data, kind))
+        for _, topic, _ in _instances(kind, _rows(data, kind))
         for column, letter in zip(kind.columns, kind.units, strict=False)
         if labels.get(letter)
     }
@@ -148,15 +134,16 @@ def _texts(data: bytes, types: list[_Type], name: str, key: str, value: str) -> 
     return pairs
 
 
-def _instances(kind: _Type, rows: Any) -> Iterator[tuple[str, Any]]:
+def _instances(kind: _Type, rows: Any) -> Iterator[tuple[_Type, str, Any]]:
     """Yield the topic of each sensor of a type, and its messages."""
     name = re.sub(r"\W", "_", kind.name)
     counted = [c for c, unit in zip(kind.columns, kind.units, strict=False) if unit == INSTANCE]
     if not counted or not len(rows) or rows[counted[0]].dtype.kind not in "iu":
-        yield f"/{name}", rows
+        yield kind, f"/{name}", rows
         return
     for number in np.unique(rows[counted[0]]).tolist():
-        yield f"/{name}" + f"_{number}" * (number != 0), rows[rows[counted[0]] == number]
+        topic = f"/{name}" + f"_{number}" * (number != 0)
+        yield kind, topic, rows[rows[counted[0]] == number]
 
 
 def _numbers(kind: _Type, rows: Any) -> dict[str, Floats]:

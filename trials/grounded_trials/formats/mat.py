@@ -1,4 +1,4 @@
-"""Convert MATLAB files to log records: version 5 (and 7) by SciPy, 7.3, which is HDF5, by h5py.
+"""Read the tables of MATLAB files: version 5 (and 7) by SciPy, 7.3, which is HDF5, by h5py.
 
 A struct with a column of times becomes a topic, `/run.q`, with its arrays of that length; so do the
 arrays of the file itself, `/mat.q`. Structs inside it without times of their own use those. The two
@@ -18,16 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Columns,
     Layout,
+    Tables,
     column_name,
     columns_by_name,
     is_time,
-    table_records,
 )
 from grounded_trials.plain_file import unreadable
 
@@ -43,42 +42,36 @@ class _Object:
         self.kind = kind
 
 
-def mat_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
-    """Yield the records of a MATLAB file of version 5.
-
-    Raises:
-        GroundedError: if no struct or array in it has times.
-    """
+def mat_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the tables of a MATLAB file of version 5; raises as `mat73_tables`."""
     from scipy.io import loadmat
 
     with warnings.catch_warnings():  # of two variables with one name the last counts
         warnings.simplefilter("ignore")
         content = loadmat(path, simplify_cells=True, appendmat=False)
-    yield from _records(
-        {k: _plain(v) for k, v in content.items() if k[:2] != "__"}, path, layout.rate
-    )
+    return _tables_in({k: _plain(v) for k, v in content.items() if k[:2] != "__"}, path, layout)
 
 
-def mat73_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
-    """Yield the records of a MATLAB file of version 7.3.
+def mat73_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the tables of a MATLAB file of version 7.3.
 
     Raises:
-        GroundedError: if no struct or array in it has times.
+        GroundedError: if it holds nothing but objects of MATLAB's own classes.
     """
     import h5py
 
     with h5py.File(path, "r") as file:
-        yield from _records(_struct(file), path, layout.rate)
+        return _tables_in(_struct(file), path, layout)
 
 
-def _records(content: Mapping[str, Any], path: Path, rate: float) -> Iterator[Record]:
-    """Yield the records of nested dictionaries, lists, arrays and texts.
+def _tables_in(content: Mapping[str, Any], path: Path, layout: Layout) -> Tables:
+    """Return the tables in nested dictionaries, lists, arrays and texts.
 
     With a rate, what has no times is as long as the longest array.
     """
     rows = max((max(a.shape) for a in map(_numbers, content.values()) if a is not None), default=0)
-    outer = np.arange(rows) / rate if rate else None
-    tables: dict[str, Columns] = {}
+    outer = np.arange(rows) / layout.rate if layout.rate else None
+    tables: Tables = {}
     for topic, clock, columns in _tables(content, ("mat",), outer, path):
         while topic in tables and not np.array_equal(next(iter(tables[topic].values())), clock):
             topic += "_"  # another clock in the same struct
@@ -88,7 +81,7 @@ def _records(content: Mapping[str, Any], path: Path, rate: float) -> Iterator[Re
         kinds = tuple(dict.fromkeys(objects.values()))
         why = f"{', '.join(objects)}: {', '.join(kinds)}"
         raise unreadable(path, why, kind="MATLAB class")
-    yield from table_records(tables, "mat", path)
+    return tables
 
 
 def _plain(value: Any) -> Any:
@@ -202,14 +195,14 @@ def _numbers(one: Any) -> Floats | None:
     return a.astype(float) if a.dtype.kind in NUMBERS and 0 < a.ndim <= 2 and a.size else None
 
 
-def _columns(name: str, a: Floats | None, rows: int) -> Iterator[tuple[str, str, Floats]]:
+def _columns(name: str, a: Floats | None, rows: int) -> Iterator[tuple[str, Floats]]:
     """Yield the columns of an array (N, k), (N,) or (k, N), by name."""
     if a is None or rows not in a.shape:
         return
     bare = column_name(name)
     if a.ndim == 1:
-        yield bare, name, a
+        yield bare, a
         return
     wide = a if a.shape[0] == rows else a.T
     for i, column in enumerate(wide.T):
-        yield f"{bare}[{i}]", name, column
+        yield f"{bare}[{i}]", column

@@ -1,4 +1,4 @@
-"""Convert parquet tables, and the episodes of LeRobot's data sets, to log records.
+"""Read parquet tables, and the episodes of LeRobot's data sets.
 
 A table's columns of numbers become the topic /parquet; lists of one length are arrays. A LeRobot
 data set is a folder with meta/info.json, which names the numbers of each feature; its episodes are
@@ -14,24 +14,19 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import found
-from grounded_trials.formats.mcap_records import Header, Record
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
-    Columns,
     Layout,
+    Tables,
     column_name,
     columns_by_name,
-    table_records,
 )
 from grounded_trials.plain_file import read_file
 
@@ -41,7 +36,8 @@ EPISODE_LIMIT = 10**6
 WIDEST = 100  # numbers of a list that is an array of signals; longer ones are pictures or scans
 COUNTED = ("frame_index", "episode_index", "index", "task_index", "timestamp")  # no signals
 FIRST, LAST = ("observation.state",), ("action",)  # order of the topics
-IDS = ("episode_index", "data/chunk_index", "data/file_index")  # of a file in meta/episodes
+KEY = "episode_index"
+PLACES = {"data/chunk_index": "chunk_index", "data/file_index": "file_index"}  # in meta/episodes
 
 
 def is_dataset(folder: Path) -> bool:
@@ -71,58 +67,47 @@ def episode_files(path: Path) -> list[Path]:
     return alone or [*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]
 
 
-def parquet_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
-    """Yield the records of a parquet table, which needs a column of times or a rate.
-
-    A file with one episode of a LeRobot data set is read as that.
-
-    Raises:
-        GroundedError: if it has no times.
-    """
+def parquet_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return a parquet table, or of a file with one episode of a LeRobot data set that."""
     home = next((one for one in path.parents[:3] if is_dataset(one)), None)
     if home is not None and EPISODE.fullmatch(path.stem):
-        yield from episode_records(home / path.stem)
-        return
-    file = _opened(path)
+        return episode_tables(home / path.stem)
+    table = _read(path)
     named = [
-        (column_name(name), name, values)
-        for column in file.schema_arrow.names
-        for name, values in _numbers(column, file.read([column], use_threads=False)[column])
+        (column_name(name), values)
+        for column in table.column_names
+        for name, values in _numbers(column, table[column])
     ]
-    yield from table_records(
-        {"/parquet": columns_by_name(named, path)}, "parquet", path, layout.rate
-    )
+    return {"/parquet": columns_by_name(named, path)}
 
 
-def episode_records(path: Path) -> Iterator[Record]:
-    """Yield the records of an episode, FOLDER/episode_000003.
+def episode_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the features of an episode, FOLDER/episode_000003, a table each.
 
     Raises:
         GroundedError: if the data set's meta/info.json can't be used, or it has no such episode.
     """
     folder, number = path.parent, int(path.name.partition("_")[2])
     info = _info(folder)
-    features = {
-        key: one
-        for key, one in info["features"].items()
-        if key not in COUNTED and not key.startswith("next.") and _is_signal(one)
-    }
-    file, rows = _rows_of(folder, info, number, [*features, "frame_index", "timestamp"])
-    if not len(rows.get("frame_index", ())):
+    file = _file_of(folder, info, number)
+    table = _read(file, filters=[(KEY, "=", number)]) if file else None
+    if table is None or not len(table) or "frame_index" not in table.column_names:
         high = info["total_episodes"] - 1
         raise wrong("episode", got=path.name, must="whole", low=0, high=high)
-    times = rows["frame_index"][:, 0] / float(info["fps"])
-    tables: dict[str, Columns] = {}
-    for key in sorted(features, key=lambda key: (key not in FIRST, key in LAST)):
-        if key in rows:
-            names = _names(features[key], rows[key].shape[1])
-            columns = zip(names, names, rows[key].T, strict=True)
-            tables["/" + key.replace(".", "/")] = {"timestamp_s": times} | columns_by_name(
-                columns, file
-            )
-    writer = f"LeRobot {info['codebase_version']}, episode {number} of {info['total_episodes']}"
-    for record in table_records(tables, "lerobot", path):
-        yield replace(record, library=writer) if isinstance(record, Header) else record
+    times = table["frame_index"].to_numpy() / float(info["fps"])
+    signals = [
+        key
+        for key, one in info["features"].items()
+        if key not in COUNTED and not key.startswith("next.") and _is_signal(one)
+    ]
+    tables: Tables = {}
+    for key in sorted(signals, key=lambda key: (key not in FIRST, key in LAST)):
+        if key in table.column_names:
+            columns = [values for _, values in _numbers(key, table[key])]
+            named = zip(_names(info["features"][key], len(columns)), columns, strict=True)
+            times_of = {"timestamp_s": times}
+            tables["/" + key.replace(".", "/")] = times_of | columns_by_name(named, path)
+    return tables
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -170,62 +155,27 @@ def _names(feature: Mapping[str, Any], count: int) -> list[str]:
     return [f"{name}_{i}" if again[name] > 1 else name for i, name in enumerate(names)]
 
 
-def _rows_of(
-    folder: Path, info: Mapping[str, Any], number: int, wanted: Sequence[str]
-) -> tuple[Path, dict[str, Any]]:
-    """Return the file with an episode, and its columns as arrays (N, k)."""
-    place = {"episode_index": number, "episode_chunk": number // max(int(info["chunks_size"]), 1)}
+def _file_of(folder: Path, info: Mapping[str, Any], number: int) -> Path | None:
+    """Return the file with an episode, None if the data set has none of its own."""
+    place = {KEY: number, "episode_chunk": number // max(int(info["chunks_size"]), 1)}
     for listing in sorted(folder.glob("meta/episodes/*/*.parquet")):
-        known, chunk, file = (values[:, 0] for values in _read(listing, IDS).values())
-        at = np.flatnonzero(known == number)
-        if len(at):
-            place |= {"chunk_index": int(chunk[at[0]]), "file_index": int(file[at[0]])}
-            break
+        rows = _read(listing, columns=list(PLACES), filters=[(KEY, "=", number)]).to_pylist()
+        place |= {name: row[key] for row in rows[:1] for key, name in PLACES.items()}
     try:
         path = folder / str(info["data_path"]).format(**place)
     except (KeyError, IndexError, ValueError, AttributeError):
-        return folder, {}
-    if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
-        return path, {}
-    return path, _read(path, wanted, number)
+        return None
+    return path if path.is_file() and path.resolve().is_relative_to(folder.resolve()) else None
 
 
-def _read(path: Path, names: Sequence[str], episode: int | None = None) -> dict[str, Any]:
-    """Return columns of a file as arrays (N, k), of one episode or of all rows."""
-    file, key = _opened(path), "episode_index"
-    there = [name for name in names if name in file.schema_arrow.names]
-    parts: dict[str, list[Any]] = {name: [] for name in there}
-    for group in range(file.num_row_groups):
-        if episode is not None and not _may_hold(file, group, key, episode):
-            continue
-        table = file.read_row_group(group, list({*there, key}), use_threads=False)
-        rows = slice(None)
-        if episode is not None:
-            rows = np.asarray(table[key]) == episode
-        for name in there:
-            columns = [values for _, values in _numbers(name, table[name])]
-            if columns:
-                parts[name].append(np.column_stack(columns)[rows])
-    return {name: np.concatenate(some) for name, some in parts.items() if some}
-
-
-def _may_hold(file: Any, group: int, key: str, value: int) -> bool:
-    """Check by its statistics whether a row group may hold a value of a column."""
-    about = file.metadata.row_group(group)
-    for i in range(about.num_columns):
-        column = about.column(i)
-        if column.path_in_schema == key and column.is_stats_set and column.statistics.has_min_max:
-            return bool(column.statistics.min <= value <= column.statistics.max)
-    return True
-
-
-def _opened(path: Path) -> Any:
+def _read(path: Path, **some: Any) -> Any:
+    """Return a parquet file as a table of pyarrow; for `some` see `pyarrow.parquet.read_table`."""
     import pyarrow
-    from pyarrow.parquet import ParquetFile
+    from pyarrow.parquet import read_table
 
     # the other pools of memory reserve more addresses than a log's limit
     pyarrow.set_memory_pool(pyarrow.system_memory_pool())
-    return ParquetFile(path, pre_buffer=False)
+    return read_table(path, use_threads=False, pre_buffer=False, partitioning=None, **some)
 
 
 def _numbers(name: str, column: Any) -> Iterator[tuple[str, Any]]:

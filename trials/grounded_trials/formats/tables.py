@@ -1,9 +1,10 @@
-"""Convert tables of numbers to log records: `.npz` and PX4's `.ulg`; `text_tables` reads `.csv`.
+"""Tables of numbers as log records; those of `.npz` and PX4's `.ulg` are read here.
 
-A table becomes a topic whose messages hold a stamp and one double per column, so that tables are
-read like bags: `/csv.speed`, `/run03.q[1]`, `/vehicle_attitude.q[0]`. Every table needs a column of
-times, which is stated in the name of its type ("csv, time in 't'"). Names keep letters, digits and
-underscores; a unit in brackets is left out.
+Every reader of tables is a function (path, layout) -> {topic: {column: numbers}}; `text_tables` has
+that of `.csv`. `table_records` makes a topic of each table, whose messages hold a stamp and one
+double per column, so that tables are read like bags: `/csv.speed`, `/run03.q[1]`. Every table needs
+a column of times, which is stated in the name of its type ("csv, time in 't'"). Names keep letters,
+digits and underscores; a unit in brackets is left out.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LATEST = 4e18  # [ns], the year 2096
 
 Columns = Mapping[str, Floats]
+Tables = dict[str, Columns]  # by topic
 
 
 @dataclass(frozen=True)
@@ -56,77 +58,59 @@ class Layout:
 AS_IT_SAYS = Layout()
 
 
-def columns_by_name(columns: Iterable[tuple[str, str, C]], path: Path) -> dict[str, C]:
-    """Return columns by their names, which no two may share.
-
-    A name that stands twice would say nothing of which column it means, and the last one would be
-    taken without a word; so would one of two names that are equal without their units.
-
-    Args:
-        columns: (name, the name as the file writes it, column); without a name it is left out.
-        path: the file, for messages.
+def columns_by_name(columns: Iterable[tuple[str, C]], path: Path) -> dict[str, C]:
+    """Return columns by their names, which no two may share; one without a name is left out.
 
     Raises:
-        GroundedError: if two have the same name.
+        GroundedError: if two have the same name: which one it means would be unclear.
     """
     by_name: dict[str, C] = {}
-    written: dict[str, str] = {}
-    for name, cell, column in columns:
+    for name, column in columns:
         if name in by_name:
             raise GroundedError(found("given.twice", str(path), name=name))
         if name:
-            by_name[name], written[name] = column, cell
+            by_name[name] = column
     return by_name
 
 
-def npz_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
-    """Yield the records of a NumPy archive: arrays of one length and their times.
+def npz_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the tables of a NumPy archive: arrays of one length and their times.
 
     `NAME` (N, k) with `NAME_t` (N,) becomes the table /NAME, its columns named by an array of k
     texts if there is one; arrays (N,) with a time of that length become the table /npz. With a
     rate, the longest array and those of its length are that.
 
     Raises:
-        GroundedError: if it has no times.
+        GroundedError: if it is an exported candidate.
     """
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     if arrays.keys() >= CANDIDATE:
         head = f"candidate {arrays['candidate']}"
         raise GroundedError(found("file.no_log", str(path), head=head))
-    yield from table_records(_npz_tables(arrays, path, layout.rate), "npz", path, layout.rate)
-
-
-def _npz_tables(arrays: Mapping[str, Any], path: Path, rate: float) -> dict[str, Columns]:
-    labels = {
-        key: list(map(column_name, a))
-        for key, a in arrays.items()
-        if a.ndim == 1 and a.dtype.kind == "U"
-    }
+    texts = {key: a for key, a in arrays.items() if a.ndim == 1 and a.dtype.kind == "U"}
+    labels = {key: list(map(column_name, a)) for key, a in texts.items()}
     numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
-    tables: dict[str, Columns] = {}
-    for name, t in numbers.items():
-        own = numbers.get(name.removesuffix("_t"), np.zeros(0))
-        if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
-            continue
+
+    # The tables with times of their own, NAME and NAME_t.
+    tables: Tables = {}
+    for name, t in [(n, t) for n, t in numbers.items() if n.endswith("_t") and t.ndim == 1]:
         stem = name.removesuffix("_t")
-        table = column_name(stem)
-        named = _columns(own, _labels(stem, own, labels, numbers), table)
-        tables["/" + table] = {"t": t} | columns_by_name(named, path)
+        own = numbers.get(stem, np.zeros(0))
+        if len(own) == len(t) and own.ndim <= 2:
+            named = _columns(own, _labels(stem, own, labels, numbers), column_name(stem))
+            tables["/" + column_name(stem)] = {"t": t} | columns_by_name(named, path)
+
+    # What is left is one table: what is as long as its times, or with a rate as the longest.
     used = {name for name in numbers if "/" + column_name(name.removesuffix("_t")) in tables}
     rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
-    times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]
-    for k in times[:1]:
-        flat: list[tuple[str, str, Floats]] = [(column_name(k), k, rest.pop(k))]
-        for name, a in rest.items():
-            if len(a) == len(flat[0][2]):
-                flat += _columns(a, [], column_name(name))
-        tables["/npz"] = columns_by_name(flat, path)
-    if rate and not tables and rest:
-        rows = max(map(len, rest.values()))
-        flat = [one for n, a in rest.items() if len(a) == rows for one in _columns(a, [], n)]
-        tables["/npz"] = columns_by_name(flat, path)
-    return tables
+    clocks = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and is_time(k)]
+    rows = len(rest[clocks[0]]) if clocks else 0
+    if layout.rate and not tables and not clocks:
+        rows = max(map(len, rest.values()), default=0)
+    flat = [(column_name(k), rest.pop(k)) for k in clocks[:1]]
+    flat += [c for k, a in rest.items() if len(a) == rows for c in _columns(a, [], column_name(k))]
+    return tables | ({"/npz": columns_by_name(flat, path)} if rows else {})
 
 
 def _labels(
@@ -143,26 +127,26 @@ def _labels(
     return fits.get(f"{table}_names") or next(free, [])
 
 
-def _columns(array: Floats, names: list[str], table: str) -> list[tuple[str, str, Floats]]:
+def _columns(array: Floats, names: list[str], table: str) -> list[tuple[str, Floats]]:
     if array.ndim == 1:
-        return [(table, table, array)]
+        return [(table, array)]
     names = names or [f"{table}_{i}" for i in range(array.shape[1])]
-    return [(name, name, array[:, i]) for i, name in enumerate(names) if not is_time(name)]
+    return [(name, array[:, i]) for i, name in enumerate(names) if not is_time(name)]
 
 
-def ulog_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a PX4 log, read with pyulog."""
+def ulog_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the topics of a PX4 log, read with pyulog."""
     from pyulog import ULog
 
     # pyulog prints problems, and does not close a file that it opened itself
     with path.open("rb") as stream, redirect_stdout(io.StringIO()):
         log = ULog(stream)
-    tables: dict[str, Columns] = {}
+    tables: Tables = {}
     for data in log.data_list:
         topic = f"/{data.name}" + (f"_{data.multi_id}" if data.multi_id else "")
         fields = {k: np.asarray(v, float) for k, v in data.data.items() if "padding" not in k}
         tables[topic] = {"timestamp_us": fields.pop("timestamp")} | fields
-    yield from table_records(tables, "ulog", path)
+    return tables
 
 
 def table_records(

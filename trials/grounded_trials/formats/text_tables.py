@@ -1,4 +1,4 @@
-"""Convert text tables, `.csv`, to log records.
+"""Read text tables, `.csv`.
 
 The line with the column names is the first one with rows of numbers below it. Lines above it, as a
 PLC or a logger writes them, are skipped; a line of units below it belongs to the names. Columns are
@@ -17,30 +17,29 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import islice
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Weight, found
-from grounded_trials.formats.mcap_records import Record
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Layout,
+    Tables,
     column_name,
     columns_by_name,
     is_time,
-    table_records,
     time_among,
 )
 from grounded_trials.within import within
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
-LOOK = 65536  # characters read of a line
+LOOK = 65536  # bytes and characters that show the encoding and the separator
 BEFORE = 20  # rows before the last one that show how many digits its last cell should have
 NAMELESS = ("file.no_times",)  # which [log] says then
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
@@ -69,33 +68,29 @@ class AboutTable:
     findings: tuple[Finding, ...]  # an incomplete last row, a last column without numbers
 
 
-def csv_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
-    """Yield the records of a text table: a row of names, unless the layout has them, then numbers.
+def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
+    """Return the numbers of a text table: a row of names, unless the layout has them, then rows.
 
     Raises:
         GroundedError: if names or times are missing, or a row has a wrong number of cells.
     """
-    with _opened(path) as stream:
-        table = _Table(stream, path, layout.columns)
-        head = table.head
-        width, times = len(head.names), "" if layout.rate else _times_among(table)
-        table.check_widths()
-        cut = table.cut()
-        try:
-            with warnings.catch_warnings():  # a table without rows is reported below
-                warnings.simplefilter("ignore")
-                rows = table.rows(cut)
-                values = np.loadtxt(rows, delimiter=head.mark, ndmin=2, usecols=range(width))
-            stamps = None
-        except ValueError:
-            values, stamps = _with_texts(table.rows(cut), head, times, path)
+    table = _Table(path, layout.columns)
+    head = table.head
+    times = "" if layout.rate else _times_among(table)
+    table.check_widths()
+    rows = table.rows if table.cut is None else table.rows[: table.cut[0] - head.rows - 1]
+    stamps = None
+    try:
+        with warnings.catch_warnings():  # a table without rows is reported below
+            warnings.simplefilter("ignore")
+            width = range(len(head.names))
+            values = np.loadtxt(rows, delimiter=head.mark, ndmin=2, usecols=width)
+    except ValueError:
+        values, stamps = _with_texts(rows, head, times, path)
     if not values.size:
         raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
-    named = zip(head.names, head.cells, values.T, strict=True)
-    columns: dict[str, Any] = columns_by_name(named, path)
-    if stamps is not None:
-        columns[times] = stamps
-    yield from table_records({"/csv": columns}, "csv", path, layout.rate)
+    columns: dict[str, Any] = columns_by_name(zip(head.names, values.T, strict=True), path)
+    return {"/csv": columns if stamps is None else columns | {times: stamps}}
 
 
 def about_table(path: Path) -> AboutTable:
@@ -110,44 +105,38 @@ def about_table(path: Path) -> AboutTable:
 
 
 def _about(path: Path) -> AboutTable:
-    with _opened(path) as stream:
-        table = _Table(stream, path)
-        head = table.head
-        said = {
-            name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
-            for name, cell in zip(head.names, head.cells, strict=True)
-        }
-        units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
-        odd, name = [], str(path)
-        if table.empty_last():
-            facts: dict[str, Any] = {"name": head.cells[-1], "line": head.line}
-            odd.append(found("file.empty_column", name, **facts, weight=Weight.WARN))
-        if (cut := table.cut()) is not None:
-            odd.append(found("file.cut", name, line=str(cut[0]), text=cut[1][:80]))
-        row = next((_cells(row, head.mark) for row in table.lines[head.rows :] if row.strip()), [])
-        at = head.names.index(time) if (time := _time_in(head)) else len(head.names)
-        named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
+    table = _Table(path)
+    head, odd, name = table.head, list[Finding](), str(path)
+    said = {
+        name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
+        for name, cell in zip(head.names, head.cells, strict=True)
+    }
+    units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
+    if table.empty_last():
+        facts: dict[str, Any] = {"name": head.cells[-1], "line": head.line}
+        odd.append(found("file.empty_column", name, **facts, weight=Weight.WARN))
+    if table.cut is not None:
+        odd.append(found("file.cut", name, line=str(table.cut[0]), text=table.cut[1][:80]))
+    row = next((_cells(row, head.mark) for row in table.rows if row.strip()), [])
+    at = head.names.index(time) if (time := _time_in(head)) else len(head.names)
+    named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
     return AboutTable(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
 
 
 class _Table:
-    """An open text table: its head, and its lines."""
+    """A text table: its head, and the lines of its rows."""
 
-    def __init__(self, stream: TextIO, path: Path, columns: Sequence[str] = ()) -> None:
-        self.stream, self.path = stream, path
-        self.lines = [stream.readline(LOOK) for _ in range(PREAMBLE + 2)]  # the first ones
-        self.head = _head_by(columns, self.lines, path) if columns else _head(self.lines, path)
-
-    def rows(self, cut: tuple[int, str] | None = None) -> Iterable[str]:
-        """Return the lines of the rows, without one that is cut off."""
-        self.stream.seek(0)
-        for _ in range(self.head.rows):
-            self.stream.readline()
-        return self.stream if cut is None else islice(self.stream, cut[0] - self.head.rows - 1)
+    def __init__(self, path: Path, columns: Sequence[str] = ()) -> None:
+        self.path = path
+        lines = _lines(path)
+        self.ended = not lines[-1]  # with a line end
+        self.head = _head_by(columns, lines, path) if columns else _head(lines, path)
+        self.rows = lines[self.head.rows :]
 
     def numbered(self) -> Iterator[tuple[int, str]]:
-        """Yield the lines of the rows with their numbers, from 1."""
-        yield from enumerate(self.rows(), start=self.head.rows + 1)
+        """Yield the rows that are not blank with their line numbers, from 1."""
+        lines = enumerate(self.rows, start=self.head.rows + 1)
+        return ((number, line) for number, line in lines if line.strip())
 
     def check_widths(self) -> None:
         """Check that no row has more cells than names; empty ones at its end don't count.
@@ -170,23 +159,22 @@ class _Table:
     def empty_last(self) -> bool:
         """Return whether the last column is empty in every row, which ends with a separator."""
         mark, width = self.head.mark, len(self.head.names)
-        rows = (line.strip(" \r\n") for _, line in self.numbered() if line.strip())
+        rows = (line.strip(" ") for _, line in self.numbered())
         return all(row.endswith(mark) and row.count(mark) < width for row in rows)
 
+    @cached_property
     def cut(self) -> tuple[int, str] | None:
-        """Return a last row whose writer was interrupted: its line number, and what is left of it.
+        """A last row whose writer was interrupted: its line number, and what is left of it.
 
         It has too few cells, or, without a line end, half a number.
         """
-        mark = self.head.mark
-        last = deque[tuple[int, str]](maxlen=BEFORE + 1)
-        last.extend((number, line) for number, line in self.numbered() if line.strip())
+        mark, last = self.head.mark, deque(self.numbered(), maxlen=BEFORE + 1)
         if not last:
             return None
         (number, line), before = last[-1], [_cells(line, mark) for _, line in last][:-1]
-        text = line.strip(" \t\r\n\0")
-        cells = _cells(text if "\0" in line else line.rstrip("\r\n"), mark)
-        whole = line.endswith("\n") or not all(len(row) == len(cells) for row in before)
+        text = line.strip(" \t\0")
+        cells = _cells(text if "\0" in line else line, mark)
+        whole = self.ended or not all(len(row) == len(cells) for row in before)
         short = len(cells) < len(self.head.names)
         half = not (whole or _ends(cells[-1], [row[-1] for row in before]))
         return (number, text) if short or half else None
@@ -210,48 +198,25 @@ def _ends(cell: str, before: Sequence[str]) -> bool:
     return not np.isnan(_number(cell)) and not (fixed and len(cell.partition(".")[2]) < min(digits))
 
 
-class _Spaced:
-    """A text file whose columns are separated by blanks, read as if these were tabs."""
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text file in UTF-16 with a byte order mark, UTF-8, else Windows-1252.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self.seek = stream, stream.seek
-
-    def readline(self, limit: int = -1) -> str:
-        return _tabbed(self._stream.readline(limit))
-
-    def __iter__(self) -> Iterator[str]:
-        return map(_tabbed, self._stream)
-
-    def __enter__(self) -> _Spaced:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-
-
-def _tabbed(line: str) -> str:
-    """Return a line with tabs between its words, without what marks a comment before them."""
-    end = "\n" * line.endswith("\n")
-    return "\t".join(line.lstrip("#% ").split()) + end
-
-
-def _opened(path: Path) -> TextIO:
-    """Open a text file in its encoding: UTF-16 with a byte order mark, UTF-8, else Windows-1252."""
-    with path.open("rb") as stream:
-        start = stream.read(LOOK)
-    encoding = "utf-8-sig"
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
+    Where columns are separated by blanks, tabs take their place; what marks a comment is left out.
+    """
+    data = path.read_bytes()
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = data.decode("utf-16", "replace")
     else:
         try:
-            codecs.getincrementaldecoder("utf-8")().decode(start)
+            codecs.getincrementaldecoder("utf-8")().decode(data[:LOOK])
+            text = data.decode("utf-8-sig", "replace")
         except UnicodeDecodeError:
-            encoding = "cp1252"
-    text = path.open(encoding=encoding, errors="replace", newline="")
-    head = text.read(LOOK)
-    text.seek(0)
-    blank = not re.search(r"[\t;,]", head) and re.search(r"[^\s#%] +[^\s]", head)
-    return _Spaced(text) if blank else text  # type: ignore[return-value]
+            text = data.decode("cp1252", "replace")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    head = text[:LOOK]
+    if not re.search(r"[\t;,]", head) and re.search(r"[^\s#%] +[^\s]", head):
+        return ["\t".join(line.lstrip("#% ").split()) for line in lines]
+    return lines
 
 
 def _head(lines: Sequence[str], path: Path) -> _Head:
@@ -261,7 +226,7 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     """
     others: list[tuple[int, str]] = []
     for i, line in enumerate(lines[:PREAMBLE]):
-        below = next((row for row in lines[i + 1 :] if row.strip()), "")
+        below = next((row for row in lines[i + 1 : PREAMBLE + 2] if row.strip()), "")
         for mark in (m for m in "\t;," if m in line):
             cells, row = _cells(line, mark), _cells(below, mark)
             if len(row) > 1 and _share(cells) == 0 and _share(row) > 0.5:
@@ -283,6 +248,7 @@ def _head_by(columns: Sequence[str], lines: Sequence[str], path: Path) -> _Head:
     Raises:
         GroundedError: if it has another number of them.
     """
+    lines = lines[: PREAMBLE + 2]
     marks = [next((m for m in "\t;," if m in line), ",") for line in lines]
     rows = [_filled(_cells(line, mark)) for line, mark in zip(lines, marks, strict=True)]
     i = next((i for i, cells in enumerate(rows) if cells and _share(cells) == 1), None)
@@ -342,7 +308,7 @@ def _times_among(table: _Table) -> str:
     head = table.head
     if named := _time_in(head):
         return named
-    rows = [_cells(row, head.mark) for row in table.lines[head.rows :] if row.strip()]
+    rows = [_cells(row, head.mark) for row in table.rows[:PREAMBLE] if row.strip()]
     rising = [n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows])]
     names = tuple(filter(None, head.names[:8]))
     rises = rising[0] if rising else ""

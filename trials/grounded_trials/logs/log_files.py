@@ -22,7 +22,7 @@ from grounded.findings import found
 from grounded_trials.formats import dataflash, parquet, text_tables
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
-from grounded_trials.formats.tables import AS_IT_SAYS, Layout
+from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
 from grounded_trials.plain_file import open_file, read_file
 from grounded_trials.within import within
@@ -48,24 +48,24 @@ class Format:
 
     kind: str  # its name in messages
     begins: bytes  # the first bytes of a file
-    reader: str  # module of `formats`, and its function (path) or (path, layout) -> records
+    reader: str  # module of `formats`, and its function
+    writes: str = ""  # of tables (path, layout) -> Tables: the kind of their types; "": (path)
     library: str = ""  # that the reader needs
     extra: str = ""  # of grounded's, with which the library comes
-    table: bool = False  # may lack names or times, so that its reader takes a layout
 
 
-TABLE = Format("table", b"", "text_tables.csv_records", table=True)
+CSV = Format("table", b"", "text_tables.csv_tables", "csv")
 PYARROW = "pyarrow.parquet", "parquet"
-EPISODE = Format("LeRobot data set", b"", "parquet.episode_records", *PYARROW)
+EPISODE = Format("LeRobot data set", b"", "parquet.episode_tables", "lerobot", *PYARROW)
 FORMATS = (
     Format("ROS 2 bag", b"SQLite format 3\0", "bags.sqlite_records"),
     Format("ROS 1 bag", b"#ROSBAG", "bags.ros1_records"),
-    Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_records", "pyulog", "px4"),
-    Format("NumPy archive", b"PK\x03\x04", "tables.npz_records", table=True),
-    Format("ArduPilot log", dataflash.BEGINS, "dataflash.dataflash_records"),
-    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_records", "scipy.io", table=True),
-    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_records", "h5py", "matlab", True),
-    Format("parquet table", b"PAR1", "parquet.parquet_records", *PYARROW, True),
+    Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_tables", "ulog", "pyulog", "px4"),
+    Format("NumPy archive", b"PK\x03\x04", "tables.npz_tables", "npz"),
+    Format("ArduPilot log", dataflash.BEGINS, "dataflash.dataflash_tables", "dataflash"),
+    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_tables", "mat", "scipy.io"),
+    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_tables", "mat", "h5py", "matlab"),
+    Format("parquet table", b"PAR1", "parquet.parquet_tables", "parquet", *PYARROW),
 )
 
 
@@ -216,14 +216,21 @@ def _by_format(path: Path, head: bytes, stream: BinaryIO, layout: Layout) -> Ite
 def _format_of(path: Path, head: bytes) -> Format | None:
     """Return the format of a file that is no MCAP log, by its first bytes, else by its name."""
     known = next((one for one in FORMATS if head.startswith(one.begins)), None)
-    return TABLE if known is None and path.suffix in SUFFIXES else known
+    return CSV if known is None and path.suffix in SUFFIXES else known
 
 
 def _read_as(format: Format, path: Path, layout: Layout) -> Iterator[Record]:
     _load(format)
     module, function = format.reader.split(".")
     read = getattr(import_module(f"grounded_trials.formats.{module}"), function)
-    yield from _guarded(format.kind, path, read(path, *[layout] * format.table))
+
+    def records() -> Iterator[Record]:
+        if format.writes:
+            yield from table_records(read(path, layout), format.writes, path, layout.rate)
+        else:
+            yield from read(path)
+
+    yield from _guarded(format.kind, path, records())
 
 
 def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Record]:
