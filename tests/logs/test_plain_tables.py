@@ -74,12 +74,14 @@ def test_a_rate_takes_the_place_of_times(tmp_path: Path) -> None:
 def test_three_commands_lead_to_a_diagnosis(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The layout is given to `init` alone; another log of the same form needs none."""
+    """The layout is given to `init` alone; a folder of runs is given as one run is."""
     monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
     for k in range(2):
-        np.savetxt(f"run{k}.txt", rows(k))
+        np.savetxt(f"runs/run{k}.csv", rows(k))
     given = ("--columns", "w,u_cmd", "--rate", "50", "--yes")
-    assert grounded("init", "motor", "--from", "run0.txt", *given).code == 0
-    assert grounded("-C", "motor", "ingest", "--data", "run0.txt", "run1.txt").code == 0
+    assert grounded("init", "motor", "--from", "runs", *given).code == 0
+    assert grounded("-C", "motor", "ingest", "--data", "runs").code == 0
+    assert len(Workspace("motor").trials()) == 2
     assert {"tau_w", "gain_w_u_cmd"} <= {*Workspace("motor").diagnose().verdict.parameters}
-    assert grounded("-C", "motor", "inspect", "run1.txt").code == 0
+    assert grounded("-C", "motor", "inspect", "runs/run1.csv").code == 0

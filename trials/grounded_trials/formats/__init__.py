@@ -5,7 +5,9 @@ order, with checksums verified; their contents in `mcap_records.py`), then `mess
 nodes that message paths walk, and JSON). `schemas.py` turns definitions into types. `cdr.py`
 decodes many messages at once, eight times as fast as a library does one by one; to protobuf's
 library, in C, `protobuf.py` leaves them. `message_path.py` and `path_walk.py` extract numbers.
-`mcap_writer.py` writes message by message, `mcap_whole.py` a whole candidate at once.
+`mcap_writer.py` writes.
 
-`bags.py` (.db3, .bag) and `tables.py` (.csv, .npz, .ulg) convert other files to the same records.
+`bags.py` (.db3, .bag) converts other bags to the same records. `tables.py` does so with tables, of
+which each format has a reader of one shape: there, and in `text_tables.py`, `parquet.py`, `mat.py`,
+`dataflash.py`.
 """

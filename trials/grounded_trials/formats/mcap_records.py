@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from grounded_trials.formats.bad import BadRecord
 
+MAGIC = b"\x89MCAP0\r\n"  # at the beginning and the end of a file
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64

@@ -30,6 +30,7 @@ from grounded_trials.formats.mcap_records import (
     CHUNK,
     DATA_END,
     FOOTER,
+    MAGIC,
     MESSAGE,
     MESSAGE_HEADER,
     PARSERS,
@@ -44,7 +45,6 @@ from grounded_trials.formats.mcap_records import (
     chunk_content,
 )
 
-MAGIC = b"\x89MCAP0\r\n"
 BLOCK = 4 * 2**20  # [bytes] read at a time
 SMALL_CHUNK = 2**16  # [bytes] chunks smaller than this are joined ...
 TOGETHER = 2**20  # [bytes] ... up to this size

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -20,8 +20,8 @@ from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 from grounded.errors import GroundedError, alike, needs
 from grounded.findings import found
 from grounded_trials.formats import dataflash, parquet, text_tables
-from grounded_trials.formats.mcap_records import Messages, Metadata, Record, Schema
-from grounded_trials.formats.mcap_walk import MAGIC, read_records
+from grounded_trials.formats.mcap_records import MAGIC, Messages, Metadata, Record, Schema
+from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
 from grounded_trials.plain_file import open_file, read_file
@@ -70,12 +70,18 @@ FORMATS = (
 
 
 def logs_in(path: Path) -> list[Path]:
-    """Return the logs that a path names: each episode of a LeRobot data set, else itself.
+    """Return the logs that a path names: the runs in a folder, or the path itself.
+
+    The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag.
 
     Raises:
         GroundedError: if the data set can't be used.
     """
-    return parquet.episodes(path) if parquet.is_dataset(path) else [path]
+    if parquet.is_dataset(path):
+        return parquet.episodes(path)
+    if not path.is_dir() or (path / "grounded.toml").is_file() or _bag(path):
+        return [path]
+    return _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p)) or [path]
 
 
 def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
@@ -84,7 +90,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
     Args:
         paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml lists its
             files in order; without it, all *.mcap, else *.db3, sorted by the numbers in their
-            names. Of a LeRobot data set it is the first episode.
+            names. Of a folder of runs, as a LeRobot data set, it is the first one.
 
     Raises:
         GroundedError: if a file is missing, or a folder has none.
@@ -93,7 +99,12 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
     files: list[Path] = []
     for path in map(Path, given):
         if path.is_dir():
-            files.extend(logs_in(path)[:1] if parquet.is_dataset(path) else _bag(path))
+            inside = [] if parquet.is_dataset(path) else _bag(path)
+            inside = inside or logs_in(path)[:1]
+            if inside == [path]:
+                workspace = int((path / "grounded.toml").is_file())
+                raise GroundedError(found("file.no_log", str(path), own=workspace))
+            files.extend(inside)
         else:
             files.append(path)
     for path in files:
@@ -105,10 +116,10 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
 
 
 def _bag(folder: Path) -> list[Path]:
+    """Return the files of a bag in order, [] if a folder is none."""
     listing = folder / "metadata.yaml"
     try:
         text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
-        bags = [[p for p in folder.iterdir() if p.name.endswith(kind)] for kind in BAGS]
     except (OSError, UnicodeDecodeError) as error:
         raise _unreadable(folder, str(error), "bag") from None
     names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
@@ -117,10 +128,31 @@ def _bag(folder: Path) -> list[Path]:
         if missing:
             raise GroundedError(found("file.missing", missing[0], where=str(listing)))
         return [folder / name for name in names]
-    inside = next((paths for paths in bags if paths), [])
-    if not inside:
-        raise _no_log_in(folder)
-    return sorted(inside, key=lambda path: _natural(path.name))
+    there = _listed(folder)
+    bags = ([p for p in there if p.name.endswith(kind)] for kind in BAGS)
+    return _sorted(next((paths for paths in bags if paths), []))
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return [*folder.iterdir()]
+    except OSError as error:
+        raise _unreadable(folder, str(error), "bag") from None
+
+
+def _sorted(paths: Iterable[Path]) -> list[Path]:
+    """Sort files by the numbers in their names: bag_2 before bag_10."""
+
+    def natural(path: Path) -> list[tuple[int, str]]:
+        parts = _DIGITS.split(path.name)
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+    return sorted(paths, key=natural)
+
+
+def _is_none(path: Path) -> bool:
+    """Check whether a file is named like an exported candidate or a target, which are no logs."""
+    return _NO_LOG.fullmatch(path.name) is not None
 
 
 def _missing(path: Path) -> GroundedError:
@@ -128,8 +160,7 @@ def _missing(path: Path) -> GroundedError:
     if not path.parent.is_dir():
         return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
     there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and p.exists()]
-    logs = [p for p in there if not _NO_LOG.fullmatch(p.name)]
-    logs = sorted(logs, key=lambda p: -p.stat().st_mtime)
+    logs = sorted((p for p in there if not _is_none(p)), key=lambda p: -p.stat().st_mtime)
     named = {p.stem: p.name for p in reversed(logs)}  # endings make all names alike
     close = named.get(alike(path.stem, named), "")
     newest = () if close else tuple(p.name for p in logs[:NEWEST])
@@ -140,20 +171,6 @@ def _missing(path: Path) -> GroundedError:
 
 def _unreadable(path: Path, why: str, kind: str = "") -> GroundedError:
     return GroundedError(found("file.unreadable", str(path), why=why, kind=kind))
-
-
-def _no_log_in(folder: Path) -> GroundedError:
-    tables = sorted(path.name for path in folder.iterdir() if path.name.endswith(".csv"))
-    several = tuple(tables[:NEWEST]) if len(tables) > 1 else ()
-    workspace = int((folder / "grounded.toml").is_file())
-    return GroundedError(
-        found("file.no_log", str(folder), tables=several * (not workspace), own=workspace)
-    )
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts bag_2 before bag_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in _DIGITS.split(name)]
 
 
 def open_log(path: Path) -> BinaryIO:

@@ -28,7 +28,7 @@ from grounded_trials.formats.mcap_records import (
     Record,
     Schema,
 )
-from grounded_trials.formats.mcap_writer import CopyWriter
+from grounded_trials.formats.mcap_writer import McapWriter
 from grounded_trials.logs.log_files import empty, open_log
 from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
@@ -161,7 +161,7 @@ class _Copy:
 
     def __init__(self, out: IO[bytes], *, compressed: bool) -> None:
         self.out, self.compressed = out, compressed
-        self.writer: CopyWriter | None = None
+        self.writer: McapWriter | None = None
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.numbers: dict[int, int] = {}
@@ -184,22 +184,28 @@ class _Copy:
         elif isinstance(record, Messages):
             self.messages(record, final=False)
         elif isinstance(record, Metadata):
-            self.start().metadata(record)
+            self.start().metadata(record.name, record.data)
             self.anything = True
             if record.name == "grounded":
                 self.meta = record.data
         elif isinstance(record, Attachment):
-            self.start().attachment(record)
+            self.start().attachment(**vars(record))
             self.anything = True
             if record.name == "policy":
                 self.policy = record.data
 
-    def start(self, header: Header | None = None) -> CopyWriter:
+    def start(self, header: Header | None = None) -> McapWriter:
         """Return the writer, opened at the first record."""
         if self.writer is None:
             header = header or Header("", "")
-            self.writer = CopyWriter(self.out, header, compressed=self.compressed)
+            self.writer = McapWriter(self.out, header, compressed=self.compressed)
         return self.writer
+
+    def opened(self, channel: Channel, schema: Schema | None) -> int:
+        """Open a channel as it was read; return its number in the copy."""
+        writer, about = self.start(), (channel.topic, channel.encoding)
+        number = writer.schema(schema.name, schema.encoding, schema.data) if schema else 0
+        return writer.channel(*about, number, channel.metadata)
 
     def messages(self, batch: Messages, *, final: bool) -> None:
         """Write the messages of known channels; keep the others, or count them at the end."""
@@ -214,7 +220,7 @@ class _Copy:
                     self.waiting.append(own)
                 continue
             if identity not in self.numbers:
-                self.numbers[identity] = self.start().channel(channel, schema)
+                self.numbers[identity] = self.opened(channel, schema)
             self.start().messages(own, self.numbers[identity])
             self.counts[channel.topic] += len(own)
             self.anything = True

@@ -22,6 +22,7 @@ from grounded_trials.formats.mcap_records import (
     CHUNK,
     DATA_END,
     FOOTER,
+    MAGIC,
     MESSAGE,
     MESSAGE_HEADER,
     MESSAGE_INDEX,
@@ -37,7 +38,6 @@ from grounded_trials.formats.mcap_records import (
     decompress,
 )
 from grounded_trials.formats.mcap_walk import (
-    MAGIC,
     again,
     chunk_records,
     message_positions,

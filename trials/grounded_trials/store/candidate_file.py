@@ -7,6 +7,7 @@ bits; `sha256` in the metadata detects a file that was rewritten with other cont
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +20,7 @@ from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
-from grounded_trials.formats.mcap_writer import rows_of, rows_of_lists
+from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles, encode_lists
 from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,
@@ -56,8 +57,6 @@ def encoded_candidate(
         GroundedError: if the policy holds a number that is not finite, a shape is wrong, or an
             entry of `meta` is reserved.
     """
-    from grounded_trials.formats.mcap_whole import Column, whole_file
-
     _refuse_faulty(policy)
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
     states, inputs = np.asarray(predicted_states, float), np.asarray(predicted_inputs, float)
@@ -74,14 +73,22 @@ def encoded_candidate(
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
     times = np.rint(np.arange(H + 1) * policy.dt * 1e9).astype(np.int64)
-    controls = rows_of_lists(_controls(policy))
+    stream = io.BytesIO()
+    log = McapWriter(stream)
+    log.metadata("grounded", table)
+    log.attachment("about", "text/plain", _ABOUT)
     lists = ("feedforward", "gain", "reference")
-    columns = (
-        Column("/policy", "Policy", lists, controls, times[:-1], repeated=True),
-        Column("/predicted_state", "State", policy.state_names, rows_of(states), times),
-        Column("/predicted_input", "Input", policy.input_names, rows_of(inputs), times[:-1]),
-    )
-    return whole_file(table, _ABOUT, columns, written=(0, 2, 1)), table
+    columns = [
+        (log.doubles("/policy", "Policy", lists, repeated=True), encode_lists(_controls(policy))),
+        (log.doubles("/predicted_state", "State", policy.state_names), encode_doubles(states)),
+        (log.doubles("/predicted_input", "Input", policy.input_names), encode_doubles(inputs)),
+    ]
+    for k, time in enumerate(times.tolist()):
+        for channel, rows in (columns[0], columns[2], columns[1]):
+            if k < len(rows):
+                log.message(channel, time, rows[k])
+    log.finish()
+    return stream.getvalue(), table
 
 
 def read_candidate(

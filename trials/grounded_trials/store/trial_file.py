@@ -18,7 +18,7 @@ import numpy as np
 from grounded.checks import of_shape, refused, wrong
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
 from grounded_trials.plain_file import unwritable
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically
@@ -76,15 +76,14 @@ class TrialWriter:
         self._owned = isinstance(target, str | Path)
         self._stream = _create(Path(target)) if isinstance(target, str | Path) else target
         self._closed = False
-        self._encode_state, self._encode_input = DoublesEncoder(self._n), DoublesEncoder(self._m)
-        self._log = LogWriter(self._stream)
+        self._log = McapWriter(self._stream)
         self._log.metadata("grounded", table)
         if policy is None:
             self._log.attachment("about", "text/plain", b"A trial; no policy was run.")
         else:
             self._log.attachment("policy", "application/octet-stream", policy)
-        self._state = self._log.channel("/state", "State", list(states))
-        self._input = self._log.channel("/input", "Input", list(inputs))
+        self._state = self._log.doubles("/state", "State", list(states))
+        self._input = self._log.doubles("/input", "Input", list(inputs))
         self._flushed = max(start_ns, 0)
         self._log.flush()
 
@@ -96,8 +95,8 @@ class TrialWriter:
         Raises:
             GroundedError: if a shape is wrong, or the file can't be written.
         """
-        data = self._encode_state(_row(state, self._n))
-        sent = None if input is None else self._encode_input(_row(input, self._m))
+        (data,) = encode_doubles(_row(state, self._n)[None])
+        sent = None if input is None else encode_doubles(_row(input, self._m)[None])[0]
         with self._writing():
             self._add(max(self._start_ns, 0) + round(t * 1e9), data, sent)
 

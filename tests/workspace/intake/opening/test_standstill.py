@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded_trials import Workspace
-from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
 from workspaces import CONFIG, make
 
 
@@ -45,10 +45,10 @@ def published_when_touched(path, speed):
     sent = np.arange(1, 9, 0.05)
     force = np.round(2 + np.sin(np.floor(sent / 0.35))) + 1.0
     with path.open("wb") as stream:
-        log = LogWriter(stream)
+        log = McapWriter(stream)
         state, command = (
-            log.channel("/state", "S", ["x", "v"]),
-            log.channel("/sent", "F", ["force"]),
+            log.doubles("/state", "S", ["x", "v"]),
+            log.doubles("/sent", "F", ["force"]),
         )
         for k, row in enumerate(encode_doubles(np.column_stack([x, v]))):
             log.message(state, 10**18 + k * 20_000_000, row)

@@ -12,7 +12,7 @@ from facts import of_code
 from grounded.accounts.returned import suspicion
 from grounded.accounts.sent import evidence, follows
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -137,8 +137,8 @@ def drive(path, w, made, seed, *, felt=(1.0, 0.0), jitter=0.0):
     past, acted = policy.past.copy(), None
     next_x, next_v = rng.integers(0, 20, 2)
     with path.open("wb") as stream:
-        log = LogWriter(stream)
-        topics = [log.channel(f"/{t}", t, [n]) for t, n in TOPICS]
+        log = McapWriter(stream)
+        topics = [log.doubles(f"/{t}", t, [n]) for t, n in TOPICS]
 
         def say(topic, k, value):
             (line,) = encode_doubles(np.array([[value]]))
