@@ -8,15 +8,12 @@ import click
 
 from grounded_cli.console import completion as complete
 from grounded_cli.console.options import as_json, misuse
-from grounded_cli.console.terminal import LABEL, field, sentence, show, show_json, tell
+from grounded_cli.console.terminal import field, sentence, show, show_json, tell
 from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from grounded_trials import Workspace
-    from grounded_trials.workspace.adoption import Moved
 
 DIGITS = 4  # of a parameter, at least
 
@@ -57,17 +54,7 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     for name, value in done.params.items():
         text = moved(before[name].value, value, before[name].unit, DIGITS)
         show(field(name, text + ALONE * (name in done.jointly), "  "))
-    if done.rewritten:
-        show("[model] effects:")
-        _rewritten(done.rewritten)
     show(f"\n{next_line(done.then)}")
-
-
-def _rewritten(changes: Sequence[Moved]) -> None:
-    """List quantities of effects that stay in the model, with their old and new values."""
-    width = max(LABEL, *(len(one.called) for one in changes))
-    for new in changes:
-        show(field(new.called, moved(new.was, new.now, new.unit, DIGITS), "  ", width))
 
 
 def _undo(workspace: Workspace, json_: bool) -> None:
@@ -82,9 +69,6 @@ def _undo(workspace: Workspace, json_: bool) -> None:
     for name, was in before.items():
         if was.value != now[name].value:
             show(field(name, moved(was.value, now[name].value, was.unit, DIGITS), "  "))
-    if done.rewritten:
-        show("[model] effects:")
-        _rewritten(done.rewritten)
     rest = ", ".join(str(effect["name"]) for effect in done.effects)
     show(field("adopted", rest or "none"))
     show(f"\n{next_line(done.then)}")

@@ -15,7 +15,8 @@ from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.store.store import Lost
+from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from page_browser import unpacked
 from reported import DIAGNOSIS, car, cart, gathered, many_flights

@@ -72,7 +72,7 @@ def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
         bad = bytearray(good)
         bad[i] ^= 1 << (i % 8)
         added.path.write_bytes(bytes(bad))
-        assert [d.path for d in store.verify()] == [added.path]
+        assert [d.file for d in store.verify()] == [str(added.path)]
         with pytest.raises(GroundedError, match=holding(added.path)):
             store.read("t0001")
     added.path.write_bytes(good[:-1])

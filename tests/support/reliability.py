@@ -388,6 +388,6 @@ def verify_flips(stride: int = 1) -> Outcome:
         for what, bad in damaged(source, True, stride):
             tries += 1
             path.write_bytes(bad)
-            if [d.path for d in store.verify()] != [path]:
+            if [d.file for d in store.verify()] != [str(path)]:
                 failures.append(what)
     return Outcome(tries, tuple(failures))

@@ -29,12 +29,12 @@ from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
 from grounded.findings.catalogue import Entry
 from grounded_trials.logs.recover import Recovery
+from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Adopted, Undone
 from grounded_trials.workspace.candidates.exporting import Exported
 from grounded_trials.workspace.candidates.running import Ran
 from grounded_trials.workspace.discarding import SetAside
 from grounded_trials.workspace.exciting import Excited
-from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.rivals import Compared
 from grounded_trials.workspace.home.taking_home import TakenHome

@@ -26,8 +26,8 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
+from grounded_trials.store.store import Lost
 from grounded_trials.wording import figure, or_zero, rendered, shown
-from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
 from grounded_trials.workspace.off_target import (

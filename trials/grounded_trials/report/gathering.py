@@ -25,11 +25,12 @@ from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.documents import read_document
+from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, better_model, settled_in
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.proposing import uncounted, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
-from grounded_trials.workspace.folder import Contents, Folder, Lost
+from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 from grounded_trials.workspace.last_diagnosis import (
     LEAST_STEPS,

@@ -21,14 +21,16 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from grounded.checks import refused
 from grounded.errors import GroundedError
+from grounded.result import MALFORMED, Document
 from grounded_trials.plain_file import open_file, unreadable
-from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
+from grounded_trials.store.store import Lost, Store, Stored, made_folder, write_atomically
 
 Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
+D = TypeVar("D", bound=Document)
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
@@ -67,6 +69,25 @@ def read_document(path: Path) -> dict[str, Any]:
     return proven(data, path)
 
 
+def read_as(path: Path, kind: type[D], **facts: Any) -> D | None:
+    """Read a document as a type; return None if there is no such file.
+
+    Args:
+        path: the file.
+        kind: the type that wrote it, maybe of another version.
+        **facts: what the error says besides, see `unreadable`.
+
+    Raises:
+        GroundedError: if it can't be read, or holds something else.
+    """
+    try:
+        return kind.from_json(read_document(path))
+    except FileNotFoundError:
+        return None
+    except (*MALFORMED, GroundedError) as error:
+        raise unreadable(path, error, **facts) from None
+
+
 def proven(data: bytes, path: Path) -> dict[str, Any]:
     """Read a document from the bytes of a file, as `read_document`; `path` is for messages."""
     found = _SEALED.fullmatch(data)
@@ -96,7 +117,7 @@ class StudyStore(MutableMapping[str, dict[str, Any]]):
         try:
             entry = read_document(path)
             return {str(entry["key"]): dict(entry["result"])}
-        except (OSError, ValueError, KeyError, TypeError, GroundedError):
+        except (OSError, *MALFORMED, GroundedError):
             return {}
 
     def __getitem__(self, key: str) -> dict[str, Any]:
@@ -132,8 +153,8 @@ class Notes:
         Raises:
             GroundedError: if it can't be written.
         """
-        text = json.dumps(dict(note), sort_keys=True)
-        self.store.add(text.encode(), ".json", again=again)
+        with self.adding(note, again=again):
+            pass
 
     @contextmanager
     def adding(self, note: Mapping[str, str], *, again: bool = False) -> Iterator[None]:
@@ -143,7 +164,7 @@ class Notes:
             yield
 
     def read(
-        self, lost: list[Damaged] | None = None, known: Known | None = None
+        self, lost: list[Lost] | None = None, known: Known | None = None
     ) -> Iterator[dict[str, str]]:
         """Yield all notes in order of creation.
 
@@ -161,7 +182,7 @@ class Notes:
             except GroundedError as error:
                 if lost is None:
                     raise
-                lost.append(Damaged(entry.path, str(error)))
+                lost.append(Lost(str(entry.path), str(error)))
                 continue
             yield note
 

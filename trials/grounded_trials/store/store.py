@@ -27,12 +27,13 @@ from pathlib import Path
 
 from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
+from grounded.result import Document
 from grounded_trials.plain_file import BINARY, open_file, unreadable, unwritable
 
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
-_TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+_TEMPORARY = re.compile(r"-([0-9a-f]{16}|\d+)\.tmp$")  # process ids: of 0.2
 MENDS = {errno.ENOSPC: "space", errno.EDQUOT: "space"}
 MENDS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "permission")
 POLL_S = 0.01  # [s] between two attempts to lock a folder that another process has locked
@@ -65,11 +66,11 @@ class Added(_Named):
     known: bool  # it was already in the store
 
 
-@dataclass(frozen=True)
-class Damaged:
-    """A stored file that is damaged, and the reason."""
+@dataclass(frozen=True, eq=False)
+class Lost(Document):
+    """A file that is missing or damaged, with the reason."""
 
-    path: Path
+    file: str
     reason: str
 
 
@@ -165,15 +166,13 @@ class Store:
             GroundedError: if the source can't be read or the folder can't be written.
         """
         with self.locked():
-            temporary = self.folder / f".{self.prefix}-{os.getpid()}.tmp"
             try:
-                self._sweep()
-                digest = _copy(source, temporary)
-                return self._place(temporary, digest, suffix, again)
+                sweep(self.folder, age_s=0.0)  # the lock excludes running processes
+                with _temporary(self.folder / self.prefix) as temporary:
+                    digest = _copy(source, temporary)
+                    return self._place(temporary, digest, suffix, again)
             except OSError as error:
                 raise self._unwritable(error) from None
-            finally:
-                _remove(temporary)
 
     @contextmanager
     def adding(
@@ -201,7 +200,7 @@ class Store:
                     sync_folder(self.folder)
             raise
 
-    def verify(self) -> tuple[Damaged, ...]:
+    def verify(self) -> tuple[Lost, ...]:
         """Read every file, and return the damaged ones.
 
         Raises:
@@ -212,7 +211,7 @@ class Store:
             try:
                 self.read(entry)
             except GroundedError as error:
-                damaged.append(Damaged(entry.path, str(error)))
+                damaged.append(Lost(str(entry.path), str(error)))
         return tuple(damaged)
 
     def _place(self, temporary: Path, digest: str, suffix: str, again: bool) -> Added:
@@ -228,11 +227,6 @@ class Store:
         temporary.rename(path)
         sync_folder(self.folder)
         return Added(path, digest, known=False)
-
-    def _sweep(self) -> None:
-        """Remove temporary files of killed processes; the lock excludes running ones."""
-        for path in self.folder.glob(f".{self.prefix}-*.tmp"):
-            path.unlink(missing_ok=True)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -286,19 +280,16 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     if path.is_dir():
         raise unwritable(path, "folder")
-    # not named by process id: processes in two containers may have the same id
-    temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
         sweep(path.parent)
-        _copy(data, temporary, mode=0o644)
-        temporary.replace(path)
+        with _temporary(path) as temporary:
+            _copy(data, temporary, mode=0o644)
+            temporary.replace(path)
         sync_folder(path.parent)
     except FileNotFoundError:
         raise refused("file.unwritable", path, folder=str(path.parent)) from None
     except OSError as error:
         raise unwritable(path, error) from None
-    finally:
-        _remove(temporary)
 
 
 def sweep(folder: Path, age_s: float = OLD_S) -> None:
@@ -311,10 +302,18 @@ def sweep(folder: Path, age_s: float = OLD_S) -> None:
                 path.unlink()
 
 
-def _remove(path: Path) -> None:
-    """Remove a temporary file; if that fails, a later process removes it."""
-    with suppress(OSError):
-        path.unlink(missing_ok=True)
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Give a hidden name beside a file; what is left there is removed, now or by a later process.
+
+    It is not named by process id: processes in two containers may have the same id.
+    """
+    temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
+    try:
+        yield temporary
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

@@ -11,14 +11,14 @@ values are, and which effects were undone: they are not suggested again.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from grounded.checks import refused, unknown
 from grounded.diagnosis.causes import sign_only
 from grounded.diagnosis.error_report import gain, telling
-from grounded.diagnosis.parts import Diagnosis, Estimate, Made
+from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.telling import errors_line, open_line
 from grounded.effects import param_name
 from grounded.effects.joint import like_a_load
@@ -27,15 +27,14 @@ from grounded.findings import Finding, Quantity, found, settle
 from grounded.model import all_at_bounds
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
-from grounded_trials.plain_file import unreadable
-from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
-    as_fitted,
     fitted_in_vain,
+    last_fit,
     made_from,
     newer_alone,
     read_diagnosis,
@@ -53,6 +52,7 @@ NO_CHANGE = 1e-3  # relative change of a parameter that counts as none
 WRITTEN = 1e-6  # relative difference of a value and what is written of it
 
 Effects = Sequence[Mapping[str, Any]]
+Texts = Mapping[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,15 @@ class Adopted(Document):
     effects: tuple[Mapping[str, Any], ...]  # all adopted effects
     params: Mapping[str, float]  # model parameters written with the new effects
     claimed: bool  # whether the diagnosis claims the new effects; else one was adopted alone
-    beside: tuple[str, ...] = ()  # adopted from the same diagnosis, but fitted instead of these
     jointly: tuple[str, ...] = ()  # parameters and effects determined only with the others
     along: tuple[str, ...] = ()  # late and filtering sensors that were adopted without being named
     left: Mapping[str, float] = field(default_factory=dict)  # fitted values that were not adopted
     findings: tuple[Finding, ...] = ()  # what an adoption leaves to be done or known
-    rewritten: tuple[Moved, ...] = field(metadata=UNSAID, default=())  # of effects adopted before
     then: NextCommand = field(metadata=UNSAID, default=PROPOSE)
 
     def summary(self) -> str:
         """Return the effects that the model has now."""
-        return ", ".join(str(effect["name"]) for effect in self.effects)
+        return ", ".join(_names(self.effects))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,7 +91,6 @@ class Undone(Document):
     effects: tuple[Mapping[str, Any], ...]  # all adopted effects
     params: Mapping[str, float]  # [model] params
     findings: tuple[Finding, ...] = ()
-    rewritten: tuple[Moved, ...] = field(metadata=UNSAID, default=())  # of effects that stay
     then: NextCommand = field(metadata=UNSAID, default=PROPOSE)
 
     def summary(self) -> str:
@@ -101,20 +98,32 @@ class Undone(Document):
         return ", ".join(self.undone)
 
 
+def _names(effects: Effects) -> list[str]:
+    return [str(effect["name"]) for effect in effects]
+
+
+def _numbers(effects: Effects) -> Iterator[tuple[str, str, str, float]]:
+    """Yield effect, quantity, name as a parameter and value of each number of some effects."""
+    for effect in effects:
+        name = str(effect["name"])
+        yield from ((name, q, param_name(name, q), v) for q, v in effect.items() if q != "name")
+
+
 # what a diagnosis offers
 
 
 def told_parameters(diagnosis: Diagnosis) -> dict[str, Estimate]:
-    """Return the calibrated parameters that may be adopted.
+    """Return the calibrated parameters that may be adopted: the trials identify them.
 
-    The trials identify them, and no bound cut a value that changed by less than its error.
+    One that changed by less than its error is none if a bound cut it, or if it was 0.
     """
     nominal = made_from(diagnosis).nominal
-    return {
-        name: e
-        for name, e in diagnosis.known_parameters.items()
-        if not (e.stopped and abs(e.value - nominal.get(name, math.inf)) <= e.std)
-    }
+
+    def tells(e: Estimate, was: float) -> bool:
+        return abs(e.value - was) > e.std or not (e.stopped or was == 0)
+
+    known = diagnosis.known_parameters.items()
+    return {name: e for name, e in known if tells(e, nominal.get(name, math.inf))}
 
 
 def left_behind(diagnosis: Diagnosis) -> dict[str, Moved]:
@@ -123,11 +132,7 @@ def left_behind(diagnosis: Diagnosis) -> dict[str, Moved]:
     The prediction errors of the diagnosis include their changes.
     """
     made, kept = made_from(diagnosis), told_parameters(diagnosis)
-    called = {
-        param_name(effect, key): f"{key} of {effect}"
-        for effect, values in made.effects.items()
-        for key in values
-    }
+    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(made.adopted)}
     return {
         name: Moved(called.get(name, name), old, e.value, e.unit)
         for name, e in diagnosis.parameters.items()
@@ -141,8 +146,7 @@ def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
     task = workspace.config.task
     if not (task.target and task.feedback):
         return ()
-    known = {effect["name"] for effect in workspace.config.model.effects}
-    known |= set(in_time_now(workspace, diagnosis.preflight))
+    known = {*_names(workspace.config.model.effects), *in_time_now(workspace, diagnosis.preflight)}
     late = diagnosis.late_sensors.items()
     return tuple(
         n for n, own in late if n not in known and max(own.values()) > NEGLIGIBLE_STEP * task.dt
@@ -156,14 +160,19 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     without them make the robot oscillate. Nothing is adopted if [log] reads the trials in another
     way now, or if they were all set aside: then their log is ingested again.
     """
-    if (first := _to_read_again(workspace, diagnosis)) is not None:
+    made, trials = made_from(diagnosis), workspace.whole_trials()
+    here = {one.stored.id for one in trials}
+    if made.trials and here.isdisjoint(made.trials):
+        aside = [one for one in workspace.aside_trials() if one.stored.id in made.trials]
+        return AGAIN if here else last_again(workspace, aside)
+    if changed_since(workspace, diagnosis, here) and (first := last_again(workspace, trials)):
         return first
     if diagnosis.changed:  # values of two robots together fit neither
         return newer_alone(diagnosis)
 
     # What is new, but what the user has undone; late sensors are adopted with it, or alone.
-    new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
-    undone = {*adoptions(workspace)[1]}
+    table = workspace.config.model
+    new, undone = diagnosis.open(table.effects, table.params), {*adoptions(workspace).undone}
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
@@ -181,25 +190,12 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     # Only parameters: they are all fitted together, unless that was done without a gain.
     if {f"parameter:{name}" for name in params}.issuperset(new):
-        made = made_from(diagnosis)
         some = (*made.named, *made.compared)
-        beside = workspace.config.model.effects  # found beside effects, they are adopted so
-        if not beside and not fitted_in_vain(workspace, some):
+        if not table.effects and not fitted_in_vain(workspace, some):  # else adopted beside them
             return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
         if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
             return alone
     return NextCommand("adopt", (*new, *late))
-
-
-def _to_read_again(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
-    """Return the command to type before the claims of a diagnosis are adopted, or None."""
-    seen, trials = {*made_from(diagnosis).trials}, workspace.whole_trials()
-    here = {one.stored.id for one in trials}
-    if seen and seen.isdisjoint(here):
-        aside = (one for one in workspace.aside_trials() if one.stored.id in seen)
-        return AGAIN if here else last_again(workspace, [*aside])
-    changed = changed_since(workspace, diagnosis, here)
-    return last_again(workspace, trials) if changed else None
 
 
 def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | None:
@@ -215,6 +211,54 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | Non
     command = rendered(then, workspace.address)
     more = len(clauses) - 1
     return found("plan.lacks", then=then, cause=clauses[0], more=more, command=command)
+
+
+def joined(
+    diagnosis: Diagnosis,
+    names: Iterable[str],
+    effects: Effects,
+    nominal: Mapping[str, float],
+    calibrated: Mapping[str, Estimate],
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Return the parameters to set and all effects, after adding diagnosed effects to a model.
+
+    Args:
+        diagnosis: the diagnosis.
+        names: its effects to add, in any order: they are added in the order of the fit.
+        effects: the effects that the model has already.
+        nominal: the values to which changes of parameters among `names` are added.
+        calibrated: the parameters that are adopted with the effects.
+
+    Raises:
+        GroundedError: if a value is not known.
+    """
+    before, fitted = made_from(diagnosis).effects, [*diagnosis.joining]
+    old, new = {str(effect["name"]): dict(effect) for effect in effects}, list[dict[str, Any]]()
+    params = {name: _rounded(estimate.value) for name, estimate in calibrated.items()}
+    last = len(fitted)
+    for name in sorted(names, key=lambda n: fitted.index(n) if n in fitted else last):
+        values = diagnosis.values(name)
+        family, _, target = name.partition(":")
+        if family == "parameter":
+            params[target] = _rounded(nominal.get(target, math.nan) + values["d"])
+        elif name in before:  # a further delay adds to the adopted one
+            old[name]["d"] = _rounded(float(before[name]["d"]) + values["d"])
+        else:
+            new.append({"name": name} | {q: _rounded(value) for q, value in values.items()})
+    own, both = settled(params, [*old.values(), *new])
+    return own, in_order(both[: len(old)], both[len(old) :])
+
+
+def _rounded(value: float) -> float:
+    if not math.isfinite(value):
+        raise refused("model.not_adoptable", "it", why="unvalued", then=AGAIN)
+    return float(f"{float(value):.8g}")
+
+
+def _nominal(workspace: Folder, diagnosis: Diagnosis) -> dict[str, float]:
+    """Return the values that parameters had when the diagnosis was made; else those of now."""
+    own = {name: float(one.value) for name, one in workspace.base_model.params.items()}
+    return own | dict(made_from(diagnosis).nominal)
 
 
 # adopting
@@ -236,92 +280,51 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     if diagnosis is None:
         raise refused("search.undiagnosed", then=AGAIN)
     asked = names = _with_curves(diagnosis, list(dict.fromkeys(effects)))
-    before = made_from(diagnosis).effects
-    _check(names, diagnosis, workspace, before)
+    claimed = _claims_all(workspace, diagnosis, names)
     physics = [name for name in names if name not in diagnosis.late_sensors]
-    claimed = not physics or _claims_all(diagnosis, physics)
     if physics and {*diagnosis.effects} <= {*physics}:
         names = list(dict.fromkeys([*names, *late_open(workspace, diagnosis)]))
 
     # The model with them.
     whole_fit = parameters and bool(physics) and claimed
     calibrated = told_parameters(diagnosis) if whole_fit else {}
-    nominal = _nominal(diagnosis, workspace, names)
-    old, model = workspace.config.model.effects, workspace.config.model
-    own, both = joined(diagnosis, names, old, nominal, calibrated)
-    adopted = in_order(both[: len(old)], both[len(old) :])
-    whole = dict(model.params) | own
-    earlier, _ = adoptions(workspace)  # raises before anything is written, as does
+    model, before = workspace.config.model, made_from(diagnosis).effects
+    nominal = _nominal(workspace, diagnosis)
+    own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
+    params = dict(model.params) | own
+    earlier = adoptions(workspace).adoptions  # raises before anything is written, as does
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects
 
     # Write it, and how it can be undone.
-    set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
-    after = {"effects": adopted or model.effects, "params": whole if own else model.params}
-    step = {"names": names, "before": _written(model), "after": after}
-    step |= _as_found(diagnosis, names, own, _estimated(diagnosis, names, nominal, calibrated))
-    write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
+    set_in_model(workspace.config.file, params if own else None, adopted or None)
+    step = _step(diagnosis, names, own, adopted, calibrated)
+    after = {"effects": adopted or _written(model)["effects"], "params": params}
+    step = replace(step, before=_written(model), after=after)
+    write_document(workspace.reports / KEPT, Kept((*earlier, step)).to_json())
 
     # What differs from the fit in which the values were found.
     fitted = {*names, *before, *(diagnosis.effects if claimed else ()), *diagnosis.late_sensors}
-    jointly = [name for name in own if name in {*calibrated} & {*diagnosis.jointly}]
     left = left_behind(diagnosis) if whole_fit else {}
     left = {name: one for name, one in left.items() if name not in own}
     done = Adopted(
         effects=tuple(adopted),
         params=own,
         claimed=claimed,
-        beside=tuple(n for n in (str(effect["name"]) for effect in adopted) if n not in fitted),
-        jointly=(*jointly, *(name for name in names if name in diagnosis.combined)),
+        jointly=(
+            *(name for name in own if name in {*calibrated} & {*diagnosis.jointly}),
+            *(name for name in names if name in diagnosis.combined),
+        ),
         along=tuple(name for name in names if name not in asked),
         left={name: one.now for name, one in left.items()},
-        rewritten=_rewritten(workspace, old, adopted),
         then=to_plan(workspace),
     )
-    stopped = [n for n, e in diagnosis.parameters.items() if e.stopped] if whole_fit else []
     told = [*_told(workspace, done, asked, left)]
-    told += [found("model.at_bound", *stopped)] if stopped else []
+    instead = [] if claimed else asked[:1]
+    beside = [name for name in _names(adopted) if name not in fitted]
+    told += [found("model.beside", *some) for some in (instead, beside) if some]
+    if stopped := [n for n, e in diagnosis.parameters.items() if e.stopped and whole_fit]:
+        told.append(found("model.at_bound", *stopped))
     return replace(done, findings=settle(told))
-
-
-def _check(
-    names: Sequence[str], diagnosis: Diagnosis, workspace: Folder, before: Mapping[str, Any]
-) -> None:
-    """Check that each effect is in the diagnosis and was not adopted since.
-
-    Raises:
-        GroundedError: if not, or if [log] already corrects the delay that it describes.
-    """
-    if diagnosis.changed and not set(names) <= {*diagnosis.late_sensors}:
-        raise refused("gap.next.changed", then=newer_alone(diagnosis))
-    known = [*(row.effect for row in diagnosis.ranking), *_curves(diagnosis)]
-    known += [*diagnosis.late_sensors]
-    effects = [str(effect["name"]) for effect in workspace.config.model.effects]
-    adopted = [name for name in effects if name not in before or name not in known]
-    in_log = in_time_now(workspace, diagnosis.preflight)
-    for name in names:
-        if name not in known and name not in adopted:
-            raise unknown("effect", name, known, "the last diagnosis")
-        if name in in_log:
-            keys = (f"[log.state.{name.partition(':')[2]}] delay_s = {in_log[name]:g}",)
-            raise refused("plan.delay_twice", keys=keys, effects=(name,))
-        if name in adopted:
-            raise refused("model.not_adoptable", name, why="adopted")
-
-
-def _claims_all(diagnosis: Diagnosis, names: Sequence[str]) -> bool:
-    """Return whether the verdict claims all the effects.
-
-    Raises:
-        GroundedError: if nothing can be adopted, or several effects are named and some of them were
-            fitted as alternatives to others.
-    """
-    if diagnosis.no_cause:
-        raise refused("gap.too_few", then=AGAIN)
-    rivals = [name for name in names if name not in (*diagnosis.effects, *_curves(diagnosis))]
-    if rivals and len(names) > 1:
-        then = NextCommand("adopt", diagnosis.effects or (rivals[0],))
-        raise refused("model.not_adoptable", *rivals, why="rival", then=then)
-    return not rivals
 
 
 def _with_curves(diagnosis: Diagnosis, names: list[str]) -> list[str]:
@@ -347,58 +350,35 @@ def _curves(diagnosis: Diagnosis) -> list[str]:
     return [] if one is None else [curve.effect for curve in one.curves]
 
 
-def joined(
-    diagnosis: Diagnosis,
-    names: Sequence[str],
-    effects: Effects,
-    nominal: Mapping[str, float],
-    calibrated: Mapping[str, Estimate],
-) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """Return the parameters to set and all effects, after adding diagnosed effects to a model.
-
-    Args:
-        diagnosis: the diagnosis.
-        names: its effects to add, in any order: they are added in the order of the fit.
-        effects: the effects that the model has already; they stay in front.
-        nominal: the value to which the change of each parameter among `names` is added.
-        calibrated: the parameters that are adopted with the effects.
-    """
-    before = made_from(diagnosis).effects
-    adopted, new = [dict(effect) for effect in effects], list[dict[str, Any]]()
-    params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
-    fitted = {name: k for k, name in enumerate(diagnosis.joining)}
-    for name in sorted(names, key=lambda name: fitted.get(name, len(fitted))):
-        values = {key: _rounded(value) for key, value in diagnosis.values(name).items()}
-        family, _, target = name.partition(":")
-        if family == "parameter":
-            params[target] = _rounded(nominal[target] + values["d"])
-        elif name in before:  # a further delay adds to the adopted one
-            values["d"] = _rounded(float(before[name]["d"]) + values["d"])
-            adopted = [e | values if e["name"] == name else e for e in adopted]
-        else:
-            new.append({"name": name, **values})
-    return settled(params, [*adopted, *new])
-
-
-def _nominal(diagnosis: Diagnosis, workspace: Folder, names: Sequence[str]) -> dict[str, float]:
-    """Return the values that parameters among the effects had when the diagnosis was made.
+def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -> bool:
+    """Return whether the verdict claims all the effects, but for late sensors.
 
     Raises:
-        GroundedError: if neither the diagnosis nor the model has a value.
+        GroundedError: if one is not in the diagnosis, was adopted since, or is a delay that [log]
+            takes out already; if several are named and some were fitted as alternatives to others.
     """
-    own = {name: float(one.value) for name, one in workspace.base_model.params.items()}
-    known = own | dict(made_from(diagnosis).nominal)
-    asked = [n.removeprefix("parameter:") for n in names if n.startswith("parameter:")]
-    for name in asked:
-        if name not in known:
-            raise refused("model.not_adoptable", name, why="unvalued", then=AGAIN)
-    return {name: known[name] for name in asked}
-
-
-def _rounded(value: float) -> float:
-    if not math.isfinite(value):
-        raise refused("model.not_adoptable", "it", why="unvalued", then=AGAIN)
-    return float(f"{float(value):.8g}")
+    physics = [name for name in names if name not in diagnosis.late_sensors]
+    if diagnosis.changed and physics:
+        raise refused("gap.next.changed", then=newer_alone(diagnosis))
+    before, own = made_from(diagnosis).effects, [*diagnosis.effects, *_curves(diagnosis)]
+    known = {*(row.effect for row in diagnosis.ranking), *own, *diagnosis.late_sensors}
+    adopted = {*_names(workspace.config.model.effects)} - {*before}.intersection(known)
+    in_log = in_time_now(workspace, diagnosis.preflight)
+    for name in names:
+        if name not in known | adopted:
+            raise unknown("effect", name, known, "the last diagnosis")
+        if name in in_log:
+            keys = (f"[log.state.{name.partition(':')[2]}] delay_s = {in_log[name]:g}",)
+            raise refused("plan.delay_twice", keys=keys, effects=(name,))
+        if name in adopted:
+            raise refused("model.not_adoptable", name, why="adopted")
+    if diagnosis.no_cause and physics:
+        raise refused("gap.too_few", then=AGAIN)
+    rivals = [name for name in physics if name not in own]
+    if rivals and len(physics) > 1:
+        then = NextCommand("adopt", diagnosis.effects or (rivals[0],))
+        raise refused("model.not_adoptable", *rivals, why="rival", then=then)
+    return not rivals
 
 
 def _told(
@@ -413,46 +393,25 @@ def _told(
         left: the parameters that changed in the fit and are not adopted.
     """
     for effect in done.effects:
-        name = str(effect["name"])
-        family, _, state = name.partition(":")
+        family, _, state = str(effect["name"]).partition(":")
         size = effect.get("b", effect.get("k", 0.0))
         way = "low" if size < 0 else "high"
-        if name in asked and family == "sensor_bias":
+        if effect["name"] not in asked:
+            continue
+        if family == "sensor_bias":
             bias = Quantity(abs(size), workspace.base_model.states[state])
             yield found("model.readings", state, bias=bias, way=way, offset=-size)
-        elif name in asked and family == "sensor_scale":
+        elif family == "sensor_scale":
             yield found("model.readings", state, by=abs(size), way=way)
-        elif name in asked and family == "sensor_delay":
+        elif family == "sensor_delay":
             yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
     if done.along:
         yield found("model.along", *done.along)
-    for beside in ([] if done.claimed else asked[:1], done.beside):
-        if beside:
-            yield found("model.beside", *beside)
     for one in left.values():
         kept, value = (Quantity(value, one.unit) for value in (one.was, one.now))
         yield found("model.not_told", one.called, kept=kept, value=value)
     if not workspace.candidate_ids() and (logged := logged_target(workspace)):
         yield found("model.logged_target", logged)
-
-
-def _estimated(
-    diagnosis: Diagnosis,
-    names: Sequence[str],
-    nominal: Mapping[str, float],
-    calibrated: Mapping[str, Estimate],
-) -> dict[str, Estimate]:
-    """Return what is adopted, by its name as a parameter of the model; arguments as of `joined`."""
-    known, before = dict(calibrated), made_from(diagnosis).effects
-    for row in (row for row in diagnosis.ranking if row.effect in names):
-        family, _, target = row.effect.partition(":")
-        for q, estimate in row.params.items():
-            if family == "parameter":
-                known[target] = estimate.moved(nominal[target])
-            else:
-                at = float(before.get(row.effect, {}).get(q, 0.0))
-                known[param_name(row.effect, q)] = estimate.moved(at)
-    return known
 
 
 def undo_adoption(workspace: Folder) -> Undone:
@@ -461,38 +420,24 @@ def undo_adoption(workspace: Folder) -> Undone:
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
     """
-    kept, undone = adoptions(workspace)
-    file, model = workspace.config.file, workspace.config.model
-    if not kept:
-        has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
+    kept, file, model = adoptions(workspace), workspace.config.file, workspace.config.model
+    if not kept.adoptions:
+        has = ", ".join(_names(model.effects)) or "none"
         raise refused("model.edited", file, effects=has)
-    *earlier, last = kept
-    names, before = [str(name) for name in last["names"]], last["before"]
-    if _written(model) != last["after"]:
-        was = as_toml(before["params"], before["effects"])
+    last = kept.adoptions[-1]
+    params, effects = last.before["params"], last.before["effects"]
+    if _written(model) != last.after:
+        was = as_toml(params, effects)
         had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
-        raise refused("model.edited", file, adopted=tuple(names), had=had)
-    set_in_model(file, params=before["params"], effects=before["effects"])
-    write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
+        raise refused("model.edited", file, adopted=last.names, had=had)
+    set_in_model(file, params=params, effects=effects)
+    left = Kept(kept.adoptions[:-1], (*kept.undone, *last.names))
+    write_document(workspace.reports / KEPT, left.to_json())
     return Undone(
-        undone=tuple(names),
-        effects=tuple(before["effects"]),
-        params=before["params"],
-        rewritten=_rewritten(workspace, last["after"]["effects"], before["effects"]),
+        undone=last.names,
+        effects=tuple(effects),
+        params=params,
         then=to_plan(workspace),
-    )
-
-
-def _rewritten(workspace: Folder, before: Effects, after: Effects) -> tuple[Moved, ...]:
-    """Return the quantities of effects in both lists that differ, in the order of the effects."""
-    now = {str(effect["name"]): effect for effect in after}
-    return tuple(
-        Moved(f"{key} of {name}", float(was), float(now[name][key]), units.get(key, ""))
-        for old in before
-        if (name := str(old["name"])) in now
-        for units in (units_of(workspace, name),)
-        for key, was in old.items()
-        if key != "name" and now[name].get(key, was) != was
     )
 
 
@@ -504,66 +449,87 @@ def _written(model: ModelTable) -> dict[str, Any]:
 # what is kept of it
 
 
-def adoptions(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
-    """Read the adoptions that can be undone, oldest first, and those undone since a diagnosis."""
-    path = workspace.reports / KEPT
+@dataclass(frozen=True, eq=False, repr=False)
+class Step(Document):
+    """One adoption: [model] before and after it, and what its diagnosis knew."""
+
+    names: tuple[str, ...]
+    before: Mapping[str, Any] = field(default_factory=dict)
+    after: Mapping[str, Any] = field(default_factory=dict)
+    known: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values with their std
+    ties: Texts = field(default_factory=dict)  # effects that the trials could not tell from one
+    equivalent: Texts = field(default_factory=dict)  # those of them that no trial can
+    given: Texts = field(default_factory=dict)  # what a value rests on
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Kept(Document):
+    """The adoptions that can be undone, oldest first, and effects undone since a diagnosis."""
+
+    adoptions: tuple[Step, ...] = ()
+    undone: tuple[str, ...] = ()
+
+    def of(self, key: str) -> dict[str, tuple[Any, ...]]:
+        """Return what the last adoption of each effect or parameter kept under a key."""
+        kept = dict[str, tuple[Any, ...]]()
+        for step in self.adoptions:
+            kept |= dict.fromkeys((*step.names, *step.known), ()) | dict(getattr(step, key))
+        return {name: each for name, each in kept.items() if each}
+
+
+def adoptions(workspace: Folder) -> Kept:
+    """Read the adoptions of a workspace.
+
+    Raises:
+        GroundedError: if reports/adoptions.json can't be read.
+    """
+    return read_as(workspace.reports / KEPT, Kept, mend="delete") or Kept()
+
+
+def _readable(workspace: Folder) -> Kept:
+    """Read the adoptions of a workspace; a damaged file counts as none."""
     try:
-        document = read_document(path)
-        return list(document["adoptions"]), [str(name) for name in document["undone"]]
-    except FileNotFoundError:
-        return [], []
-    except (ValueError, KeyError, TypeError, RecursionError, GroundedError) as error:
-        raise unreadable(path, error, mend="delete") from None
+        return adoptions(workspace)
+    except GroundedError:
+        return Kept()
 
 
 def diagnosed_again(workspace: Folder) -> None:
     """Forget which effects were undone: a newer diagnosis may claim them again."""
-    kept, undone = adoptions(workspace)
-    if undone:
-        write_document(workspace.reports / KEPT, {"adoptions": kept, "undone": []})
+    kept = adoptions(workspace)
+    if kept.undone:
+        write_document(workspace.reports / KEPT, Kept(kept.adoptions).to_json())
 
 
-def _as_found(
+def _step(
     diagnosis: Diagnosis,
     names: Sequence[str],
     own: Mapping[str, float],
-    values: Mapping[str, Estimate],
-) -> dict[str, Any]:
-    """Return what reports/adoptions.json keeps of the diagnosis that effects are adopted from."""
-    ties = {
-        name: others for name in names if (others := _beside(diagnosis.indistinguishable, name))
-    }
-    known = {n: [e.value, e.std] for n, e in values.items() if math.isfinite(e.value + e.std)}
-    return {
-        "known": known,
-        "ties": ties,
-        "equivalent": {name: _beside(diagnosis.equivalent, name) for name in ties},
-        "given": {n: [*on] for n, on in diagnosis.conditions.items() if n in {*names, *own}},
-    }
+    effects: Effects,
+    calibrated: Mapping[str, Estimate],
+) -> Step:
+    """Return what is kept of the diagnosis from which effects and parameters are adopted."""
+    std = {name: e.std for name, e in calibrated.items()}
+    for row in (row for row in diagnosis.ranking if row.effect in names):
+        family, _, target = row.effect.partition(":")
+        own_name = family == "parameter"
+        for q, e in row.params.items():
+            std[target if own_name else param_name(row.effect, q)] = e.std
+    now = {**own, **{name: value for _, _, name, value in _numbers(effects)}}
+    ties = {name: _beside(diagnosis.indistinguishable, name) for name in names}
+    return Step(
+        tuple(names),
+        known={name: (now[name], s) for name, s in std.items() if name in now and math.isfinite(s)},
+        ties=ties,
+        equivalent={name: _beside(diagnosis.equivalent, name) for name in ties},
+        given={name: on for name, on in diagnosis.conditions.items() if name in {*names, *own}},
+    )
 
 
-def _beside(groups: Sequence[Sequence[str]], name: str) -> list[str]:
+def _beside(groups: Sequence[Sequence[str]], name: str) -> tuple[str, ...]:
     """Return the other effects of the groups that an effect is in."""
-    own = [group for group in groups if name in group]
-    return list(dict.fromkeys(other for group in own for other in group if other != name))
-
-
-def _kept(
-    workspace: Folder, key: str, of: Callable[[Any], Any] = str
-) -> dict[str, tuple[Any, ...]]:
-    """Return what the last adoption of each effect or parameter kept under a key, as tuples.
-
-    Empty if reports/adoptions.json is missing or can't be read. Steps that were written before the
-    key was kept have none.
-    """
-    kept = dict[str, Any]()
-    try:
-        for step in adoptions(workspace)[0]:
-            again = (*step["names"], *step.get("known", {}))
-            kept |= dict.fromkeys(again, ()) | dict(step.get(key, {}))
-        return {str(name): tuple(map(of, each)) for name, each in kept.items() if each}
-    except (GroundedError, AttributeError, KeyError, TypeError, ValueError):
-        return {}
+    others = (other for group in groups if name in group for other in group if other != name)
+    return tuple(dict.fromkeys(others))
 
 
 def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
@@ -572,15 +538,14 @@ def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
     Nothing compares them again, so a tie lasts as long as the one is part of the model and the
     other is not.
     """
-    now, ties = workspace.config.model.effects, _kept(workspace, "ties")
-    names = [str(one["name"]) for one in now]
+    names, ties = _names(workspace.config.model.effects), _readable(workspace).of("ties")
     rest = {name: tuple(o for o in ties.get(name, ()) if o not in names) for name in names}
     return {name: others for name, others in rest.items() if others}
 
 
 def equivalent_when_adopted(workspace: Folder) -> set[str]:
     """Return the adopted effects whose ties (`tied_when_adopted`) no trial can tell from them."""
-    same, ties = _kept(workspace, "equivalent"), tied_when_adopted(workspace).items()
+    same, ties = _readable(workspace).of("equivalent"), tied_when_adopted(workspace).items()
     return {name for name, others in ties if {*others} <= {*same.get(name, ())}}
 
 
@@ -588,12 +553,17 @@ def equivalent_when_adopted(workspace: Folder) -> set[str]:
 
 
 def units_of(workspace: Folder, effect: str) -> dict[str, str]:
-    """Return the units of an effect's quantities that are fitted."""
+    """Return the units of an effect's quantities, "" where they are not known.
+
+    That is so beside another adopted effect, and of a package that is not installed.
+    """
+    units = {q: "" for e in workspace.config.model.effects if e["name"] == effect for q in e}
+    units.pop("name", None)
     try:
         known = installed_effects().effect(effect, workspace.base_model).free
-    except GroundedError:  # beside another adopted effect, or of a package that is not installed
-        return {}
-    return {q.name: q.unit for q in known}
+    except GroundedError:
+        return units
+    return units | {q.name: q.unit for q in known}
 
 
 def known_values(workspace: Folder, diagnosis: Diagnosis | None = None) -> dict[str, Estimate]:
@@ -602,28 +572,20 @@ def known_values(workspace: Folder, diagnosis: Diagnosis | None = None) -> dict[
     The +- is that of the diagnosis, of the adoption or of the last fit, the first that has this
     value; NaN if none has.
     """
-    fitted = {} if diagnosis is None else dict(diagnosis.parameters)
-    for row in () if diagnosis is None else diagnosis.ranking:
-        fitted |= {param_name(row.effect, q): e for q, e in row.params.items()}
-    own: Mapping[str, tuple[float, ...]] = {name: (e.value, e.std) for name, e in fitted.items()}
-    sources = (own, _as_adopted(workspace), as_fitted(workspace))
+    own = dict(diagnosis.parameters) if diagnosis else {}
+    for row in diagnosis.ranking if diagnosis else ():
+        own |= {param_name(row.effect, q): e for q, e in row.params.items()}
+    fitted = {name: (e.value, e.std) for name, e in own.items()}
+    sources = (fitted, _readable(workspace).of("known"), last_fit(workspace).known)
     now = {name: (one.value, one.unit) for name, one in workspace.base_model.params.items()}
-    for effect in workspace.config.model.effects:
-        units = units_of(workspace, str(effect["name"]))
-        for q, value in effect.items():
-            if q != "name":
-                name = param_name(str(effect["name"]), q)
-                now[name] = float(value), units.get(q, "")
+    for effect, q, name, value in _numbers(workspace.config.model.effects):
+        now[name] = float(value), units_of(workspace, effect)[q]
     found_values = dict[str, Estimate]()
     for name, (value, unit) in now.items():
-        same = (std for at, std in (s[name] for s in sources if name in s) if _same(at, value))
+        pairs = (source[name] for source in sources if len(source.get(name, ())) == 2)
+        same = (std for at, std in pairs if _same(at, value))
         found_values[name] = Estimate(value, next(same, math.nan), unit=unit)
     return found_values
-
-
-def _as_adopted(workspace: Folder) -> dict[str, tuple[float, ...]]:
-    """Return the values that were adopted last with their std, by parameter of the model."""
-    return {n: own for n, own in _kept(workspace, "known", float).items() if len(own) == 2}
 
 
 def _same(one: float, other: float) -> bool:
@@ -649,13 +611,11 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
         new = diagnosis.open(table.effects, table.params)
         names = [name for name in diagnosis.joining if name in new and diagnosis.ranked(name)]
         known = {n: e for n, e in told_parameters(diagnosis).items() if math.isfinite(e.value)}
-        nominal = _nominal(diagnosis, workspace, names)
-        params, both = joined(diagnosis, names, table.effects, nominal, known)
+        nominal = _nominal(workspace, diagnosis)
+        params, effects = joined(diagnosis, names, table.effects, nominal, known)
         own = {name: value for name, value in params.items() if name in task.model.params}
         if own or names:
-            old = len(table.effects)
             estimated = task.with_model(task.model.with_values(own))
-            effects = in_order(both[:old], both[old:])
             return Better(planner_of(estimated, effects), "as diagnosed")
     return Better(workspace.planner, "with adopted effects") if table.effects else None
 
@@ -716,25 +676,24 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
 
     Late sensors that it found may be adopted or not.
     """
-    if left_behind(diagnosis):
+    if left_behind(diagnosis) or not diagnosis.effects:
         return False
-    made, names = diagnosis.made or Made(), diagnosis.effects
-    now = {str(effect["name"]): dict(effect) for effect in table.effects}
-    both = [*names, *(name for name in diagnosis.late_sensors if name in now)]
+    made, now = made_from(diagnosis), {str(e["name"]): dict(e) for e in table.effects}
+    both = [*diagnosis.effects, *(name for name in diagnosis.late_sensors if name in now)]
     try:
         known = told_parameters(diagnosis)
         own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)
     except (GroundedError, KeyError):  # a document of an older version
         return False
     wanted = {str(effect["name"]): effect for effect in effects}
-    return bool(names) and now == wanted and dict(made.params or {}) | own == dict(table.params)
+    return now == wanted and dict(made.params or {}) | own == dict(table.params)
 
 
 def _rows(workspace: Folder, diagnosis: Diagnosis | None) -> Iterator[tuple[str, str]]:
     """Yield the name and the values of each adopted effect, then of each adopted parameter."""
-    table, model = workspace.config.model, workspace.origin.model
-    known, adopted = known_values(workspace, diagnosis), _as_adopted(workspace)
-    ties, rests = tied_when_adopted(workspace), _kept(workspace, "given")
+    table, model, kept = workspace.config.model, workspace.origin.model, _readable(workspace)
+    known, adopted, rests = known_values(workspace, diagnosis), kept.of("known"), kept.of("given")
+    ties = tied_when_adopted(workspace)
 
     def given(name: str) -> str:
         text = "".join(f", or {other}" for other in ties.get(name, ()))
@@ -743,10 +702,10 @@ def _rows(workspace: Folder, diagnosis: Diagnosis | None) -> Iterator[tuple[str,
         on = () if fitted else rests.get(name, ())
         return text + f", given {listed(on)}" * bool(on)
 
-    for entry in table.effects:
-        name = str(entry["name"])
-        units = units_of(workspace, name) or {key: "" for key in entry if key != "name"}
-        each = (f"{q} = {known[param_name(name, q)].text}" for q in units if q in entry)
+    for name in _names(table.effects):
+        units = units_of(workspace, name)
+        numbers = [(q, one) for effect, q, one, _ in _numbers(table.effects) if effect == name]
+        each = (f"{q} = {known[one].text}" for q, one in numbers if q in units)
         yield name, f"{', '.join(each)}{given(name)}"
     for name, param in model.params.items():
         if table.params.get(name, param.value) != param.value:

@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Self
 from grounded.checks import known, refused
 from grounded.errors import GroundedError
 from grounded.model import Model
-from grounded.result import Document
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.documents import Notes
-from grounded_trials.store.store import Damaged, Store, Stored, made_folder, write_atomically
+from grounded_trials.store.store import Lost, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.identity import (
     Noted,
@@ -39,7 +38,6 @@ from grounded_trials.workspace.identity import (
     named_apart,
     noted,
     sha256,
-    stored_candidate,
     unknown_candidate,
 )
 from grounded_trials.workspace.user_files.config import Config, read_config
@@ -56,20 +54,17 @@ _ID = re.compile(r"c\d{4,}")
 
 
 @dataclass(frozen=True, eq=False)
-class Lost(Document):
-    """A file that is missing or damaged, with the reason."""
-
-    file: str
-    reason: str
-
-
-@dataclass(frozen=True, eq=False)
 class Contents:
     """The trials and candidates of a workspace, and its lost files."""
 
     trials: tuple[StoredTrial, ...]  # in order of arrival
     candidates: tuple[Candidate, ...]  # those of the search for this task, in order of proposal
     lost: tuple[Lost, ...]
+
+
+def _named(one: Lost) -> Lost:
+    """Return a lost file by its name."""
+    return replace(one, file=Path(one.file).name)
 
 
 class Folder:
@@ -325,23 +320,23 @@ class Folder:
 
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
-        broken: list[Damaged] = []
+        broken: list[Lost] = []
         if lost is not None and "_trials" in vars(self):  # they were read, and none is damaged
-            lost += [Lost(one.path.name, one.reason) for one in self.noted.gone(self.store)]
+            lost += map(_named, self.noted.gone(self.store))
             return self._trials
         known, found = self.noted if lost is None else self._read_notes(broken), []
-        entries = [e for e in self.store.list() if known.why_aside(e) is None]
         read = self._indexed if self._many else self._whole
-        for stored in entries:
+        for stored in self.store.list():
             try:
-                found.append(read(stored))
+                if known.why_aside(stored) is None:
+                    found.append(read(stored))
             except GroundedError as error:
                 if lost is None:
                     raise
-                broken.append(Damaged(stored.path, str(error)))
+                broken.append(Lost(str(stored.path), str(error)))
         self.save_index()
         if lost is not None:
-            lost += [Lost(one.path.name, one.reason) for one in (*broken, *known.gone(self.store))]
+            lost += map(_named, (*broken, *known.gone(self.store)))
         trials = named_apart([*grouped(found, known)], known, self.candidate_path)
         if not broken:
             vars(self)["_trials"] = trials
@@ -351,8 +346,8 @@ class Folder:
     def _many(self) -> bool:
         return len(self.store.list()) >= INDEXED_FROM
 
-    def _read_notes(self, broken: list[Damaged] | None) -> Noted:
-        return noted(self.notes.read(broken, self._index[0].known if self._many else None))
+    def _read_notes(self, broken: list[Lost] | None) -> Noted:
+        return noted(self.notes.read(broken, self._index.known if self._many else None))
 
     def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
         """Read a trial as logged, its metadata, and the candidate file attached to it."""
@@ -365,29 +360,29 @@ class Folder:
         return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, ran, lambda: policy)
 
     @cached_property
-    def _index(self) -> tuple[Index, dict[str, StoredTrial]]:
-        """The index, and the trials that were created from it."""
+    def _index(self) -> Index:
         from grounded_trials.store.index import Index
 
-        return Index(self.store.folder, self._read_one), {}
+        return Index(self.store.folder)
+
+    @cached_property
+    def _made(self) -> dict[str, StoredTrial]:
+        """The trials that were created from the index, by file name."""
+        return {}
 
     def _indexed(self, stored: Stored) -> StoredTrial:
-        index, made = self._index
-        if (known := made.get(name := stored.path.name)) is not None:
-            return known
-        about = index.of_trial(stored)
-        trial = index.trial(stored, about, bridged=True)
-        measured = index.trial(stored, about, bridged=False) if about["gaps"] else trial
-        found = StoredTrial(
-            stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
-        )
-        made[name] = found
-        return found
+        read = partial(self._read_one, stored)
+        if stored.path.name not in self._made:
+            trial, measured, about = self._index.trial(stored.path, read)
+            self._made[stored.path.name] = StoredTrial(
+                stored, trial, about["meta"], measured, about["ran"], lambda: read()[2]
+            )
+        return self._made[stored.path.name]
 
     def save_index(self) -> None:
         """Save the index of the trials for the next command, if it is used."""
         if "_index" in vars(self):
-            self._index[0].save()
+            self._index.save()
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
@@ -421,10 +416,14 @@ class Folder:
     ) -> StoredCandidate:
         """Read a candidate from one of its copies; files known to the index are not read again."""
         if place is None or "_index" not in vars(self):
-            return stored_candidate(read(), identity)
-        learn = lambda: stored_candidate(read(), identity).about()  # noqa: E731
-        about = self._index[0].known(place.name, place, learn)
-        return StoredCandidate.known(about, lambda: candidate_of(read(), identity)[0])
+            return StoredCandidate.of(read(), identity)
+
+        def whole() -> tuple[Candidate, dict[str, str]]:
+            one = StoredCandidate.of(read(), identity)
+            return one.candidate, {"kind": one.kind, "task": one.task, "sha256": one.sha256}
+
+        candidate, about = self._index.candidate(place, whole)
+        return StoredCandidate(candidate, **about)
 
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:
         ids = {t.trial.candidate for t in trials}

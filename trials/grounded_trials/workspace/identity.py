@@ -11,11 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from grounded.trial import Trial
 from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.plain_file import unreadable
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
-from grounded_trials.store.store import Damaged, Store, Stored
+from grounded_trials.store.store import Lost, Store, Stored
 from grounded_trials.wording import ranges
 
 if TYPE_CHECKING:
@@ -61,9 +60,7 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
 # of files of earlier versions
 _ABSENT = dict.fromkeys(("way", "slopes", "seen"), "") | {"predicted_gain": "nan", "damping": "1.0"}
 _ABSENT |= dict.fromkeys(("caution", "likely_off", "sample_age"), "0.0")
-T = TypeVar("T")
-MOST_KNOWN = 2**25  # bytes of candidates' files about which something is kept; at least FEW files
-FEW = 4
+DECODED = 16  # files whose candidates are kept: a command decodes the same bytes several times
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,19 +89,11 @@ class StoredCandidate:
     task: str  # the hash of its task
     sha256: str  # of its file
 
-    def about(self) -> dict[str, Any]:
-        """Return everything but the arrays, for an index."""
-        fields = {key: getattr(self.candidate, key) for key in _FIELDS if key != "task"}
-        return {"kind": self.kind, "task": self.task, "sha256": self.sha256, "candidate": fields}
-
     @classmethod
-    def known(cls, about: dict[str, Any], load: Callable[[], Candidate]) -> StoredCandidate:
-        """Restore a candidate from `about`; `load` reads the arrays when they are needed."""
-        from grounded_trials.store.index import KnownCandidate
-
-        own = about["candidate"]
-        fields = KnownCandidate.of(load, own | {"seen": tuple(own["seen"])})
-        return cls(fields, about["kind"], about["task"], about["sha256"])
+    def of(cls, data: bytes, identity: str) -> Self:
+        """Decode a candidate as `candidate_of`."""
+        candidate, meta = candidate_of(data, identity)
+        return cls(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +118,7 @@ class Noted:
         """Return why a trial is set aside, or None if it is not."""
         return self.aside.get(stored.path.stem, self.aside.get(stored.digest))
 
-    def gone(self, store: Store) -> Iterator[Damaged]:
+    def gone(self, store: Store) -> Iterator[Lost]:
         """Yield the trials that were stored but are missing now."""
         entries = store.list()
         numbers = {stored.number for stored in entries}
@@ -139,7 +128,7 @@ class Noted:
         names |= {f"{store.prefix}{number:04d}" for number in gaps}
         for name in sorted(names):
             reason = f"trials/ has no file with the number {name}: it was removed"
-            yield Damaged(store.folder / name, reason)
+            yield Lost(str(store.folder / name), reason)
 
 
 def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
@@ -166,36 +155,12 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
     return found
 
 
-class _Recent(Generic[T]):
-    """What was found out about the latest files, by their bytes.
-
-    Those are megabytes: comparing them takes a third of the time of hashing them for a dictionary.
-    """
-
-    def __init__(self) -> None:
-        self._kept: deque[tuple[bytes, T]] = deque()
-        self._size = 0  # of those files, in bytes
-
-    def get(self, data: bytes) -> T | None:
-        """Return what was found out last about a file, or None."""
-        return next((found for own, found in tuple(self._kept)[::-1] if own == data), None)
-
-    def add(self, data: bytes, found: T) -> T:
-        """Keep what is known about a file, and return it."""
-        self._kept.append((data, found))
-        self._size += len(data)
-        while self._size > MOST_KNOWN and len(self._kept) > FEW:
-            self._size -= len(self._kept.popleft()[0])
-        return found
-
-
-_HASHES = _Recent[str]()
-_DECODED = _Recent[tuple[Candidate, dict[str, str]]]()
+_DECODED: dict[tuple[str, str], tuple[Candidate, dict[str, str]]] = {}  # the latest, by hash
 
 
 def sha256(data: bytes) -> str:
     """Return the hash that identifies a candidate's file."""
-    return _HASHES.get(data) or _HASHES.add(data, hashlib.sha256(data).hexdigest())
+    return hashlib.sha256(data).hexdigest()
 
 
 def grouped(trials: Iterable[StoredTrial], known: Noted) -> Iterator[StoredTrial]:
@@ -262,8 +227,14 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
-    _DECODED.add(data, (candidate, table))
+    _keep(data, candidate, table)
     return data
+
+
+def _keep(data: bytes, candidate: Candidate, meta: dict[str, str]) -> None:
+    _DECODED[sha256(data), candidate.id] = candidate, meta
+    while len(_DECODED) > DECODED:
+        del _DECODED[next(iter(_DECODED))]
 
 
 def _text(value: object) -> str:
@@ -280,10 +251,10 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
-    known = _DECODED.get(data)  # one command decodes the same bytes several times
-    if known is None or known[0].id != identity:
-        known = _DECODED.add(data, _decoded(data, identity))
-    candidate, meta = known
+    key = sha256(data), identity
+    if key not in _DECODED:
+        _keep(data, *_decoded(data, identity))
+    candidate, meta = _DECODED[key]
     return candidate, dict(meta)
 
 
@@ -301,12 +272,6 @@ def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         raise refused("file.changed", name, what="name", lost=about["id"][:40])
     about["units"] = json.loads(meta["states"]) | json.loads(meta["inputs"])
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
-
-
-def stored_candidate(data: bytes, identity: str) -> StoredCandidate:
-    """Decode a candidate as `candidate_of`, with its kind, its task and the hash of the file."""
-    candidate, meta = candidate_of(data, identity)
-    return StoredCandidate(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))
 
 
 def other_task(task: Task, made: Candidate) -> str:

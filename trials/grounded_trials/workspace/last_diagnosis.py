@@ -12,18 +12,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
+from grounded.result import Document
 from grounded.search.planner import model_fingerprint
 from grounded.share import Share, share_of
-from grounded_trials.plain_file import unreadable
-from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import named_trials, sha256
@@ -34,10 +34,12 @@ if TYPE_CHECKING:
     from grounded.fit import Fit
     from grounded.trial import Trial
 
-FILE = "diagnosis.json"  # in reports/, as FIT
-FIT = "fit.json"
+FILE, FIT = "diagnosis.json", "fit.json"  # in reports/
 LEAST_STEPS = 2
 SAME = 1e-6  # relative tolerance for values that were written with eight digits
+
+
+# documents
 
 
 def write_diagnosis(folder: Path, found: Diagnosis) -> None:
@@ -51,16 +53,13 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     Raises:
         GroundedError: if the file can't be read, or does not hold a diagnosis.
     """
-    path = folder / FILE
-    try:
-        document = read_document(path)
-        from grounded.diagnosis.parts import Diagnosis  # slow, and seldom needed
-
-        return Diagnosis.from_json(document)
-    except FileNotFoundError:
+    if not (folder / FILE).exists():
         return None
-    except (ValueError, RecursionError, GroundedError) as error:
-        raise unreadable(path, error, mend="diagnosis", then=NextCommand("diagnose")) from None
+    from grounded.diagnosis.parts import Diagnosis, Made  # slow, and seldom needed
+
+    then = NextCommand("diagnose")
+    found = read_as(folder / FILE, Diagnosis, mend="diagnosis", then=then)
+    return found and replace(found, made=found.made or Made())  # an older version does not say
 
 
 def readable_diagnosis(folder: Path) -> Diagnosis | None:
@@ -69,6 +68,55 @@ def readable_diagnosis(folder: Path) -> Diagnosis | None:
         return read_diagnosis(folder)
     except GroundedError:
         return None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LastFit(Document):
+    """What the last fit of all parameters was made from, and what it found."""
+
+    trials: tuple[str, ...] = ()
+    model: str = ""  # fingerprint
+    helps: bool = True  # whether it predicts better
+    known: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values with their std
+
+
+def write_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
+    """Write what a fit was made from, whether it predicts better, and its values with their std."""
+    known = {n: (e.value, e.std) for n, e in found.params.items() if math.isfinite(e.value + e.std)}
+    last = LastFit(ids_of(used), workspace.planner.fingerprint, found.helps, known)
+    write_document(made_folder(workspace.reports) / FIT, last.to_json())
+
+
+def last_fit(workspace: Folder) -> LastFit:
+    """Return the last fit of all parameters; an empty one without it, or if it can't be read."""
+    try:
+        return read_as(workspace.reports / FIT, LastFit) or LastFit()
+    except GroundedError:
+        return LastFit()
+
+
+def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
+    """Return whether the current model was already fitted to the same trials without a gain.
+
+    Args:
+        workspace: the workspace.
+        trials: short names; empty: all usable trials.
+    """
+    last = last_fit(workspace)
+    if last.helps or last.model != workspace.planner.fingerprint:
+        return False
+    try:
+        return last.trials == ids_of(chosen(workspace, trials).trials)
+    except GroundedError:  # then fit again
+        return False
+
+
+# trials
+
+
+def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the short names of trials."""
+    return tuple(trial.id for trial in trials)
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:
@@ -81,6 +129,15 @@ def diagnosable(workspace: Folder) -> list[Trial]:
     """
     cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
     return [trial for trial in cut if trial.steps >= LEAST_STEPS]
+
+
+def usable_ids(workspace: Folder) -> list[str]:
+    """Return the ids of the trials that a diagnosis can use, in order of arrival.
+
+    Raises:
+        GroundedError: if a stored file is damaged.
+    """
+    return [trial.id for trial in diagnosable(workspace)]
 
 
 def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
@@ -99,23 +156,17 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
     """
     from grounded.accounts.sound_trials import stop_at_folded
 
-    used, model = diagnosable(workspace), workspace.base_model
-    names = named_trials(workspace, names, [trial.id for trial in used])
+    used = diagnosable(workspace)
+    names = named_trials(workspace, names, ids_of(used))
     share = share_of([trial for trial in used if not names or trial.id in names])
-    stop_at_folded(model, share.trials)
-    guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
-    measured = [
-        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
-        for trial in share.trials
-    ]
+    stop_at_folded(workspace.base_model, share.trials)
+    guessed = {t.stored.id: t.meta.get("estimated", "").split(",") for t in workspace.trials()}
+    measured: list[Trial] = []
+    for trial in share.trials:
+        states = trial.states.copy()
+        states[:, [name in guessed[trial.id] for name in trial.state_names]] = math.nan
+        measured.append(replace(trial, states=states))
     return replace(share, trials=measured)
-
-
-def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
-    """Set the states that a trial did not measure to NaN."""
-    states = trial.states.copy()
-    states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
-    return replace(trial, states=states)
 
 
 def left_out(workspace: Folder) -> list[Finding]:
@@ -139,11 +190,13 @@ def left_out(workspace: Folder) -> list[Finding]:
     return told + ([found("search.left_out", *others, model="model.py")] if others else [])
 
 
-def made_from(diagnosis: Diagnosis) -> Made:
-    """Return what a diagnosis was made from; of an older version it does not say."""
-    from grounded.diagnosis.parts import Made  # slow: most commands find no diagnosis
+# what changed since a diagnosis
 
-    return diagnosis.made or Made()
+
+def made_from(diagnosis: Diagnosis) -> Made:
+    """Return what a diagnosis in a workspace was made from."""
+    assert diagnosis.made is not None
+    return diagnosis.made
 
 
 @dataclass(frozen=True)
@@ -181,7 +234,7 @@ class Since:
             used=self.used if self.newer else None,
             usable=self.usable,
             adopted=self.adopted,
-            missing=self.missing if self.adopted else (),
+            missing=self.missing,
             changed=int(only),
         )
         return (one,)
@@ -200,15 +253,6 @@ def model_print(workspace: Folder) -> str:
     return sha256(model_fingerprint(apart).encode() + ends)[:16]
 
 
-def usable_ids(workspace: Folder) -> list[str]:
-    """Return the ids of the trials that a diagnosis can use, in order of arrival.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
-    return [trial.id for trial in diagnosable(workspace)]
-
-
 def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
     """Return what changed since a diagnosis was made.
 
@@ -218,21 +262,24 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         usable: the trials that can be used now, in order of arrival.
     """
     model, made = workspace.config.model, made_from(diagnosis)
-    seen, params = set(made.trials), made.params
-    last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
+    last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
+
+    # the effects of the model now, of those that it claims and of others
     missing = diagnosis.open(model.effects, model.params)
-    other = [name for name in diagnosis.effects if _other_value(diagnosis, name, model.params)]
-    adopted = tuple(name for name in diagnosis.effects if name not in (*missing, *other))
-    before = {e["name"] for e in made.adopted}
-    named = (str(e["name"]) for e in model.effects)
-    adopted += tuple(n for n in named if n not in before and n not in diagnosis.effects)
-    same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
-    same = same and params in (None, dict(model.params))
+    adopted = [
+        name
+        for name in diagnosis.effects
+        if name not in missing and not _other_value(diagnosis, name, model.params)
+    ]
+    known = {*made.effects, *diagnosis.effects}
+    adopted += [name for e in model.effects if (name := str(e["name"])) not in known]
+    same = [*map(dict, model.effects)] == [*map(dict, made.adopted)]
+    same = same and made.params in (None, dict(model.params))
     return Since(
-        used=sum(name in seen for name in usable),
+        used=sum(name in made.trials for name in usable),
         usable=len(usable),
-        newer=len(usable) - 1 - last if seen else 0,
-        adopted=adopted,
+        newer=len(usable) - 1 - last if made.trials else 0,
+        adopted=tuple(adopted),
         missing=missing if adopted else (),
         changed=not same or made.model not in ("", model_print(workspace)),
         reread=changed_since(workspace, diagnosis, usable),
@@ -243,10 +290,10 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
     """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
     family, _, own = name.partition(":")
-    row, made = diagnosis.ranked(name), made_from(diagnosis)
-    if family != "parameter" or own not in params or own not in made.nominal or row is None:
+    row, was = diagnosis.ranked(name), made_from(diagnosis).nominal.get(own)
+    if family != "parameter" or own not in params or was is None or row is None:
         return False
-    said = row.params["d"].moved(made.nominal[own])
+    said = row.params["d"].moved(was)
     low, high = said.interval or (said.value - 2 * said.std, said.value + 2 * said.std)
     room = SAME * abs(said.value)
     return not low - room <= params[own] <= high + room
@@ -257,47 +304,3 @@ def newer_alone(diagnosis: Diagnosis) -> NextCommand:
     made = made_from(diagnosis)
     newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
     return NextCommand("diagnose", ("--trials", ",".join(newer)))
-
-
-def write_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    """Write what a fit was made from, whether it predicts better, and its values with their std."""
-    finite = {
-        n: e for n, e in found.params.items() if math.isfinite(e.value) and math.isfinite(e.std)
-    }
-    known = {name: [e.value, e.std] for name, e in finite.items()}
-    made = _made_from(workspace, used) | {"helps": found.helps, "known": known}
-    write_document(made_folder(workspace.reports) / FIT, made)
-
-
-def as_fitted(workspace: Folder) -> dict[str, tuple[float, float]]:
-    """Return value and standard deviation by parameter of the last fit of all; {} without one."""
-    try:
-        known = read_document(workspace.reports / FIT).get("known", {})
-        return {str(name): (float(value), float(std)) for name, (value, std) in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError, GroundedError):
-        return {}
-
-
-def _made_from(workspace: Folder, used: Sequence[Trial]) -> dict[str, Any]:
-    """Return the trials and the model of a fit."""
-    return {"trials": list(ids_of(used)), "model": workspace.planner.fingerprint}
-
-
-def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the short names of trials."""
-    return tuple(trial.id for trial in trials)
-
-
-def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
-    """Return whether the current model was already fitted to the same trials without a gain.
-
-    Args:
-        workspace: the workspace.
-        trials: short names; empty: all usable trials.
-    """
-    try:
-        kept = read_document(workspace.reports / FIT)
-        used = chosen(workspace, trials).trials
-    except (OSError, ValueError, RecursionError, GroundedError):  # then fit again
-        return False
-    return kept.get("helps") is False and _made_from(workspace, used).items() <= kept.items()

@@ -15,10 +15,13 @@ from grounded.result import Document
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
+from grounded_trials.store.store import Lost
 from grounded_trials.workspace.candidates.handover import intact
-from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import Noted, noted, sha256
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
+
+Check = tuple[Path, Callable[[], Any]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,21 +46,18 @@ def verify_in(workspace: Folder) -> Verified:
     broken = [*workspace.store.verify()]
     known = noted(workspace.notes.read(broken))
     broken += known.gone(workspace.store)
-    gone = {one.path.name for one in broken}
-    damaged = [Lost(str(one.path), one.reason) for one in broken]
     checked = len(workspace.store.list()) + len(workspace.notes.store.list())
+    gone = {Path(one.file).name for one in broken}
     for path, check in (*_candidates(workspace, known, gone), *_documents(workspace)):
         checked += 1
         try:
             check()
         except GroundedError as error:
-            damaged.append(Lost(str(path), str(error)))
-    return Verified(checked, tuple(damaged))
+            broken.append(Lost(str(path), str(error)))
+    return Verified(checked, tuple(broken))
 
 
-def _candidates(
-    workspace: Folder, known: Noted, gone: set[str]
-) -> Iterator[tuple[Path, Callable[[], None]]]:
+def _candidates(workspace: Folder, known: Noted, gone: set[str]) -> Iterator[Check]:
     """Yield the path of each candidate that exists or existed, with a function that checks it.
 
     Args:
@@ -65,36 +65,29 @@ def _candidates(
         known: its notes.
         gone: trials that are reported as missing already.
     """
-    folder = workspace.folder / "candidates"
     stored = {one.id for one in workspace.store.list()} | gone
-    names = {path.stem for path in folder.glob("*.mcap")} | set(known.handed)
-    for name in sorted(names):
-        path = workspace.candidate_path(name)
 
-        def check(name: str = name, path: Path = path) -> None:
-            handed = known.handed.get(name)
-            if not path.exists() and _carried(workspace, handed or set()):
-                return
-            data = read_file(path, FILE_LIMIT, follow=False)
-            lost = sorted({*intact(data, name)[0].seen} - stored)
-            if lost:
-                raise refused("file.changed", path, what="gone", lost=tuple(lost))
-            if handed and sha256(data) not in handed:
-                raise refused("file.changed", path, what="candidate")
+    def check(path: Path) -> None:
+        handed = known.handed.get(path.stem, set())
+        carried = (one.ran in handed for one in workspace.read(strict=False).trials)
+        if not path.exists() and any(carried):  # a trial contains the file
+            return
+        data = read_file(path, FILE_LIMIT, follow=False)
+        lost = sorted({*intact(data, path.stem)[0].seen} - stored)
+        if lost:
+            raise refused("file.changed", path, what="gone", lost=tuple(lost))
+        if handed and sha256(data) not in handed:
+            raise refused("file.changed", path, what="candidate")
 
-        yield path, check
-
-
-def _carried(workspace: Folder, handed: set[str]) -> bool:
-    """Return whether a trial contains one of the candidate files with these hashes."""
-    trials = workspace.read(strict=False).trials
-    return any(one.ran in handed for one in trials)
+    there = {path.stem for path in (workspace.folder / "candidates").glob("*.mcap")}
+    for path in map(workspace.candidate_path, sorted(there | set(known.handed))):
+        yield path, partial(check, path)
 
 
-def _documents(workspace: Folder) -> Iterator[tuple[Path, Callable[[], Any]]]:
+def _documents(workspace: Folder) -> Iterator[Check]:
     """Yield the path of each document in reports/, with a function that checks it."""
     if (path := workspace.reports / "diagnosis.json").exists():
         yield path, lambda: read_diagnosis(workspace.reports)
-    for name in ("optimum.json", "adoptions.json", "fit.json"):
-        if (place := workspace.reports / name).exists():
-            yield place, partial(read_document, place)
+    for path in (workspace.reports / f"{n}.json" for n in ("optimum", "adoptions", "fit")):
+        if path.exists():
+            yield path, partial(read_document, path)

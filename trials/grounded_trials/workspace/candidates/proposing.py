@@ -169,7 +169,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not workspace.config.task.target:
         raise GroundedError(found("plan.no_target", then=NextCommand("target", ("SHAPE",))))
     check_log(workspace)
-    told, changed = bool(workspace.noted.since), [*filter(None, [overtaken(workspace)])]
+    told, changed = bool(workspace.noted.since), [*filter(None, [overtaken(workspace, ran=True)])]
     proposal, void = _handed_over(workspace, tick)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate, now = proposal.candidate, proposal.standing

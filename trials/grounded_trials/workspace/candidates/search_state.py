@@ -181,10 +181,11 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     return best.candidate.id
 
 
-def overtaken(workspace: Folder) -> Finding | None:
+def overtaken(workspace: Folder, *, ran: bool = False) -> Finding | None:
     """Return that task or model is not the one that the search's latest candidate was made with.
 
-    A candidate that was not run is void then. If it was run, its prediction is outdated.
+    A candidate that was not run is void then. If it was run, its prediction is outdated, which
+    matters where one is used or replaced: nothing is told of it without `ran`.
     """
     trials = workspace.whole_trials()
     for name in reversed(workspace.candidate_ids()):
@@ -192,11 +193,10 @@ def overtaken(workspace: Folder) -> Finding | None:
             made, meta = workspace.candidate(name)
             if meta.get("kind") != "search":
                 continue
-            ran = any(one.trial.candidate == name for one in trials)
             other = meta.get("task") != workspace.task.hash
             changed = not other and made.model != workspace.planner.fingerprint
-            if ran:
-                return found("plan.outdated", name, candidate=name) if changed else None
+            if any(one.trial.candidate == name for one in trials):
+                return found("plan.outdated", name, candidate=name) if changed and ran else None
             why = other_task(workspace.task, made) if other else MODEL
             void = found("plan.void", name, candidate=name, why=why, other=int(other))
             return void if other or changed else None

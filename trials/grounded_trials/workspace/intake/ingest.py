@@ -266,7 +266,7 @@ def _of_run(
 
 def _of_search(workspace: Folder, read: Read, added: Added, now: Standing) -> Iterator[Finding]:
     """Yield what a run changed in the search, and that it is judged by another model."""
-    if changed := overtaken(workspace):
+    if changed := overtaken(workspace, ran=True):
         yield changed.weighing(Weight.WARN)
     if read.doubted and added.id not in workspace.discarded():
         yield from odd_run(workspace, now, added.id, aside=_aside(read))
