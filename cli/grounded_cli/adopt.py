@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import click
 
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json, misuse
-from grounded_cli.console.terminal import field, sentence, show, show_json, tell
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.options import command, flag, misuse
+from grounded_cli.console.terminal import field, sentence, show, tell
+from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
-
-if TYPE_CHECKING:
-    from grounded_trials import Workspace
+from grounded_trials.workspace.adoption import Adopted, Undone
 
 DIGITS = 4  # of a parameter, at least
 
 
-@click.command("adopt")
+@command("adopt")
 @click.argument("effects", nargs=-1, metavar="EFFECT...", shell_complete=complete.effects)
-@click.option("--effect-only", is_flag=True, help="Leave the model's own parameters alone.")
-@click.option("--undo", is_flag=True, help="Undo the last adoption.")
-@in_workspace
-@as_json
-def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool) -> None:
+@flag("--effect-only", help="Leave the model's own parameters alone.")
+@flag("--undo", help="Undo the last adoption.")
+def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[Adopted | Undone]:
     """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
 
     Effects that were claimed together were estimated together: adopt them together. The model
@@ -37,38 +33,27 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     if undo == bool(effects) or (undo and effect_only):
         raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()
+    before, file = workspace.base_model.params, workspace.config.file
     if undo:
-        _undo(workspace, json_)
-        return
-    before = workspace.base_model.params
-    done = workspace.adopt(*effects, parameters=not effect_only)
-    if json_:
-        show_json(done.to_json())
-        return
-    for name in dict.fromkeys((*effects, *done.along)):
-        alone = ALONE * (name in done.jointly)
-        show(field("adopted", f"{name}{alone}"))
-    tell(done.findings)
-    if done.params:
+        done: Adopted | Undone = workspace.undo_adoption()
+    else:
+        done = workspace.adopt(*effects, parameters=not effect_only)
+    yield done
+    if isinstance(done, Undone):
+        sentence(f"undone: {', '.join(done.undone)} ({file})")
+        now = workspace.base_model.params
+        values = {k: now[k].value for k, was in before.items() if was.value != now[k].value}
+        jointly: tuple[str, ...] = ()
+    else:
+        values, jointly = dict(done.params), done.jointly
+        for name in dict.fromkeys((*effects, *done.along)):
+            show(field("adopted", f"{name}{ALONE * (name in jointly)}"))
+        tell(done.findings)
+    if values:
         show("[model] params:")
-    for name, value in done.params.items():
+    for name, value in values.items():
         text = moved(before[name].value, value, before[name].unit, DIGITS)
-        show(field(name, text + ALONE * (name in done.jointly), "  "))
-    show(f"\n{next_line(done.then)}")
-
-
-def _undo(workspace: Workspace, json_: bool) -> None:
-    """Undo the last adoption and print the restored effects and parameters."""
-    before = workspace.base_model.params
-    done = workspace.undo_adoption()
-    if json_:
-        show_json(done.to_json())
-        return
-    sentence(f"undone: {', '.join(done.undone)} ({workspace.config.file})")
-    now = workspace.base_model.params
-    for name, was in before.items():
-        if was.value != now[name].value:
-            show(field(name, moved(was.value, now[name].value, was.unit, DIGITS), "  "))
-    rest = ", ".join(str(effect["name"]) for effect in done.effects)
-    show(field("adopted", rest or "none"))
+        show(field(name, text + ALONE * (name in jointly), "  "))
+    if isinstance(done, Undone):
+        show(field("adopted", ", ".join(str(one["name"]) for one in done.effects) or "none"))
     show(f"\n{next_line(done.then)}")

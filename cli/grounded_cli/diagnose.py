@@ -3,37 +3,41 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
+from grounded.accounts.finding import Finding
+from grounded.diagnosis.parts import Diagnosis
+from grounded.diagnosis.telling import (
+    FINDINGS,
+    effect_table,
+    error_table,
+    instrument_lines,
+    sentence,
+    told,
+)
+from grounded.engine import Engine
 from grounded.findings import Weight
 from grounded.refusals import wrong
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json, chosen_trials, parallel
-from grounded_cli.console.terminal import (
-    field,
-    names_in,
-    show,
-    show_json,
-    stages,
-    table,
-    tell,
-    tinted,
-)
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.options import chosen_trials, command, flag, parallel
+from grounded_cli.console.terminal import field, names_in, show, stages, table, tell, tinted
+from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.propose import show_extent
 from grounded_trials.wording import figure, percent
+from grounded_trials.workspace.candidates.trust import extent_of
+from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
+from grounded_trials.workspace.home.rivals import Compared
+from grounded_trials.workspace.last_diagnosis import left_out
+from grounded_trials.workspace.next_step import BEFORE_TRIALS
 
-if TYPE_CHECKING:
-    from grounded.accounts.finding import Finding
-    from grounded.diagnosis.parts import Diagnosis
-    from grounded.engine import Engine
-    from grounded_trials.workspace.home.rivals import Compared
+_GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
 
 
-@click.command("diagnose")
+@command("diagnose")
 @chosen_trials
 @click.option(
     "--max-effects",
@@ -49,17 +53,11 @@ if TYPE_CHECKING:
     shell_complete=complete.trials,
     help="Two groups of trials, T1,T2 T3,T4: what changed. Or two models: which predicts better.",
 )
-@click.option(
-    "--probe", is_flag=True, help="Write the most informative next trial, even without a tie."
-)
+@flag("--probe", help="Write the most informative next trial, even without a tie.")
 @partial(parallel, by_itself=True)
-@click.option("--instruments", is_flag=True, help="Check the sensors only; takes some seconds.")
-@click.option(
-    "--details", is_flag=True, help="Also all findings, errors, rival effects and places."
-)
-@in_workspace
-@as_json
-def command(
+@flag("--instruments", help="Check the sensors only; takes some seconds.")
+@flag("--details", help="Also all findings, errors, rival effects and places.")
+def diagnose(
     trials: tuple[str, ...],
     max_effects: int | None,
     without: tuple[str, ...],
@@ -68,8 +66,7 @@ def command(
     engine: Engine,
     instruments: bool,
     details: bool,
-    json_: bool,
-) -> None:
+) -> Iterator[Any]:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the rest is noise, or cannot be told from it) or
@@ -81,34 +78,30 @@ def command(
     numbers they can't decide.
     """
     workspace = open_workspace()
-    from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
-    from grounded_trials.workspace.last_diagnosis import left_out
-    from grounded_trials.workspace.next_step import BEFORE_TRIALS
-
     if compare and not all(_GROUP.fullmatch(text) for text in compare):
         with stages() as stage:
             compared = workspace.compare(*compare, trials, progress=stage)
-        return show_json(compared.to_json()) if json_ else _models(compared)
+        yield compared
+        return _models(compared)
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
         raise wrong(
             "--compare", got=" ".join(compare), must="groups", like="t0001,t0002 t0003,t0004"
         )
     if instruments:
-        findings = workspace.preflight(trials)
-        alone = unheld_in(workspace, trials)
-        if json_:
-            odd = [one.to_json() for one in findings]
-            return show_json({"preflight": odd, "unheld": list(alone)})
+        findings, alone = workspace.preflight(trials), unheld_in(workspace, trials)
+        yield {"preflight": [one.to_json() for one in findings], "unheld": list(alone)}
         _instruments(findings, workspace.base_model.inputs)
-        _unheld(alone, bool(findings))
+        if alone:
+            show(field("unchecked", f"{', '.join(alone)} (no other sensor)"))
+        if not findings:
+            show(field("sensors", "no fault"))
         return show(f"\n{next_line(workspace.status().then)}")
-    families = [name for text in without for name in names_in(text)]
     with stages() as stage:
         found = workspace.diagnose(
             trials or first,
             max_effects=max_effects,
-            without=families,
+            without=[name for text in without for name in names_in(text)],
             compare=second,
             probe=probe,
             engine=engine,
@@ -116,22 +109,14 @@ def command(
         )
     left = () if trials or first else left_out(workspace)
     tell([*left, *unwritten_in(workspace)], all_=True)
-    if json_:
-        show_json(found.to_json())
-    else:
-        _show(found, workspace.base_model.inputs, details=details)
-        before = found.then is not None and found.then.verb in BEFORE_TRIALS
-        show("\n" + field("then" if before else "next trial", found.next_trial))
-        if found.probe:
-            from grounded_cli.propose import show_extent
-            from grounded_trials.workspace.candidates.trust import extent_of
-
-            show_extent(extent_of(workspace.candidate(found.probe)[0], workspace.task))
-        assert found.then is not None
-        show(f"\n{next_line(found.then)}")
-
-
-_GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
+    yield found
+    assert found.then is not None
+    _show(found, workspace.base_model.inputs, details=details)
+    before = found.then.verb in BEFORE_TRIALS
+    show("\n" + field("then" if before else "next trial", found.next_trial))
+    if found.probe:
+        show_extent(extent_of(workspace.candidate(found.probe)[0], workspace.task))
+    show(f"\n{next_line(found.then)}")
 
 
 def _models(found: Compared) -> None:
@@ -155,8 +140,6 @@ def _models(found: Compared) -> None:
 
 def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:
     """Print a diagnosis: what a person needs to decide, or with `details` everything."""
-    from grounded.diagnosis.telling import FINDINGS, effect_table, error_table, sentence, told
-
     said, kind = told(found), found.kind
     first, *others = [sentence(one) for one in said.lines]
     show(field("verdict", f"{kind}: {first}").replace(kind, tinted(kind), 1))
@@ -182,18 +165,8 @@ def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> N
 
 def _instruments(findings: Sequence[Finding], inputs: Collection[str]) -> None:
     """Print what is odd in the sensors and in the commands."""
-    from grounded.diagnosis.telling import instrument_lines
-
     sent = [one for one in findings if one.signal in inputs]
     seen = [one for one in findings if one.signal not in inputs]
     for title, some in (("sensors", seen), ("commands", sent)):
         for k, line in enumerate(instrument_lines(some)):
             show(field(title if k == 0 else "", line))
-
-
-def _unheld(alone: Sequence[str], odd: bool) -> None:
-    """Name the sensors that have no other sensor to be checked against."""
-    if alone:
-        show(field("unchecked", f"{', '.join(alone)} (no other sensor)"))
-    if not odd:
-        show(field("sensors", "no fault"))

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import click
 
 from grounded.result import with_unit
-from grounded_cli.console.options import as_json
-from grounded_cli.console.terminal import field, number, progress, show, show_json, table, tell
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.options import command
+from grounded_cli.console.terminal import field, number, progress, show, table, tell
+from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_trials.workspace.exciting import Excited
 
 
-@click.command("excite")
+@command("excite")
 @click.option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
-@in_workspace
-@as_json
-def command(seconds: float | None, json_: bool) -> None:
+def excite(seconds: float | None) -> Iterator[Excited]:
     """Write a drive that makes the model's uncertain parameters identifiable.
 
     It needs no target: multisines or staircases on all inputs, from [task] start, inside [limits]
@@ -25,9 +26,7 @@ def command(seconds: float | None, json_: bool) -> None:
     with progress("designing a drive"):
         made = workspace.excite(seconds)
     tell(made.findings)
-    if json_:
-        show_json(made.to_json())
-        return
+    yield made
     slow, quick = made.frequencies_hz
     held = ", with feedback" * made.feedback
     show(f"Run {made.candidate}: {made.file}")

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from grounded.diagnosis.causes import in_words
+from grounded.effects import Family, Scales, Site
 from grounded.errors import GroundedError, alike
 from grounded.findings.catalogue import WEIGHTS, codes, entry_of
 from grounded.findings.numbers import bare
+from grounded.models import car, pendulum
 from grounded.refusals import refused
-from grounded_cli.console.options import as_json
-from grounded_cli.console.terminal import field, show, show_json
+from grounded_cli.console.options import command
+from grounded_cli.console.terminal import field, show
 from grounded_cli.console.workspace_option import open_workspace
-
-if TYPE_CHECKING:
-    from grounded.effects import Family
+from grounded_trials.workspace.adopted import installed_effects
 
 
-@click.command("explain")
+@command("explain", workspace=False)
 @click.argument("name", metavar="[CODE|EFFECT]", required=False, default="")
-@as_json
-def command(name: str, json_: bool) -> None:
+def explain(name: str) -> Iterator[dict[str, Any]]:
     """Print what the CODE of a finding, or an EFFECT or its family, means; without, list all."""
-    from grounded_trials.workspace.adopted import installed_effects
-
     family, _, target = name.partition(":")
     findings = {one: vars(entry_of(one)) for one in codes() if name in ("", one)}
     library = installed_effects().families
@@ -36,9 +34,8 @@ def command(name: str, json_: bool) -> None:
         known = None if near else "those that `grounded explain` lists"
         raise refused("given.name", name, kind="code or effect", near=near, known=known)
     effects = _described(chosen, target) if chosen else {}
-    if json_:
-        show_json({"findings": findings, "effects": effects})
-    elif name:
+    yield {"findings": findings, "effects": effects}
+    if name:
         read = f"read docs/effects.md, {family}" if effects else "[text] is told where it applies"
         show(f"{name}: <name> stands for a value; {read}")
         (told,) = (findings | effects).values()
@@ -59,10 +56,6 @@ def _text(value: Any) -> str:
 
 def _described(families: Sequence[Family], target: str) -> dict[str, dict[str, Any]]:
     """Return what the registry has of families, with units at the target, or at an example."""
-    from grounded.diagnosis.causes import in_words
-    from grounded.effects import Scales, Site
-    from grounded.models import car, pendulum
-
     models, told = [car.model, pendulum.model], {}
     with suppress(GroundedError):
         models = [open_workspace().base_model, *models]

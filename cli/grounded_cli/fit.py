@@ -3,74 +3,62 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import click
 
+from grounded.diagnosis.telling import instrument_lines
+from grounded.engine import Engine
+from grounded.fit import Fit
+from grounded.fit.result import FittedValue
+from grounded.model import Model
 from grounded.refusals import wrong
 from grounded.result import listed
-from grounded_cli.console.options import as_json, chosen_trials, parallel
+from grounded_cli.console.options import chosen_trials, command, flag, parallel
 from grounded_cli.console.terminal import (
     field,
     lines,
     names_in,
     number,
     show,
-    show_json,
     stages,
     table,
     tell,
 )
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import or_zero, shown
-
-if TYPE_CHECKING:
-    from grounded.engine import Engine
-    from grounded.fit import Fit
-    from grounded.fit.result import FittedValue
-    from grounded.model import Model
+from grounded_trials.workspace.fitting import Fitted
 
 HELD_OUT = (
     "rms, open loop, of each group of trials (or piece of a single log), predicted with values "
     "from the others"
 )
+DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 
-@click.command("fit")
+@command("fit")
 @chosen_trials
 @click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
-@click.option("--latency", is_flag=True, help="Fit one transport delay of all inputs too.")
-@click.option("--apply", "apply_", is_flag=True, help="Write the values to grounded.toml.")
+@flag("--latency", help="Fit one transport delay of all inputs too.")
+@flag("--apply", help="Write the values to grounded.toml.")
 @partial(parallel, by_itself=True)
-@in_workspace
-@as_json
-def command(
-    trials: tuple[str, ...],
-    params: str | None,
-    latency: bool,
-    apply_: bool,
-    engine: Engine,
-    json_: bool,
-) -> None:
+def fit(
+    trials: tuple[str, ...], params: str | None, latency: bool, apply: bool, engine: Engine
+) -> Iterator[Fitted]:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
     Sensor faults (a delay, filtered speeds, degrees) are corrected first, as in `diagnose`.
     Trials are predicted with values from the others; values that predict worse are never written.
     """
-    workspace = open_workspace()
-    from grounded.diagnosis.telling import instrument_lines
-
-    names = names_in(params) or None
+    workspace, names = open_workspace(), names_in(params) or None
     if params is not None and names is None:
         raise wrong("--params", got=params, like="a1,L")
     with stages() as stage:
         done = workspace.fit(
-            names, trials=trials, latency=latency, apply=apply_, engine=engine, progress=stage
+            names, trials=trials, latency=latency, apply=apply, engine=engine, progress=stage
         )
-    if json_:
-        show_json(done.to_json())
-        return
+    yield done
     found = done.fit
     corrected = instrument_lines(one for one in done.preflight if one.corrected)
     for k, line in enumerate(corrected):
@@ -80,7 +68,7 @@ def command(
         show(f"\n{_errors(found, workspace.base_model)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
     tell(done.findings)
-    show(field("written", "[model] params" if apply_ else "nothing"))
+    show(field("written", "[model] params" if apply else "nothing"))
     show(next_line(done.then))
 
 
@@ -103,9 +91,6 @@ def _digits(e: FittedValue) -> int:
     if not 0 < width < size < math.inf:
         return DIGITS
     return min(max(math.floor(math.log10(size)) - math.floor(math.log10(width)) + 2, DIGITS), MOST)
-
-
-DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 
 def _errors(found: Fit, model: Model) -> str:

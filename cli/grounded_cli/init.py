@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import click
 
 from grounded.findings import found as finding
 from grounded.result import listed
 from grounded_cli.console import completion as complete
-from grounded_cli.console.options import as_json, misuse, table_layout
-from grounded_cli.console.terminal import (
-    LABEL,
-    field,
-    names_in,
-    progress,
-    sentence,
-    show,
-    show_json,
-    tell,
-)
+from grounded_cli.console.options import command, flag, json_asked, misuse, table_layout
+from grounded_cli.console.terminal import LABEL, field, names_in, progress, sentence, show, tell
 from grounded_cli.console.workspace_option import next_line
-
-if TYPE_CHECKING:
-    from grounded.findings import Finding
-    from grounded_trials.formats.tables import Layout
-    from grounded_trials.logs.inspection.guess import Guess
-    from grounded_trials.starting.begin import Begun
+from grounded_trials import Workspace
+from grounded_trials.formats.tables import Layout
+from grounded_trials.logs.inspection.guess import Guess
+from grounded_trials.logs.inspection.guessed_table import estimating
+from grounded_trials.starting.begin import Begun, begin
+from grounded_trials.starting.blank import left_open
+from grounded_trials.starting.examples import EXAMPLES
 
 ALTERNATIVES = 8  # alternative signals listed for an unsure state or input
 
 
-@click.command("init")
+@command("init", workspace=False)
 @click.argument("folder", metavar="DIR", required=False)
 @click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
 @click.option(
@@ -43,7 +36,7 @@ ALTERNATIVES = 8  # alternative signals listed for an unsure state or input
     metavar="FILE",
     help="Your model.py, or an MJCF or URDF file, beside --from or --blank.",
 )
-@click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
+@flag("--blank", help="No log yet: a workspace of --model, to fill in.")
 @click.option(
     "--kind",
     help="Kind of model skeleton: car, rover, differential, boat, balance, drone, arm, pendulum, "
@@ -63,17 +56,15 @@ ALTERNATIVES = 8  # alternative signals listed for an unsure state or input
     metavar="FILE[:INPUT,...]",
     help="Begin with an actuator that `export --library` wrote, for inputs of its unit or these.",
 )
-@click.option("--yes", is_flag=True, help="Ask nothing: use the best guesses, marked as such.")
+@flag("--yes", help="Ask nothing: use the best guesses, marked as such.")
 @click.option(
     "--example",
-    "name",
     metavar="NAME",
     shell_complete=complete.examples,
     help="Which example (see --list).",
 )
-@click.option("--list", "list_", is_flag=True, help="List the examples.")
-@as_json
-def command(
+@flag("--list", help="List the examples.")
+def init(
     folder: str | None,
     log: str | None,
     model: str | None,
@@ -84,10 +75,9 @@ def command(
     dt: float | None,
     actuators: tuple[str, ...],
     yes: bool,
-    name: str | None,
-    list_: bool,
-    json_: bool,
-) -> None:
+    example: str | None,
+    list: bool,
+) -> Iterator[Begun | dict[str, Any]]:
     """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
 
     --from LOG finds the model's states and inputs in a log and says why it chose them; without
@@ -95,43 +85,42 @@ def command(
     needs no log and writes drive.py, the robot's program. --example NAME copies an example, whose
     real.py simulates the robot.
     """
-    sorts: tuple[tuple[str, object], ...] = (
-        *(("--kind", kind), ("--inputs", inputs), ("--yes", yes)),
-        *(("--columns", layout.columns), ("--rate", layout.rate)),
-    )
-    if list_:
-        _list(json_)
-    elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
+    if list:
+        yield {"examples": {key: value.text for key, value in EXAMPLES.items()}}
+        return show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
+    if folder is None or [log is not None, example is not None, blank].count(True) != 1:
         raise misuse("DIR --from LOG", "DIR --example NAME", "DIR --blank --model FILE")
-    elif foreign := [key for key, given in sorts if given and not log]:
+    of_logs: dict[str, Any] = {"--kind": kind, "--inputs": inputs, "--yes": yes}
+    of_logs |= {"--columns": layout.columns, "--rate": layout.rate}
+    if not log and (foreign := [key for key, given in of_logs.items() if given]):
         raise misuse("--from LOG", foreign[0], how="first")
-    elif name is not None and (model or dt):
+    if example is not None and (model or dt):
         raise misuse("--example", "--model or --dt")
-    elif blank:
-        _blank(folder, model, dt, json_)
-        _with(folder, actuators)
-    elif log is not None:
-        from pathlib import Path
-
-        from grounded_trials.starting.begin import begin
-
-        asked = None if yes or json_ or not sys.stdin.isatty() else _ask
+    if blank and model is None:
+        raise misuse("--model FILE", "--blank", how="first")
+    if log is not None:
+        asked = None if yes or json_asked() or not sys.stdin.isatty() else _ask
         with progress(f"reading {log}"):
-            named = names_in(inputs)
             about: Any = {"model": model, "kind": kind, "dt": dt, "layout": layout}
-            begun = begin(Path(folder), log, inputs=named, ask=asked, **about)
+            begun = begin(Path(folder), log, inputs=names_in(inputs), ask=asked, **about)
         _with(folder, actuators)
-        show_json(begun.to_json()) if json_ else _tell(begun)
-    else:
-        _example(folder, str(name), json_)
-        _with(folder, actuators)
+        yield begun
+        return _tell(begun)
+    made = Workspace.create(folder, example=example, model=model, dt=dt)
+    _with(folder, actuators)
+    notes = left_open(made.base_model) if blank else ()
+    of = {"model": model} if blank else {"example": example}
+    yield {"workspace": folder, **of, "findings": [one.to_json() for one in notes]}
+    _made(folder, f"{model or example}:")
+    show(f"  grounded.toml, {'target.csv, drive.py' if blank else 'model.py, target.csv, real.py'}")
+    tell(notes)
+    where = f"cd {shlex.quote(folder)} && " * (folder != ".")
+    show(f"\nnext: {where}grounded propose")
 
 
 def _with(folder: str, actuators: Sequence[str]) -> None:
     """Begin with actuators of other workspaces."""
     if actuators:
-        from grounded_trials import Workspace
-
         effects = Workspace(folder).begin_with(*actuators)
         tell([finding("model.adopted", *(str(effect["name"]) for effect in effects))], all_=True)
 
@@ -157,8 +146,6 @@ def _made(folder: str, of: str) -> None:
 
 
 def _tell(begun: Begun) -> None:
-    from grounded_trials.logs.inspection.guessed_table import estimating
-
     what = f"{begun.kind}: {begun.why}" if begun.kind else begun.why
     _made(begun.workspace, begun.log)
     show(field("model", what, "  "))
@@ -188,44 +175,3 @@ def _tell(begun: Begun) -> None:
     tell(begun.findings, all_=True)
     show(field("read", f"{begun.workspace}/model.py, {begun.workspace}/grounded.toml"))
     show(next_line(begun.then, None if begun.again else begun.workspace))
-
-
-def _list(json_: bool) -> None:
-    from grounded_trials.starting.examples import EXAMPLES
-
-    if json_:
-        show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
-    else:
-        show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
-
-
-def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> None:
-    if model is None:
-        raise misuse("--model FILE", "--blank", how="first")
-    from grounded_trials import Workspace
-    from grounded_trials.starting.blank import left_open
-
-    made = Workspace.create(folder, model=model, dt=dt)
-    _created(folder, {"model": model}, left_open(made.base_model), "target.csv, drive.py", json_)
-
-
-def _example(folder: str, name: str, json_: bool) -> None:
-    from grounded_trials import Workspace
-
-    Workspace.create(folder, example=name)
-    _created(folder, {"example": name}, (), "model.py, target.csv, real.py", json_)
-
-
-def _created(
-    folder: str, of: dict[str, str], notes: Sequence[Finding], files: str, json_: bool
-) -> None:
-    """Say what a workspace was made of, and what is in it."""
-    if json_:
-        findings = [one.to_json() for one in notes]
-        show_json({"workspace": folder, **of, "findings": findings})
-        return
-    _made(folder, f"{', '.join(of.values())}:")
-    show(f"  grounded.toml, {files}")
-    tell(notes)
-    where = f"cd {shlex.quote(folder)} && " * (folder != ".")
-    show(f"\nnext: {where}grounded propose")

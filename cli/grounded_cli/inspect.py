@@ -2,47 +2,38 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
 import click
 
-from grounded_cli.console.options import as_json, table_layout
-from grounded_cli.console.terminal import number, progress, remark, show, show_json, table
-from grounded_cli.console.workspace_option import given, in_workspace, next_line, typed
+from grounded_cli.console.options import command, table_layout
+from grounded_cli.console.terminal import number, progress, remark, show, table
+from grounded_cli.console.workspace_option import given, next_line, typed
+from grounded_trials.formats.tables import Layout
+from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
+from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.wording import count, extent
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from grounded_trials.formats.tables import Layout
-    from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
-    from grounded_trials.workspace.inspecting import Inspected
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.inspecting import Inspected, inspect_in
 
 # constant fields of one array (an IMU's covariance has 9) that are folded into one line
 FOLDED_FIELDS = 9
 
 
-@click.command("inspect")
+@command("inspect")
 @click.argument("log", metavar="LOG")
 @table_layout
-@in_workspace
-@as_json
-def command(log: str, layout: Layout, json_: bool) -> None:
+def inspect(log: str, layout: Layout) -> Iterator[Inspected]:
     """Show topics, types, rates and fields of a log, and a ready-made [log] table.
 
     The table is guessed for the states and inputs of the workspace; `unsure` marks lines to check.
     There is no table for files written by grounded, for damaged files, and outside a workspace.
     """
-    from grounded_trials.workspace.folder import Folder
-    from grounded_trials.workspace.inspecting import inspect_in
-
     with progress(f"reading {log}"):
         found = inspect_in(Folder(given() or "."), log, layout)
     if found.why_none:
         remark("note", f"no [log] table is guessed{found.why_none}")
-    if json_:
-        show_json(found.to_json())
-        return
+    yield found
     report, what = found.report, _what(found)
     show(
         f"{', '.join(str(f) for f in report.files)}: {what}{chr(10) + '  ' if what else ''}"
@@ -57,7 +48,7 @@ def command(log: str, layout: Layout, json_: bool) -> None:
         show(f"\n# for grounded.toml\n{found.log_table}")
     else:
         show()
-    show(_next(found))
+    show(f"# next: {typed(found.then)}" if found.log_table else next_line(found.then))
 
 
 def _tell(topic: TopicReport) -> None:
@@ -99,19 +90,7 @@ def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
 
 def _what(found: Inspected) -> str:
     """Describe what a file is, if it says so itself; else ""."""
-    from grounded_trials.store.own_files import CANDIDATE, TRIAL
-
     damaged = ["DAMAGED"] * bool(found.report.damage)
     ran = found.report.meta.get("candidate", "")
-    kinds = {
-        TRIAL: f"trial{f' of {ran}' * bool(ran)}",
-        CANDIDATE: "candidate",
-    }
+    kinds = {TRIAL: f"trial{f' of {ran}' * bool(ran)}", CANDIDATE: "candidate"}
     return ", ".join(damaged + [text for form, text in kinds.items() if form == found.format])
-
-
-def _next(found: Inspected) -> str:
-    """Return the line that says what to do with the file."""
-    if found.log_table:
-        return f"# next: {typed(found.then)}"
-    return next_line(found.then)

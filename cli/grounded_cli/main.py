@@ -14,29 +14,23 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from functools import wraps
 from io import StringIO, TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
+from typing import Any, NoReturn, TextIO
 
+import click
+from click.shell_completion import CompletionItem
+
+from grounded import __version__
 from grounded.errors import GroundedError
 from grounded.refusals import unknown
-from grounded_cli.console.workspace_option import given, next_line
+from grounded_cli.console.terminal import ALARM, remark, say, style
+from grounded_cli.console.workspace_option import given, in_workspace, next_line
 from grounded_trials.wording import placed
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads only slow start-up
-
-import click
-
-from grounded import __version__
-from grounded_cli.console.workspace_option import in_workspace
-
-if TYPE_CHECKING:
-    from click.shell_completion import CompletionItem
-
-T = TypeVar("T")
 
 # name -> (module, one line); in the order in which they are used
 COMMANDS = {
@@ -84,10 +78,7 @@ class LazyGroup(click.Group):
             gc.freeze()
             gc.enable()
         commands = (one for one in vars(module).values() if isinstance(one, click.Command))
-        found = next(one for one in commands if one.name == name)
-        if found.callback is not None and not hasattr(found.callback, "apart"):
-            found.callback = _apart(found.callback)
-        return found
+        return next(one for one in commands if one.name == name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -110,10 +101,9 @@ class LazyGroup(click.Group):
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete command names without importing any command."""
-        from grounded_cli.console.completion import commands
-
-        options = click.Command.shell_complete(self, ctx, incomplete)
-        return [*commands(COMMANDS, incomplete), *options]
+        named = [(name, text) for name, (_, text) in COMMANDS.items()]
+        found = [CompletionItem(n, help=text) for n, text in named if n.startswith(incomplete)]
+        return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands without importing any."""
@@ -121,22 +111,7 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
 
-def _apart(command: Callable[..., T]) -> Callable[..., T]:
-    """Return a command that keeps stdout for its data, whatever the user's code prints."""
-
-    @wraps(command)
-    def run(*args: Any, **options: Any) -> T:
-        from grounded_cli.console.terminal import stdout_kept
-
-        with stdout_kept():
-            return command(*args, **options)
-
-    vars(run)["apart"] = True
-    return run
-
-
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@in_workspace
 @click.version_option(__version__, prog_name="grounded")
 def cli() -> None:
     """Teach a real system a manoeuvre in a few trials, from a crude model.
@@ -144,6 +119,9 @@ def cli() -> None:
     Start with `grounded demo car-figure8` in an empty folder, or make a workspace of your own with
     `grounded init DIR --example car-turn`.
     """
+
+
+in_workspace(cli)
 
 
 def main() -> NoReturn:
@@ -158,8 +136,6 @@ def main() -> NoReturn:
     try:
         code, words = _run()
         if words:
-            from grounded_cli.console.terminal import say
-
             say(words)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -183,8 +159,6 @@ def _noted(
     line: str | None = None,
 ) -> None:
     """Print a warning of Python, such as NumPy's about the user's model, as a remark."""
-    from grounded_cli.console.terminal import remark
-
     with suppress(OSError):
         remark("warning", f"{message} ({Path(filename).name}, line {lineno})")
 
@@ -215,8 +189,6 @@ def _run() -> tuple[int, str]:
     except Exception as error:
         if any(isinstance(one, KeyboardInterrupt) for one in _leading_to(error)):
             return 130, INTERRUPTED
-        from grounded_cli.console.terminal import ALARM, style
-
         if isinstance(error, OSError) and error.strerror:
             named = f"{error.filename}: " if error.filename else ""
             return 1, f"{style('error:', ALARM)} {named}{error.strerror}"

@@ -4,73 +4,52 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
-import click
-
-from grounded_cli.console.options import as_json, details
-from grounded_cli.console.terminal import LABEL, field, number, show, show_json, stages, tell
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.options import command, details
+from grounded_cli.console.terminal import LABEL, field, number, show, stages, tell
+from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import with_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from grounded_trials.workspace.candidates.proposing import Proposed
-    from grounded_trials.workspace.candidates.trust import Extent
+from grounded_trials.workspace.candidates.proposing import Proposed
+from grounded_trials.workspace.candidates.trust import Extent
 
 
-@click.command("propose")
+@command("propose")
 @details
-@in_workspace
-@as_json
-def command(json_: bool, details: bool) -> None:
+def propose(details: bool) -> Iterator[Proposed]:
     """Show what to run next and write its candidate file.
 
     The outstanding candidate is shown again while its trial is missing. Nothing is proposed once
     the search has ended.
     """
-    workspace = open_workspace()
     with stages() as tick:
         tick("planning")
-        proposed = workspace.propose(tick)
-    if json_:
-        show_json(proposed.to_json())
-    else:
-        tell_proposed(proposed, details=details)
+        proposed = open_workspace().propose(tick)
+    yield proposed
+    tell_proposed(proposed, details=details)
+    show(f"\n{next_line(proposed.then)}")
 
 
-def tell_proposed(proposed: Proposed, *, last: bool = True, details: bool = False) -> None:
-    """Print what to run next.
-
-    Args:
-        proposed: the result of `Workspace.propose`.
-        last: whether to end with the next command.
-        details: whether all findings are told.
-    """
+def tell_proposed(proposed: Proposed, *, details: bool = False) -> None:
+    """Print what to run next; with `details` all findings."""
     standing, candidate = proposed.standing, proposed.candidate
     tell(proposed.findings, all_=details)
     if candidate is None:
-        show(field("end", standing.sentence))
-        show(f"\n{next_line(proposed.then)}")
-        return
+        return show(field("end", standing.sentence))
     waiting = "" if proposed.proposal.is_new else " (waiting)"
     show(f"Run {candidate.id}{' once more' if proposed.again else waiting}: {proposed.file}")
-    errors = "; ".join(one.finding.what for one in proposed.off_target)
     rows = (
         ("why", standing.sentence if proposed.again else ""),
-        ("what", proposed.made),
-        ("predicted", proposed.predicted),
-        ("off target", errors),
-        ("so far", proposed.so_far),
-        ("trust", proposed.trust),
+        ("what", proposed.made.sentence if proposed.made else ""),
+        ("predicted", proposed.predicted.sentence if proposed.predicted else ""),
+        ("off target", "; ".join(one.finding.what for one in proposed.off_target)),
+        ("so far", proposed.so_far.sentence if proposed.so_far else ""),
+        ("trust", proposed.trust.sentence if proposed.trust else ""),
     )
-    for label, told in rows:
-        if text := told if isinstance(told, str) else told.sentence if told else "":
+    for label, text in rows:
+        if text:
             show(field(label, text, "  "))
     show_extent(proposed.extent)
-    if last:
-        show(f"\n{next_line(proposed.then)}")
 
 
 def show_extent(extent: Sequence[Extent]) -> None:

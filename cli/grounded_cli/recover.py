@@ -2,45 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from grounded.errors import NextCommand
-from grounded_cli.console.options import as_json
-from grounded_cli.console.terminal import field, progress, say, show, show_json
+from grounded_cli.console.options import command, exits
+from grounded_cli.console.terminal import field, progress, say, show
 from grounded_cli.console.workspace_option import next_line
+from grounded_trials.logs.recover import Recovery, recover_log
+from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.wording import count
 
-if TYPE_CHECKING:
-    from grounded_trials.logs.recover import Recovery
 
-
-@click.command("recover")
+@command("recover", workspace=False)
 @click.argument("log", metavar="LOG")
 @click.option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
-@as_json
-def command(log: str, output: str | None, json_: bool) -> None:
+def recover(log: str, output: str | None) -> Iterator[Recovery]:
     """Recover what is readable in a damaged MCAP file; exit with 3 if something was lost.
 
     The damaged file is not changed.
     """
-    from grounded_trials.logs.recover import recover_log
-
     source = Path(log)
     target = Path(output) if output else source.with_name(f"{source.stem}-recovered.mcap")
     with progress(f"reading {log}"):
         found = recover_log(source, target)
-    if json_:
-        show_json(found.to_json())
-    else:
-        _tell(found)
-    if not found.complete:
-        click.get_current_context().exit(3)
-
-
-def _tell(found: Recovery) -> None:
+    exits(0 if found.complete else 3)
+    yield found
     for loss in found.losses:
         say(field("lost", loss))
     if found.complete:
@@ -52,36 +41,24 @@ def _tell(found: Recovery) -> None:
         show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
     if found.unverified:
         show(field("unchecked", count(found.unverified, "message")))
-    if _is_trial(found):
-        show(field("trial", _steps(found)))
-    show(f"\n{_next(found)}")
+    if found.format == TRIAL:
+        ran = f" of {found.candidate}" * bool(found.candidate)
+        planned = f" of {found.planned_steps}" if found.planned_steps is not None else ""
+        show(
+            field("trial", f"{found.steps}{planned} steps{ran}{', with a hole' * bool(found.hole)}")
+        )
+    show(f"\n{next_line(_next(found))}")
 
 
-def _is_trial(found: Recovery) -> bool:
-    from grounded_trials.store.own_files import TRIAL
-
-    return found.format == TRIAL
-
-
-def _steps(found: Recovery) -> str:
-    """Describe how much of a trial written by grounded is left."""
-    ran = f" of {found.candidate}" * bool(found.candidate)
-    planned = f" of {found.planned_steps}" if found.planned_steps is not None else ""
-    return f"{found.steps}{planned} steps{ran}{', with a hole' * bool(found.hole)}"
-
-
-def _next(found: Recovery) -> str:
-    """Return the lines that say what to do with the file."""
-    from grounded_trials.store.own_files import CANDIDATE
-
+def _next(found: Recovery) -> NextCommand:
+    """Return what to do with the file."""
     target = str(found.file)
     if found.format == CANDIDATE:
-        return next_line(NextCommand("propose"))
-    if not _is_trial(found):
-        return next_line(NextCommand("inspect", (target,)))  # which says how it is ingested
+        return NextCommand("propose")
+    if found.format != TRIAL:
+        return NextCommand("inspect", (target,))  # which says how it is ingested
     if found.hole:
-        return next_line(NextCommand("run", (found.candidate,) if found.candidate else ()))
+        return NextCommand("run", (found.candidate,) if found.candidate else ())
     short = found.planned_steps is None or (found.steps or 0) < found.planned_steps
-    if found.complete or not (found.candidate and short):
-        return next_line(NextCommand("ingest", (target,)))
-    return next_line(NextCommand("ingest", ("--data", target)))
+    as_data = found.candidate and short and not found.complete
+    return NextCommand("ingest", ("--data", target) if as_data else (target,))

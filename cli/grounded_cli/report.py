@@ -3,40 +3,30 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import click
+from typing import Any
 
 from grounded.errors import GroundedError
 from grounded.refusals import refused
-from grounded_cli.console.options import as_json
-from grounded_cli.console.terminal import (
-    number,
-    progress,
-    remark,
-    say,
-    show,
-    show_json,
-    sparkline,
-    table,
-)
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.options import command, exits, flag, json_asked
+from grounded_cli.console.terminal import number, progress, remark, say, show, sparkline, table
+from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_trials import Workspace
+from grounded_trials.report.report_text import report_text
+from grounded_trials.report.reporting import Report, save_recording
 from grounded_trials.wording import count
 
-if TYPE_CHECKING:
-    from grounded_trials import Workspace
 
-
-@click.command("report")
-@click.option("--html", is_flag=True, help="Write reports/report.html, one page with everything.")
-@click.option("--png", is_flag=True, help="Write the page's figures as pictures, reports/*.png.")
-@click.option("--rrd", is_flag=True, help="Write reports/recording.rrd for the Rerun viewer.")
-@click.option("--watch", is_flag=True, help="Write the page again whenever a trial comes in.")
-@in_workspace
-@as_json
-def command(html: bool, png: bool, rrd: bool, watch: bool, json_: bool) -> None:
+@command("report")
+@flag("--html", help="Write reports/report.html, one page with everything.")
+@flag("--png", help="Write the page's figures as pictures, reports/*.png.")
+@flag("--rrd", help="Write reports/recording.rrd for the Rerun viewer.")
+@flag("--watch", help="Write the page again whenever a trial comes in.")
+def report(html: bool, png: bool, rrd: bool, watch: bool) -> Iterator[Report | dict[str, Any]]:
     """Show utilities, trajectories, bias and gap of all stored trials.
 
     A damaged or missing trial is left out and named (exit code 3). With --watch the page stays
@@ -44,26 +34,20 @@ def command(html: bool, png: bool, rrd: bool, watch: bool, json_: bool) -> None:
     """
     workspace = open_workspace()
     if watch:
-        _watch(workspace)
-        return
+        return _watch(workspace)
     with progress("reading trials"):
         report = workspace.report(html=html, png=png, rrd=rrd)
-    if json_:
-        show_json(report.to_json())
-    elif report.paths:
-        for path in report.paths:
-            show(str(path))
-        if html or rrd:
-            remark("layouts", "load one in Foxglove or PlotJuggler, then open a trial in trials/")
-        show(f"\n{next_line(report.findings.then)}")
-    else:
-        from grounded_trials.report.report_text import report_text
-
-        show(report_text(report.findings, table, sparkline))
-    if report.findings.lost:
-        for one in report.findings.lost if report.paths or json_ else ():
-            remark("left out", f"{one.file}: {one.reason}")
-        click.get_current_context().exit(3)
+    exits(3 if report.findings.lost else 0)
+    for one in report.findings.lost if report.paths or json_asked() else ():
+        remark("left out", f"{one.file}: {one.reason}")
+    yield report
+    if not report.paths:
+        return show(report_text(report.findings, table, sparkline))
+    for path in report.paths:
+        show(str(path))
+    if html or rrd:
+        remark("layouts", "load one in Foxglove or PlotJuggler, then open a trial in trials/")
+    show(f"\n{next_line(report.findings.then)}")
 
 
 def _watch(workspace: Workspace) -> None:
@@ -83,31 +67,16 @@ def _watch(workspace: Workspace) -> None:
         say("stopped")
 
 
-@click.command("view")
-@in_workspace
-def view() -> None:
+@command("view", json=False)
+def view() -> Iterator[Path]:
     """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
 
     The file reports/recording.rrd is written first. If this machine has no screen, copy the file to
     one that has (with the extra `view`) and open it there: rerun recording.rrd
     """
-    workspace = open_workspace()
-    from grounded_trials.report.reporting import save_recording
-
     with progress("writing the recording"):
-        path = save_recording(workspace)
-    _open(path)
-
-
-def _open(path: Path) -> None:
-    """Start the viewer and leave it running.
-
-    Raises:
-        GroundedError: if the viewer is not installed, there is no screen, or it exits at once.
-    """
-    import shutil
-    import subprocess
-
+        path = save_recording(open_workspace())
+    yield path
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         raise refused("run.viewer", path, screen=True)
     beside = Path(sys.executable).with_name("rerun")
@@ -121,7 +90,6 @@ def _open(path: Path) -> None:
         code = viewer.wait(timeout=2.0)
     except subprocess.TimeoutExpired:
         viewer.returncode = 0  # it keeps running: Popen must not warn about it
-        say(f"{path} is open")
-        return
+        return say(f"{path} is open")
     if code != 0:
         raise refused("run.viewer", path, exit=code)

@@ -3,43 +3,34 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
-import click
-
-from grounded_cli.console.options import as_json, details
+from grounded_cli.console.options import command, details, exits
 from grounded_cli.console.terminal import (
     field,
     number,
     progress,
     remark,
     show,
-    show_json,
     sparkline,
     table,
     tell,
 )
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import count, legend, wrapped
-
-if TYPE_CHECKING:
-    from grounded_trials.workspace.candidates.proposing import Status
+from grounded_trials.workspace.candidates.proposing import Status
+from grounded_trials.workspace.verifying import Verified
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
 
-@click.command("status")
+@command("status")
 @details
-@in_workspace
-@as_json
-def command(json_: bool, details: bool) -> None:
+def status(details: bool) -> Iterator[Status]:
     """Show where the search stands, from the stored trials; nothing is written."""
-    workspace = open_workspace()
     with progress("reading trials"):
-        status = workspace.status()
-    if json_:
-        show_json(status.to_json())
-        return
+        status = open_workspace().status()
+    yield status
     show(summary(status))
     tell(status.findings, all_=details)
     for name, why in status.discarded.items():
@@ -51,22 +42,16 @@ def command(json_: bool, details: bool) -> None:
     show(f"\n{next_line(status.then)}")
 
 
-@click.command("verify")
-@in_workspace
-@as_json
-def verify(json_: bool) -> None:
+@command("verify")
+def verify() -> Iterator[Verified]:
     """Find stored files that were changed, damaged, deleted or replaced."""
-    workspace = open_workspace()
     with progress("checking"):
-        found = workspace.verify()
-    if json_:
-        show_json(found.to_json())
-    else:
-        for one in found.damaged:
-            remark("damaged", one.reason)
-        show(f"{count(found.checked, 'file')} checked, {len(found.damaged)} damaged")
-    if found.damaged:
-        click.get_current_context().exit(1)
+        found = open_workspace().verify()
+    exits(1 if found.damaged else 0)
+    yield found
+    for one in found.damaged:
+        remark("damaged", one.reason)
+    show(f"{count(found.checked, 'file')} checked, {len(found.damaged)} damaged")
 
 
 def summary(status: Status) -> str:

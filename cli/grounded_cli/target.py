@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import click
 from click.core import ParameterSource
 
 from grounded.result import listed
-from grounded_cli.console.options import as_json, misuse, values_by_name
-from grounded_cli.console.options import details as with_details
-from grounded_cli.console.terminal import field, number, show, show_json, tell
-from grounded_cli.console.workspace_option import in_workspace, next_line, open_workspace
+from grounded_cli.console import options
+from grounded_cli.console.options import command, flag, misuse, values_by_name
+from grounded_cli.console.terminal import field, number, show, tell
+from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_trials.starting.drawing import Drawn, Manoeuvre
+from grounded_trials.starting.shapes import Drive
 from grounded_trials.wording import extent, with_unit
-
-if TYPE_CHECKING:
-    from grounded_trials.starting.drawing import Drawn
-
 
 PATHS = ("line", "circle", "figure-8")
 OF_SHAPES = {  # the shapes that an option is for
@@ -25,11 +23,11 @@ OF_SHAPES = {  # the shapes that an option is for
     **dict.fromkeys(("lateral", "laps"), PATHS[1:]),
     "seconds": ("line", "step", "swing-up"),
     "to": (*PATHS, "step", "swing-up"),
-    "at_rest": PATHS[:1],
+    "rest": PATHS[:1],
 }
 
 
-@click.command("target")
+@command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
 @click.option(
     "--size",
@@ -54,29 +52,16 @@ OF_SHAPES = {  # the shapes that an option is for
 @click.option(
     "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
 )
-@click.option(
-    "--rest",
-    "at_rest",
-    is_flag=True,
-    help="Let the states that a line leaves free rest at its end, by weights in [reward] terminal.",
-)
-@with_details
-@in_workspace
-@as_json
-def command(
+@flag("--rest", help="Let the states that a line leaves free rest at its end, by weights.")
+@options.details
+def target(
     shape: str,
-    size: float,
-    speed: float | None,
-    accel: float | None,
-    lateral: float,
-    laps: float,
-    hold: float,
     to: tuple[str, ...],
     seconds: float | None,
-    at_rest: bool,
-    json_: bool,
+    rest: bool,
     details: bool,
-) -> None:
+    **pace: float | None,
+) -> Iterator[Drawn]:
     """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
 
     FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
@@ -96,24 +81,19 @@ def command(
     inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
     diagnose; the search starts again.
     """
-    from grounded_trials.starting.drawing import Manoeuvre
-    from grounded_trials.starting.shapes import Drive
-
     context = click.get_current_context()
-    for name in OF_SHAPES:
+    for name, shapes in OF_SHAPES.items():
         given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
-        if given and shape not in OF_SHAPES[name]:
-            raise misuse(" | ".join(OF_SHAPES[name]), f"--{name.removeprefix('at_')}", how="first")
-    paces = {k: v for k, v in (("speed", speed), ("accel", accel)) if v is not None}
-    drive = Drive(size=size, lateral=lateral, laps=laps, hold=hold, **paces)
-    if shape == "line" and seconds is not None and len(paces) > 1:
+        if given and shape not in shapes:
+            raise misuse(" | ".join(shapes), f"--{name}", how="first")
+    paces = {name: value for name, value in pace.items() if value is not None}
+    asked = {name: value for name, value in paces.items() if name in ("speed", "accel")}
+    if shape == "line" and seconds is not None and len(asked) > 1:
         raise misuse("--seconds", "--speed with --accel")
-    asked = Manoeuvre(shape, drive, values_by_name(to, "--to"), seconds, paces, at_rest)
-    drawn = open_workspace().draw(asked)
-    if json_:
-        show_json(drawn.to_json())
-    else:
-        _tell(drawn, shape, details=details)
+    ends = values_by_name(to, "--to")
+    drawn = open_workspace().draw(Manoeuvre(shape, Drive(**paces), ends, seconds, asked, rest))
+    yield drawn
+    _tell(drawn, shape, details=details)
 
 
 def _tell(drawn: Drawn, shape: str, *, details: bool) -> None:

@@ -21,7 +21,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 @click.command("completion")
 @click.argument("shell", type=click.Choice(SHELLS))
-def command(shell: str) -> None:
+def completion(shell: str) -> None:
     """Print the script that makes the TAB key complete commands, candidates, trials and effects.
 
     \b
@@ -68,15 +68,6 @@ def examples(ctx: click.Context, param: click.Parameter, incomplete: str) -> lis
     return [
         CompletionItem(name, help=example.text)
         for name, example in EXAMPLES.items()
-        if name.startswith(incomplete)
-    ]
-
-
-def commands(table: dict[str, tuple[str, str]], incomplete: str) -> list[CompletionItem]:
-    """Complete the commands of a lazy group without importing them."""
-    return [
-        CompletionItem(name, help=text)
-        for name, (_, text) in table.items()
         if name.startswith(incomplete)
     ]
 

@@ -1,10 +1,10 @@
-"""Options that several commands share: --json, --details, --anyway, --trials, tables, jobs."""
+"""`command`, which makes a function a command, and the options that several commands share."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import click
@@ -12,25 +12,71 @@ import click
 from grounded.findings import found
 from grounded.refusals import wrong
 from grounded_cli.console import completion as complete
-from grounded_cli.console.terminal import names_in
+from grounded_cli.console.terminal import names_in, show_json, stdout_kept
+from grounded_cli.console.workspace_option import in_workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
+_CODE = "grounded_cli.code"
 
 
-def as_json(function: F) -> F:
-    """Add the option --json, passed as `json_`."""
-    return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
+def command(
+    name: str, *, workspace: bool = True, json: bool = True, **settings: Any
+) -> Callable[[Callable[..., Iterator[Any]]], click.Command]:
+    """Make a function a command, with the options -C and --json.
+
+    The function yields its result, and then tells it to a person: with --json, the document of the
+    result is printed instead. stdout is kept for either, whatever the user's code prints.
+
+    Args:
+        name: the command.
+        workspace: whether it takes -C.
+        json: whether it takes --json.
+        **settings: those of `click.command`.
+    """
+
+    def made(function: Callable[..., Iterator[Any]]) -> click.Command:
+        @functools.wraps(function)
+        def call(*args: Any, json_: bool = False, **options: Any) -> int:
+            with stdout_kept():
+                telling = function(*args, **options)
+                done = next(telling, None)  # None: it has told all, as `report --watch`
+                if json_ and done is not None:
+                    show_json(done if isinstance(done, dict) else done.to_json())
+                else:
+                    list(telling)
+            code: int = click.get_current_context().meta.get(_CODE, 0)
+            return code
+
+        found = click.command(name, cls=click.Command, **settings)(call)
+        if workspace:
+            in_workspace(found)
+        if json:
+            text = "Print one JSON document."
+            found.params.append(click.Option(["--json", "json_"], is_flag=True, help=text))
+        return found
+
+    return made
 
 
-def details(function: F) -> F:
-    """Add the option --details: tell every finding."""
-    return click.option("--details", is_flag=True, help="Tell all notes, with codes.")(function)
+def exits(code: int) -> None:
+    """Let the running command end with this exit code, once it has told its result."""
+    click.get_current_context().meta[_CODE] = code
 
 
-def anyway(function: F) -> F:
-    """Add the option --anyway, for commands that hand a candidate over."""
-    text = "Hand the candidate over even if [limits], [safety], task or model changed since."
-    return click.option("--anyway", is_flag=True, help=text)(function)
+def json_asked() -> bool:
+    """Return whether the running command was given --json."""
+    return bool(click.get_current_context().params.get("json_"))
+
+
+def flag(*names: str, help: str) -> Callable[[F], F]:
+    """Add an option without a value."""
+    return click.option(*names, is_flag=True, help=help)
+
+
+details = flag("--details", help="Tell all notes, with codes.")
+anyway = flag(
+    "--anyway", help="Hand the candidate over even if [limits], [safety], task or model changed."
+)
 
 
 def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[..., Any]:
@@ -38,7 +84,14 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
 
     by_itself: it runs on all idle processors unless --jobs says otherwise.
     """
+    kinds, jobs_ = click.Choice(["local", "dask"]), click.IntRange(1)
+    cluster = "Here (default), or a Dask cluster that sees this disk."
+    default = "all idle" if by_itself else "1"
+    workers = f"Workers on this machine (default: {default})."
 
+    @click.option("--jobs", type=jobs_, metavar="N", help=workers)
+    @click.option("--engine", type=kinds, default="local", help=cluster)
+    @click.option("--address", metavar="URL", help="Scheduler of a Dask cluster.")
     @functools.wraps(function)
     def call(*args: Any, jobs: int | None, engine: str, address: str | None, **others: Any) -> Any:
         from grounded.engine import Engine, idle
@@ -46,24 +99,6 @@ def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[
         jobs = jobs or (idle() if by_itself and engine == "local" else 1)
         return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
 
-    default = "all idle" if by_itself else "1"
-
-    for option in (
-        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
-        click.option(
-            "--engine",
-            type=click.Choice(["local", "dask"]),
-            default="local",
-            help="Here (default), or a Dask cluster that sees this disk.",
-        ),
-        click.option(
-            "--jobs",
-            type=click.IntRange(1),
-            metavar="N",
-            help=f"Workers on this machine (default: {default}).",
-        ),
-    ):
-        call = option(call)
     return call
 
 
@@ -89,35 +124,17 @@ def values_by_name(pairs: tuple[str, ...], option: str) -> dict[str, float]:
 
 def table_layout(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add --columns and --rate, passed as `layout`: what a table without names or times lacks."""
+    above, rows = click.FloatRange(min=0, min_open=True), "Rows a second of a table without times."
 
+    @click.option("--columns", metavar="A,B,...", help="Columns of a table without names.")
+    @click.option("--rate", type=above, metavar="HZ", help=rows)
     @functools.wraps(function)
     def call(*args: Any, columns: str | None, rate: float | None, **others: Any) -> Any:
         from grounded_trials.formats.tables import Layout
 
         return function(*args, layout=Layout(tuple(names_in(columns)), rate or 0.0), **others)
 
-    for option in (
-        click.option(
-            "--rate",
-            type=click.FloatRange(min=0, min_open=True),
-            metavar="HZ",
-            help="Rows a second of a table without times.",
-        ),
-        click.option("--columns", metavar="A,B,...", help="Columns of a table without names."),
-    ):
-        call = option(call)
     return call
-
-
-def chosen_trials(function: F) -> F:
-    """Add the option --trials, passed as a tuple of names; empty if it was not given."""
-    return click.option(
-        "--trials",
-        metavar="T1,T2,...",
-        shell_complete=complete.trials,
-        callback=_trial_names,
-        help="Only these trials (default: all).",
-    )(function)
 
 
 def _trial_names(ctx: click.Context, option: click.Parameter, text: str | None) -> tuple[str, ...]:
@@ -125,3 +142,15 @@ def _trial_names(ctx: click.Context, option: click.Parameter, text: str | None) 
     if text is not None and not chosen:
         raise wrong("--trials", got=text, like="t0001,t0002")
     return chosen
+
+
+chosen_trials = click.option(
+    "--trials",
+    metavar="T1,T2,...",
+    shell_complete=complete.trials,
+    callback=_trial_names,
+    help="Only these trials (default: all).",
+)
+which_candidate = click.option(
+    "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
+)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,19 +12,16 @@ from grounded_trials.wording import ELSEWHERE, folded, rendered
 if TYPE_CHECKING:
     from grounded_trials import Workspace
 
-F = TypeVar("F", bound=Callable[..., Any])
 _KEY = "grounded_cli.folder"
 
 
-def in_workspace(function: F) -> F:
+def in_workspace(command: click.Command) -> None:
     """Add the option -C DIR to the group or a command; `given` returns its value."""
-    return click.option(
-        "-C",
-        metavar="DIR",
-        expose_value=False,
-        callback=_remembered,
-        help="The workspace (default: here).",
-    )(function)
+    text = "The workspace (default: here)."
+    option = click.Option(
+        ["-C"], metavar="DIR", expose_value=False, callback=_remembered, help=text
+    )
+    command.params.append(option)
 
 
 def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,22 @@ from grounded.challenge import make, simulator, summary
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded.refusals import refused
-from grounded_cli.console.options import as_json, parallel
-from grounded_cli.console.terminal import bar, names_in, number, say, show, show_json, table
+from grounded_cli.console.options import command, flag, parallel
+from grounded_cli.console.terminal import bar, names_in, number, say, show, table
 from grounded_cli.console.workspace_option import typed
 from grounded_trials.challenge import diagnose_cases, score_cases, undiagnosed, write_cases
 from grounded_trials.wording import count
 
 
 @click.group("challenge")
-def command() -> None:
+def challenge() -> None:
     """Make, diagnose and score blind cases for the diagnosis.
 
     Run `grounded challenge run DIR` on a machine without the labels.
     """
 
 
-@command.command("make", short_help="Write cases, and their sealed labels elsewhere.")
+@command("make", workspace=False, short_help="Write cases, and their sealed labels elsewhere.")
 @click.argument("folder", metavar="DIR")
 @click.option(
     "--kind",
@@ -51,7 +52,6 @@ def command() -> None:
     metavar="E",
     help="Relative error of the model's parameters, 0 to 0.5.",
 )
-@as_json
 def make_cases(
     folder: str,
     kind: str,
@@ -60,17 +60,14 @@ def make_cases(
     systems: str,
     labels: str | None,
     param_error: float | None,
-    json_: bool,
-) -> None:
+) -> Iterator[dict[str, Any]]:
     """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
     sealed = Path(labels or f"{folder}-labels")
     groups = _at_hand(names_in(systems))
     drawn = make(kind, cases, seed, groups=groups, param_error=param_error)  # type: ignore[arg-type]
     with bar("cases") as progress:
         names = write_cases(drawn, Path(folder), sealed, lambda done: progress(done, cases))
-    if json_:
-        show_json({"workspace": folder, "labels": str(sealed), "cases": names})
-        return
+    yield {"workspace": folder, "labels": str(sealed), "cases": names}
     show(f"{folder}: {count(len(names), 'case')}; labels: {sealed}")
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
 
@@ -88,19 +85,14 @@ def _at_hand(groups: list[str]) -> list[str]:
     return groups
 
 
-@command.command("run", short_help="Diagnose the cases that have no diagnosis yet.")
+@command("run", workspace=False, short_help="Diagnose the cases that have no diagnosis yet.")
 @click.argument("folder", metavar="DIR")
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Effect families to leave out.")
-@click.option("--again", is_flag=True, help="Also repeat the diagnoses that exist.")
+@flag("--again", help="Also repeat the diagnoses that exist.")
 @parallel
-@as_json
 def run_cases(
-    folder: str,
-    without: tuple[str, ...],
-    again: bool,
-    engine: Engine,
-    json_: bool,
-) -> None:
+    folder: str, without: tuple[str, ...], again: bool, engine: Engine
+) -> Iterator[dict[str, Any]]:
     """Diagnose the cases of DIR that have no diagnosis yet; an interrupted run resumes."""
     families = [name for text in without for name in names_in(text)]
     waiting = undiagnosed(Path(folder), again=again)
@@ -108,21 +100,18 @@ def run_cases(
         times = diagnose_cases(
             Path(folder), without=families, again=again, engine=engine, progress=progress
         )
-    if json_:
-        show_json({"cases": list(times), "cpu_s": times})
-        return
+    yield {"cases": list(times), "cpu_s": times}
     if waiting:
         mean = sum(times.values()) / max(len(times), 1)
         show(f"{count(len(waiting), 'case')}: {mean:.1f} s CPU")
     show(f"\n{_scored(folder)}")
 
 
-@command.command("score", short_help="Open the labels, score the diagnoses.")
+@command("score", workspace=False, short_help="Open the labels, score the diagnoses.")
 @click.argument("folder", metavar="DIR")
 @click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
 @parallel
-@as_json
-def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
+def score(folder: str, labels: str | None, engine: Engine) -> Iterator[dict[str, Any]]:
     """Open the labels, score the diagnoses of DIR and compare with an oracle.
 
     The oracle knows the effects of each case.
@@ -131,15 +120,18 @@ def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
     with bar("cases") as progress:
         marks = score_cases(Path(folder), sealed, engine=engine, progress=progress)
     found = summary(marks)
-    if json_:
-        show_json({"summary": found, "cases": marks})
-        return
+    yield {"summary": found, "cases": marks}
     rows = [(m["case"], ", ".join(m["truth"]), m["verdict"], _few(m["named"])) for m in marks]
     show(table(rows, ("case", "truth", "verdict", "named")))
     for kind, row in found.items():
         show(f"\n{kind}")
         for key, value in row.items():
             show(f"  {key.replace('_', ' '):<20} {_words(value)}")
+
+
+challenge.add_command(make_cases)
+challenge.add_command(run_cases)
+challenge.add_command(score)
 
 
 def _few(names: list[str]) -> str:

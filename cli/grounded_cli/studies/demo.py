@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from grounded.engine import Engine, idle
 from grounded.errors import NextCommand
 from grounded.refusals import refused
 from grounded.result import percent
-from grounded_cli.console.options import as_json
+from grounded_cli.console.options import command
 from grounded_cli.console.terminal import (
     field,
     number,
@@ -21,7 +22,6 @@ from grounded_cli.console.terminal import (
     remark,
     say,
     show,
-    show_json,
     stages,
 )
 from grounded_cli.console.workspace_option import located, next_line
@@ -39,11 +39,10 @@ USED_ALL_BELOW = 1.5  # times as many trials as fit into STEPS: fewer are all us
 STEPS = 800  # total steps of the diagnosed trials, so that a demo ends within a minute or two
 
 
-@click.command("demo")
+@command("demo", workspace=False)
 @click.argument("name", metavar="[NAME]", default="car-figure8")
 @click.option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
-@as_json
-def command(name: str, folder: str | None, json_: bool) -> None:
+def demo(name: str, folder: str | None) -> Iterator[dict[str, Any]]:
     """Learn an example's manoeuvre on its simulated real system, diagnose the gap, report.
 
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
@@ -83,9 +82,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         "diagnosed_trials": len(diagnosed.made.trials if diagnosed.made else ()),
         "paths": report.to_json()["paths"],
     }
-    if json_:
-        show_json(document)
-        return
+    yield document
     say("")
     show(summary(status))
     _tell(document, [sentence(one) for one in told(diagnosed).lines])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import click
 from grounded.engine import Engine
 from grounded.experiments import car, flight, footnote9, nondeterminism, theorem1
 from grounded.refusals import wrong
-from grounded_cli.console.options import as_json, misuse, parallel
-from grounded_cli.console.terminal import bar, show, show_json, table
+from grounded_cli.console.options import command, misuse, parallel
+from grounded_cli.console.terminal import bar, show, table
 from grounded_trials.report.study_pictures import draw_study
 from grounded_trials.store.documents import StudyStore
 
@@ -26,7 +26,7 @@ STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
 }
 
 
-@click.command("experiment")
+@command("experiment", workspace=False)
 @click.argument("name", type=click.Choice(list(STUDIES)), metavar="[NAME]", required=False)
 @click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
 @parallel
@@ -34,25 +34,16 @@ STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
     "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
 )
 @click.option("--png", metavar="FILE", help="Draw the study's picture.")
-@as_json
-def command(
-    name: str | None,
-    seeds: str | None,
-    engine: Engine,
-    keep: str | None,
-    png: str | None,
-    json_: bool,
-) -> None:
+def experiment(
+    name: str | None, seeds: str | None, engine: Engine, keep: str | None, png: str | None
+) -> Iterator[Any]:
     """Run one of the paper's studies; the same seeds give the same results on any machine.
 
     Without NAME the studies are listed. Finished jobs are kept, so an interrupted study resumes.
     """
-    if name is None and json_:
-        show_json({"studies": {key: text for key, (_, _, text) in STUDIES.items()}})
-        return
     if name is None:
-        show("\n".join(f"{key:15} {text}" for key, (_, _, text) in STUDIES.items()))
-        return
+        yield {"studies": {key: text for key, (_, _, text) in STUDIES.items()}}
+        return show("\n".join(f"{key:15} {text}" for key, (_, _, text) in STUDIES.items()))
     study, kind, _ = STUDIES[name]
     given: dict[str, Any] = _seeds(seeds, kind, name)
     if kind:
@@ -66,9 +57,7 @@ def command(
         result = study(**given)
     if png:
         draw_study(name, result, Path(png))
-    if json_:
-        show_json(result.to_json())
-        return
+    yield result
     for one in result.tables():
         show(f"{one.title}\n\n{table(one.rows, one.head)}\n")
     if png:
