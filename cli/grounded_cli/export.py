@@ -18,7 +18,7 @@ from grounded_trials.workspace.candidates.exporting import Exported
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.taking_home import TakenHome
 
-FORMATS = ("csv", "npz", "bag", "json")
+FORMATS = ("csv", "npz", "json")
 
 
 @command("export")
@@ -27,7 +27,7 @@ FORMATS = ("csv", "npz", "bag", "json")
     "--format",
     "form",
     type=click.Choice(FORMATS),
-    help="Default: by the ending of FILE, without one json; of a trial a bag.",
+    help="Default: by the ending of FILE, without one json; of a trial csv.",
 )
 @click.option(
     "-o",
@@ -56,8 +56,7 @@ def export(
 ) -> Iterator[Exported | Shelved | TakenHome]:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
-    --format bag writes the predicted run as a ROS 2 bag of standard messages. A trial (t0007) can
-    be written as a bag, csv or npz.
+    A trial (t0007) can be written as csv or npz.
 
     `best` names the best candidate so far. A candidate that must not be run any more (see
     `grounded run`) is refused. One that was run in an earlier task is allowed if it keeps to the

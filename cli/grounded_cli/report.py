@@ -45,8 +45,6 @@ def report(html: bool, png: bool, rrd: bool, watch: bool) -> Iterator[Report | d
         return show(report_text(report.findings, table, sparkline))
     for path in report.paths:
         show(str(path))
-    if html or rrd:
-        remark("layouts", "load one in Foxglove or PlotJuggler, then open a trial in trials/")
     show(f"\n{next_line(report.findings.then)}")
 
 

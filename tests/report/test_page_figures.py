@@ -35,7 +35,6 @@ from grounded.trial import Trial
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.forecast import forecast, forecast_error
-from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
 from reported import car, cart, gathered
 
@@ -78,7 +77,6 @@ def test_a_position_along_one_axis_is_drawn_over_its_speed(roles, axes):
     )
     scene = scene_of(model)
     assert scene.names == axes and not scene.spatial
-    assert "3D!grounded" not in foxglove_layout(model)["configById"]
 
 
 @pytest.fixture(scope="module")

@@ -55,5 +55,5 @@ def test_a_report_reads_few_of_many_trials_and_its_numbers_are_the_same(learnt, 
         np.testing.assert_array_equal(one.residual, other.residual)
     text = page(part)
     assert holds(text, f"{len(part.runs)} of {len(whole.runs)} trials", "2 of 5 logs")
-    head = grounded("-C", learnt.folder, "report").out.splitlines()[0:2]
+    head = grounded("-C", learnt.folder, "report").out.splitlines()[0:3]
     assert f"{len(whole.runs)} trials" in " ".join(head)

@@ -11,7 +11,7 @@ import pytest
 from cli import grounded
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.tables import parameter_table
+from grounded_trials.report.tables import parameter_table
 from grounded_trials.workspace.adoption import tied_when_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import set_in_model

@@ -259,23 +259,22 @@ class Workspace(Folder):
         runner: bool = False,
         anyway: bool = False,
     ) -> Exported:
-        """Export a candidate for other languages, or a trial or predicted run for viewing.
+        """Export a candidate, or a trial, for other languages.
 
-        Candidates are refused as in `run`, except that one of an earlier task is allowed. A trial,
-        or a candidate with form "bag", is exported as a recorded or predicted run.
+        Candidates are refused as in `run`, except that one of an earlier task is allowed.
 
         Args:
             candidate: c0003, `best`, or a trial, t0007.
             path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz; for a run bag, csv or npz; None: by the file's suffix.
+            form: csv, json or npz; of a trial csv or npz; None: by the file's suffix.
             runner: write npz, and beside it the program that runs it on a robot with only numpy.
             anyway: write it although it is void.
         """
         from grounded_trials.workspace.candidates.exporting import export_candidate
 
         file, here, candidate = Path(path) if path else None, self.forget(), candidate.lower()
-        if form == "bag" or candidate.startswith("t"):
-            from grounded_trials.report.ros_bag import export_run
+        if candidate.startswith("t"):
+            from grounded_trials.report.run_file import export_run
 
             return export_run(here, candidate, form, file, runner=runner)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)

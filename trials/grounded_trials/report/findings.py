@@ -5,7 +5,7 @@ Text, page, pictures and recording show the same findings and read no files them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
@@ -18,7 +18,6 @@ from grounded.diagnosis.telling import Told, sentence, told
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded.frozen import Array
-from grounded.model import Model
 from grounded.result import begun, measured_alike
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
@@ -27,7 +26,7 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.store.store import Lost
-from grounded_trials.wording import figure, or_zero, rendered, shown
+from grounded_trials.wording import rendered, shown
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
 from grounded_trials.workspace.off_target import (
@@ -45,12 +44,6 @@ One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
 ESTIMATED = "not measured: an estimate"  # note at a panel
 NOWHERE = OffTarget("", "")  # without a first trial
-TERMS = {  # tables of [reward]
-    "state": "states",
-    "terminal": "end",
-    "input": "inputs",
-    "input_change": "input changes",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,9 +246,9 @@ class Improved:
 
     @property
     def text(self) -> str:
-        """`170 mm → 5.0 mm`: both in one unit, lengths below 1 m in mm."""
+        """`170 mm -> 5.0 mm`: both in one unit, lengths below 1 m in mm."""
         known = [v for v in (self.before, self.after) if np.isfinite(v)]
-        return " → ".join(measured_alike(known, self.unit))
+        return " -> ".join(measured_alike(known, self.unit))
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
@@ -282,33 +275,6 @@ def improvements_in(findings: Findings) -> list[Improved]:
             ends = max(first.end, least), max(last.end, least)
             found.append(Improved(f"{what} off target, end{doubt}{note}", unit, *ends))
     return found[:SHOWN]
-
-
-def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
-    """Return rows and header of the table of the compared utilities, by terms of the reward."""
-    task, runs = findings.task, [run for _, run in compared(findings)]
-    each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
-    rows = [
-        (words, *(figure(float(np.mean([terms[name] for terms in own]))) for own in each))
-        for name, words in TERMS.items()
-        if each and name in each[0][0]
-    ]
-    rows.append(("utility", *(figure(run.utility) for run in runs)))
-    return rows, ("term of the reward ", *(run.candidate.id for run in runs))
-
-
-def by_state(
-    model: Model, columns: Sequence[Array], unit: Callable[[str], str] = shown
-) -> list[tuple[str, ...]]:
-    """Return table rows: each state's name, its unit, and its number in each column (n,).
-
-    A number that is rounding noise beside another one of its row is 0.
-    """
-    table = np.array(columns, dtype=np.float64).reshape(-1, model.n).T
-    return [
-        (name, unit(each), *(figure(or_zero(value, *values), 3) for value in values))
-        for (name, each), values in zip(model.states.items(), table.tolist(), strict=True)
-    ]
 
 
 def prediction_error(task: Task, run: Run) -> Array:

@@ -2,37 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from grounded.errors import NextCommand
-from grounded.search.difference import Difference
 from grounded.search.pictures import few
-from grounded_trials.report.findings import (
-    Findings,
-    by_state,
-    compared,
-    off_prediction,
-    off_target,
-    rms,
-    selection,
-)
-from grounded_trials.report.forecast import forecast_error
-from grounded_trials.wording import (
-    count,
-    figure,
-    folded,
-    legend,
-    per_second,
-    rendered,
-    wrapped,
-)
-from grounded_trials.workspace.candidates.proposing import not_counted
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.tables import about, counted, error_table, forecast_table, improved
+from grounded_trials.wording import folded, rendered, wrapped
 from grounded_trials.workspace.next_step import DIAGNOSE
 
 ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
-ITERATIONS = 5  # of the bias
-LEGEND = "alpha: the part of the step that was run; +-: standard error"
 
 Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
 
@@ -45,115 +24,39 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         table: aligns rows under a header.
         bars: a sparkline of utilities.
     """
-    parts = [_head(findings), _utilities(findings, table, bars)]
-    if findings.best is not None:
-        parts += [_trajectories(findings, table), _biases(findings, table)]
-    parts.append(_diagnosis(findings, table))
-    if findings.logs:
-        parts.append(_logs(findings, table))
-    if findings.lost:
-        lines = ["left out"]
-        for one in findings.lost:
-            lines += _wrapped(f"{one.file}: {one.reason}")
-        parts.append("\n".join(lines))
-    parts.append(folded(rendered(findings.then, findings.folder)))
-    return "\n\n".join(parts)
+    now, history = findings.standing, findings.history
 
-
-def _head(findings: Findings) -> str:
-    task = findings.task
-    text = (
-        f"{findings.name}: {task.model.name}, {task.horizon} steps of {task.dt:g} s "
-        f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
-        f"{count(len(findings.runs) + findings.left_runs, 'trial')}"
-    )
-    if findings.logs:
-        text += f", {count(len(findings.logs) + findings.left_logs, 'log')} of data"
-    text += "".join(f"; {one.sentence}" for one in not_counted(findings.uncounted))
+    # the task, its trials, and what became better
+    head = [f"{findings.name}: {about(findings)}", "; ".join(counted(findings))]
     if findings.discarded:
-        text += f", set aside: {', '.join(findings.discarded)}"
+        head.append(f"set aside: {', '.join(findings.discarded)}")
     if findings.effects:
-        text += "; adopted: " + ", ".join(findings.effects)
-    return "\n".join(wrapped(text, "", ""))
+        head.append(f"adopted: {', '.join(findings.effects)}")
+    lines = [line for text in head for line in wrapped(text, "", "  ")]
+    lines += ["", *_indented(f"{value}: {what}" for value, what in improved(findings))]
 
+    # the candidates
+    if history:
+        kept, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
+        lines += ["", table([now.row(one) for one in kept], now.table()[1])]
+        more = f"({left} more: {rendered(NextCommand('status'), findings.folder)})"
+        spark = bars([tried.utility for tried in history if tried.utilities])
+        less = now.less_in_log.sentence if now.less_in_log else ""
+        lines += _indented(filter(None, (more * bool(left), spark, less)))
+    lines += _indented([f"{now.outcome}: {findings.outlook}"])
 
-def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
-    history = findings.history
-    if not history:
-        return "utility\n  -"
-    shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
-    rows = [(*row[:3], *row[4:]) for row in map(findings.standing.row, shown)]  # without damping
-    header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
-    lines = [
-        "utility",
-        table(rows, header),
-        *_wrapped(legend(LEGEND, [t.candidate.iteration for t in shown])),
-    ]
-    if left:
-        status = rendered(NextCommand("status"), findings.folder)
-        lines += _wrapped(f"({left} more: {status})")
-    if spark := bars([t.utility for t in history if t.utilities]):
-        lines += ["", *_wrapped(spark)]
-    first, best = findings.first, findings.best
-    if first is not None and best is not None:
-        text = f"model's policy {figure(first.utility)}, "
-        text += f"best {best.candidate.id} {figure(best.utility)}"
-        own = best.candidate.id == first.candidate.id  # it leads no other
-        if math.isfinite(first.utility) and first.utility < 0 and not own:
-            tried = {one.candidate.id: one for one in history}
-            two = tried[first.candidate.id], tried[best.candidate.id]
-            text += f"; {Difference(*two, history).lead.sentence}"
-        if findings.optimum is not None:
-            text += f", optimum {figure(findings.optimum)}"
-        lines += _wrapped(text)
-    if less := findings.standing.less_in_log:
-        lines += _wrapped(less.sentence)
-    lines += _wrapped(f"{findings.standing.outcome}: {findings.outlook}")
-    return "\n".join(lines)
-
-
-def _trajectories(findings: Findings, table: Table) -> str:
-    """Distance to the target, and what the model had promised, rms over the run."""
-    task, runs = findings.task, [run for _, run in compared(findings)]
-    columns = [rms(off_target(findings, run)) for run in runs]
-    columns += [rms(off_prediction(findings, run)) for run in runs]
-    rows = by_state(task.model, columns)
-    ids = [run.candidate.id for run in runs]
-    header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
-    return "\n".join(["trajectories, rms", table(rows, header)])
-
-
-def _biases(findings: Findings, table: Table) -> str:
-    task = findings.task
-    runs = selection(findings.improvements, ITERATIONS)
-    if not runs:
-        return "bias\n  -"
-    rows = by_state(task.model, [rms(run.residual) / task.dt for run in runs], per_second)
-    header = ("state", "unit", *(run.candidate.id for run in runs))
-    return "bias, rms\n" + table(rows, header)
-
-
-def _diagnosis(findings: Findings, table: Table) -> str:
-    if findings.diagnosis is None:
-        told = rendered(DIAGNOSE, findings.folder)
-        return "\n".join(["gap to the model", *_wrapped(told)])
-    lines = ["gap to the model", *(part for line in findings.lines for part in _wrapped(line))]
+    # errors by state, and what was diagnosed
+    ahead = forecast_table(findings) if findings.logs else []
+    for block in (*error_table(findings), *ahead):
+        lines += ["", block.text or table(block.rows, [name.strip() for name in block.header])]
+    gap = findings.lines or [rendered(DIAGNOSE, findings.folder)]
+    lines += ["", "gap to the model", *_indented(gap)]
     if (said := findings.told) is not None and said.rows:
         lines += ["", table(said.rows, said.header)]
-    return "\n".join(lines)
+    if findings.lost:
+        lines += ["", "left out", *_indented(f"{one.file}: {one.reason}" for one in findings.lost)]
+    return "\n".join([*lines, "", folded(rendered(findings.then, findings.folder))])
 
 
-def _logs(findings: Findings, table: Table) -> str:
-    """How far the crude model is off so far ahead (`ahead_s`) in logs that ran no candidate."""
-    logs = findings.logs[-ITERATIONS:]
-    ahead = findings.ahead_s
-    columns = [forecast_error(findings.crude, log.trial, ahead) for log in logs]
-    rows = by_state(findings.task.model, columns)
-    title = f"data: rms error {ahead:.3g} s ahead"
-    return "\n".join([*wrapped(title, "", "  "), ""]) + table(
-        rows, ("state", "unit", *(log.trial.id for log in logs))
-    )
-
-
-def _wrapped(text: str) -> list[str]:
-    return wrapped(text, "  ", "    ")
+def _indented(texts: Iterable[str]) -> list[str]:
+    return [line for text in texts for line in wrapped(text, "  ", "    ")]

@@ -20,7 +20,6 @@ from grounded_trials.report.figures.png import png as drawn
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.layouts import write_layouts
 from grounded_trials.report.page.page import page
 from grounded_trials.report.recording.recording import write_recording
 from grounded_trials.store.documents import write_document
@@ -60,7 +59,7 @@ class Report(Result):
         """Return the document of `report --json`, with the numbers of the text report by state."""
         findings, diagnosis = self.findings, self.findings.diagnosis
         document: dict[str, Any] = {
-            "paths": {_kind(path): str(path) for path in self.paths if path.suffix != ".png"},
+            "paths": {p.suffix[1:]: str(p) for p in self.paths if p.suffix != ".png"},
             "utilities": findings.standing.utilities,
             "phase": findings.standing.phase,
             "sentence": findings.outlook,
@@ -84,12 +83,6 @@ class Report(Result):
         gained, left = (one and one.sentence for one in (settled.gained, settled.open))
         document["adopted"] = {"clauses": settled.adopted, "gained": gained, "left": left}
         return document
-
-
-def _kind(path: Path) -> str:
-    """Return the kind of a file: html, rrd, foxglove or plotjuggler."""
-    name, _, layout = path.stem.partition("-")
-    return name if layout else path.suffix[1:]
 
 
 def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
@@ -117,9 +110,9 @@ def report_in(
 
     Args:
         workspace: the workspace.
-        html: write reports/report.html, and layouts for Foxglove and PlotJuggler.
+        html: write reports/report.html.
         png: write the figures of the page as reports/*.png.
-        rrd: write reports/recording.rrd for the Rerun viewer, and the layouts.
+        rrd: write reports/recording.rrd for the Rerun viewer.
 
     Raises:
         GroundedError: if an extra that one of them needs is missing; nothing is written then.
@@ -138,8 +131,6 @@ def report_in(
         paths += save_pictures(workspace, findings)
     if rrd:
         paths.append(save_recording(workspace, findings))
-    if html or rrd:
-        paths += save_layouts(workspace, findings)
     return Report(findings, tuple(paths))
 
 
@@ -148,11 +139,6 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     path = made_folder(workspace.reports) / RECORDING
     write_recording(findings or gather(workspace), path)
     return path
-
-
-def save_layouts(workspace: Folder, findings: Findings) -> tuple[Path, Path]:
-    """Write the layouts for Foxglove and PlotJuggler to reports/; return their paths."""
-    return write_layouts(made_folder(workspace.reports), findings.task.model)
 
 
 def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:

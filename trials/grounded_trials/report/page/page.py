@@ -10,11 +10,10 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import math
 import re
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,35 +23,10 @@ from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import label_lines, packed, palette, plotted
-from grounded.result import begun
-from grounded.search.difference import Difference, last_gain
-from grounded.search.pictures import search_figure
-from grounded_trials.report.figures.paths import crash, path_figure
-from grounded_trials.report.figures.runs import (
-    bias_figure,
-    error_figure,
-    input_figure,
-    state_figure,
-)
-from grounded_trials.report.findings import Findings, improvements_in, utility_terms
-from grounded_trials.report.page.diagnosed import gap_section
-from grounded_trials.report.page.tables import (
-    Block,
-    candidate_table,
-    channel_table,
-    drawn,
-    error_table,
-    parameter_table,
-    table,
-)
-from grounded_trials.wording import count, figure, glued, placed, rendered
-from grounded_trials.workspace.candidates.proposing import not_counted
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.tables import about, counted, improved, sections
+from grounded_trials.wording import glued, placed, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE
-
-if TYPE_CHECKING:
-    from grounded.search.candidate import Tried
-
-OPEN = 12  # largest number of candidates whose table is shown unfolded
 
 
 def page(findings: Findings, watched: int = 0) -> str:
@@ -84,12 +58,12 @@ def page(findings: Findings, watched: int = 0) -> str:
 
     return jinja.from_string(_own("page.html")).render(
         findings=findings,
-        about=_about(findings),
-        tiles=_tiles(findings),
-        improved=_improved(findings),
+        about=about(findings),
+        tiles=counted(findings),
+        improved=improved(findings),
         diagnose=rendered(DIAGNOSE, findings.folder),
         why=_why(findings),
-        sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
+        sections=sections(findings),
         style=_own("page.css") + _roles(),
         scripts=scripts,
         hashes=[_hash(script) for script in scripts],
@@ -181,75 +155,6 @@ def _roles() -> str:
     return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
 
 
-def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
-    """Return the sections (title, parts) in reading order."""
-    paths = drawn(path_figure(findings), wide=True)
-    return [
-        ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
-        ("States", drawn(state_figure(findings))),
-        ("Inputs", drawn(input_figure(findings))),
-        ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
-        ("Utility", _utility(findings)),
-        ("Bias", drawn(bias_figure(findings))),
-        ("Gap: model against reality", gap_section(findings)),
-        ("Task and model", _task(findings)),
-    ]
-
-
-def _about(findings: Findings) -> str:
-    task = findings.task
-    return (
-        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s ({task.horizon * task.dt:g} s), "
-        f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
-    )
-
-
-def _first_and_best(findings: Findings) -> tuple[Tried, Tried] | None:
-    """Return the first and the best candidate with their runs; None if they are the same."""
-    first, best = findings.first, findings.best
-    tried = {one.candidate.id: one for one in findings.history}
-    if first is None or best is None or first.candidate.id == best.candidate.id:
-        return None
-    return tried[first.candidate.id], tried[best.candidate.id]
-
-
-def _improved(findings: Findings) -> list[tuple[str, str]]:
-    """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    rows = [(one.text, one.what) for one in improvements_in(findings)]
-    first, best = findings.first, findings.best
-    same = first is None or best is None or figure(first.utility) == figure(best.utility)
-    if first is not None and best is not None and not same:
-        gain = ""
-        rated = -math.inf < first.utility < 0 and best.utility <= 0
-        if rated and (two := _first_and_best(findings)):
-            gain = f": {Difference(*two, findings.history).lead.sentence}"
-        moved = f"{figure(first.utility)} → {figure(best.utility)}"
-        rows.append((moved, f"utility, {first.candidate.id} to {best.candidate.id}{gain}"))
-    elif best is not None:
-        rows.append((figure(best.utility), f"utility, {best.candidate.id}"))
-    return rows
-
-
-def _tiles(findings: Findings) -> list[str]:
-    now, logs = findings.standing, len(findings.logs) + findings.left_logs
-    found = []
-    if findings.history or not logs:
-        found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
-    if logs:
-        found.append(f"{count(logs, 'log')} of data")
-    found += [one.sentence for one in not_counted(findings.uncounted)]
-    if findings.optimum is not None:
-        found.append(f"optimum {figure(findings.optimum)}")
-    for left, shown, kind in (
-        (findings.left_runs, len(findings.runs), "trials"),
-        (findings.left_logs, len(findings.logs), "logs"),
-    ):
-        if left:
-            found.append(f"{shown} of {left + shown} {kind} drawn")
-    early = [run.trial.id for run in findings.runs if crash(run) is not None]
-    return [*found, f"ended early: {', '.join(early)}"] if early else found
-
-
 def _why(findings: Findings) -> dict[str, Any]:
     """Return what is told of the diagnosis, and the credit figure; {} if undiagnosed."""
     diagnosis, said = findings.diagnosis, findings.told
@@ -266,24 +171,3 @@ def _why(findings: Findings) -> dict[str, Any]:
         "notes": [sentence(one) for one in said.findings[FINDINGS:]],
         "credit": credit_figure(diagnosis, 2),
     }
-
-
-def _utility(findings: Findings) -> list[Block]:
-    if not findings.history:
-        return []
-    gain = last_gain(findings.history)
-    sure = gain.to_finding().sentence if gain else ""
-    few = len(findings.history) <= OPEN
-    rows, header = utility_terms(findings)
-    return [
-        *drawn(search_figure(findings.standing, findings.optimum)),
-        *([Block("text", f"{begun(sure)}.")] if sure else []),
-        *([table("terms", header, rows)] if len(rows) > 2 else []),
-        Block("folded", "All candidates", blocks=candidate_table(findings), wide=few),
-    ]
-
-
-def _task(findings: Findings) -> list[Block]:
-    words = f"Adopted: {', '.join(findings.effects) or 'none'}."
-    parameters = Block("folded", "Parameters", blocks=parameter_table(findings))
-    return [Block("text", words), channel_table(findings), parameters]

@@ -41,16 +41,14 @@ from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.layout import Space, blueprint, entity_of, escaped, over_time
 from grounded_trials.report.scene import scene_of
-from grounded_trials.wording import count, figure, labelled, per_second
+from grounded_trials.report.tables import about, counted, improved
+from grounded_trials.wording import labelled, per_second
 
 
 def verdict(findings: Findings) -> str:
     """Return the next command, and the diagnosis in a few lines (Markdown)."""
-    lines = [f"next: `{findings.next_command}`\n"]
-    if findings.diagnosis is None:
-        lines.append("not diagnosed yet\n")
-    lines += [f"{_marked(line)}\n" for line in findings.lines]
-    return "\n".join(lines)
+    lines = [f"next: `{findings.next_command}`", *([] if findings.diagnosis else ["not diagnosed"])]
+    return "\n\n".join([*lines, *map(_marked, findings.lines)])
 
 
 def credit(findings: Findings) -> str:
@@ -69,31 +67,19 @@ def _marked(text: str) -> str:
 
 def summary(findings: Findings) -> str:
     """Return a summary of the workspace and of what is left out (Markdown)."""
-    task, best, first = findings.task, findings.best, findings.first
-    left = findings.left_runs + findings.left_logs
-    lines = [
-        f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
-        f"{count(len(findings.runs), 'trial')}"
-        + f", {count(len(findings.logs), 'log')} of data" * bool(findings.logs)
-        + f" (not shown: {left})" * bool(left),
-        "",
-    ]
-    known = []
-    if first is not None:
-        known.append(f"{figure(first.utility)} by the model's policy ({first.candidate.id})")
-    if best is not None:
-        known.append(f"{figure(best.utility)} best so far ({best.candidate.id})")
-    if findings.optimum is not None:
-        known.append(f"{figure(findings.optimum)} at the optimum")
-    lines.append(f"utility {', '.join(known)}" if known else "no candidate has been run yet")
-    lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
-    if findings.better is not None and best is not None:
-        lines[-1] += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
+    colours = "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"
+    if findings.better is not None and findings.best is not None:
+        colours += f"; yellow: limits, and the bias that the model {findings.better.name} leaves"
     if any(crash(run) is not None for run in findings.runs):
-        lines[-1] += "; crosses: where and when a run ended early"
-    lines += ["", f"**{findings.standing.outcome}**: {_marked(findings.outlook)}", ""]
-    lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
-    return "\n".join(lines)
+        colours += "; crosses: where and when a run ended early"
+    lines = [
+        f"**{findings.name}**, {about(findings)}; {'; '.join(counted(findings))}",
+        *(f"{value}: {what}" for value, what in improved(findings)),
+        colours,
+        f"**{findings.standing.outcome}**: {_marked(findings.outlook)}",
+        *(f"**left out**: {one.file}: {one.reason}" for one in findings.lost),
+    ]
+    return "\n\n".join(map(typeset, lines))
 
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}

@@ -1,0 +1,432 @@
+"""The contents of a report as values: sentences, tables, figures, commands.
+
+The page's template lays them out and escapes every text, since names may come from untrusted
+files; the report for a terminal and the recording take the same sentences and tables.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.diagnosis.parts import Diagnosis, Estimate
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
+from grounded.diagnosis.telling import error_table as held_out_table
+from grounded.diagnosis.telling import weighed_beside
+from grounded.errors import NextCommand
+from grounded.figures.figure import Figure
+from grounded.result import begun, listed
+from grounded.search.difference import Difference, last_gain
+from grounded.search.pictures import MOST_DRAWN, few, search_figure
+from grounded_trials.report.figures.gap import forecast_figures, residual_figures
+from grounded_trials.report.figures.paths import crash, path_figure
+from grounded_trials.report.figures.runs import (
+    bias_figure,
+    error_figure,
+    input_figure,
+    state_figure,
+)
+from grounded_trials.report.findings import (
+    Findings,
+    compared,
+    improvements_in,
+    off_prediction,
+    off_target,
+    rms,
+)
+from grounded_trials.report.forecast import forecast_error
+from grounded_trials.wording import (
+    count,
+    extent,
+    figure,
+    labelled,
+    legend,
+    or_zero,
+    percent,
+    rendered,
+    shown,
+    spread,
+    with_unit,
+)
+from grounded_trials.workspace.candidates.proposing import not_counted
+from grounded_trials.workspace.next_step import DIAGNOSE
+
+OPEN = 12  # largest number of candidates whose table is shown unfolded
+UNKNOWN = "–"
+TERMS = {  # tables of [reward]
+    "state": "states",
+    "terminal": "end",
+    "input": "inputs",
+    "input_change": "input changes",
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a section; `kind` selects its layout.
+
+    text, soft, heading    a sentence
+    command                a command to copy; `name` is its id
+    verdict                `lines`, one below the other
+    table                  `name`, `header` (text columns end with a blank), `rows`; `strong` rows
+                           are bold
+    figure                 `figure`; with `wide` two panels per row
+    folded                 `blocks` under the title `text`; open if `wide`
+    run                    the slider that moves along the paths
+    """
+
+    kind: str
+    text: str = ""
+    name: str = ""
+    lines: Sequence[str] = ()
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    strong: frozenset[int] = frozenset()
+    figure: Figure | None = None
+    blocks: Sequence[Block] = ()
+    wide: bool = False
+
+
+def table(
+    name: str, header: Sequence[str], rows: Sequence[Sequence[str]], strong: Iterable[int] = ()
+) -> Block:
+    """Return a table that can be copied."""
+    return Block("table", name=name, header=header, rows=rows, strong=frozenset(strong))
+
+
+def _drawn(figure: Figure | None, wide: bool = False, title: bool = False) -> list[Block]:
+    """Return a figure's blocks, with its title as a heading if `title`; [] for None."""
+    if figure is None:
+        return []
+    heading = [Block("heading", figure.title)] if title else []
+    return [*heading, Block("figure", name=figure.name, figure=figure, wide=wide)]
+
+
+# what a report begins with
+
+
+def about(findings: Findings) -> str:
+    """Return the task in a line, and how it is searched."""
+    task = findings.task
+    return (
+        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s ({task.horizon * task.dt:g} s), "
+        f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
+    )
+
+
+def counted(findings: Findings) -> list[str]:
+    """Return how many trials there are, and what of them is not used or drawn."""
+    now, logs = findings.standing, len(findings.logs) + findings.left_logs
+    found = []
+    if findings.history or not logs:
+        found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
+    if logs:
+        found.append(f"{count(logs, 'log')} of data")
+    found += [one.sentence for one in not_counted(findings.uncounted)]
+    if findings.optimum is not None:
+        found.append(f"optimum {figure(findings.optimum)}")
+    for left, drawn, kind in (
+        (findings.left_runs, len(findings.runs), "trials"),
+        (findings.left_logs, len(findings.logs), "logs"),
+    ):
+        if left:
+            found.append(f"{drawn} of {left + drawn} {kind} drawn")
+    early = [run.trial.id for run in findings.runs if crash(run) is not None]
+    return [*found, f"ended early: {', '.join(early)}"] if early else found
+
+
+def improved(findings: Findings) -> list[tuple[str, str]]:
+    """Return rows (value, text) of the errors and utility of the first and the best trial."""
+    rows = [(one.text, one.what) for one in improvements_in(findings)]
+    first, best = findings.first, findings.best
+    if first is not None and best is not None and figure(first.utility) != figure(best.utility):
+        gain, tried = "", {one.candidate.id: one for one in findings.history}
+        if -math.inf < first.utility < 0 and best.utility <= 0:
+            two = tried[first.candidate.id], tried[best.candidate.id]
+            gain = f": {Difference(*two, findings.history).lead.sentence}"
+        moved = f"{figure(first.utility)} -> {figure(best.utility)}"
+        rows.append((moved, f"utility, {first.candidate.id} to {best.candidate.id}{gain}"))
+    elif best is not None:
+        rows.append((figure(best.utility), f"utility, {best.candidate.id}"))
+    return rows
+
+
+# sections
+
+
+def sections(findings: Findings) -> list[tuple[str, list[Block]]]:
+    """Return the page's sections (title, parts) in reading order, without empty ones."""
+    paths = _drawn(path_figure(findings), wide=True)
+    found = [
+        ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
+        ("States", _drawn(state_figure(findings))),
+        ("Inputs", _drawn(input_figure(findings))),
+        ("Tracking error", _drawn(error_figure(findings)) + error_table(findings)),
+        ("Utility", _utility(findings)),
+        ("Bias", _drawn(bias_figure(findings))),
+        ("Gap: model against reality", _gap(findings)),
+        ("Task and model", _task(findings)),
+    ]
+    return [(title, blocks) for title, blocks in found if blocks]
+
+
+def _utility(findings: Findings) -> list[Block]:
+    if not findings.history:
+        return []
+    gain = last_gain(findings.history)
+    sure = gain.to_finding().sentence if gain else ""
+    terms, wide = _terms(findings), len(findings.history) <= OPEN
+    return [
+        *_drawn(search_figure(findings.standing, findings.optimum)),
+        *([Block("text", f"{begun(sure)}.")] if sure else []),
+        *([terms] if len(terms.rows) > 2 else []),
+        Block("folded", "All candidates", blocks=_candidates(findings), wide=wide),
+    ]
+
+
+def _gap(findings: Findings) -> list[Block]:
+    """What was diagnosed, and forecasts of the crude model beside the better one; then details."""
+    diagnosis = findings.diagnosis
+    ahead = [b for each in forecast_figures(findings) for b in _drawn(each, title=True)]
+    ahead += forecast_table(findings)
+    lacking = [b for each in residual_figures(findings) for b in _drawn(each, title=True)]
+    if diagnosis is None:
+        command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
+        return [command, *ahead, *lacking]
+    verdict = Block("verdict", lines=findings.lines)
+    if diagnosis.no_cause:  # with too little data, what was fitted is no finding
+        return [verdict, *ahead, *lacking]
+    proof = _drawn(accuracy_figure(diagnosis), title=True)
+    proof += _drawn(credit_figure(diagnosis), title=True)
+    found = [verdict, *proof, *ahead, *lacking, *_drawn(where_figure(diagnosis), title=True)]
+    alike = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
+    found += _titled("Errors of held-out predictions", "held-out", *held_out_table(diagnosis))
+    found += _effects(diagnosis, findings.since.adopted)
+    names = ("claimed effect", "look-alike ", "share")
+    found += _titled("Look-alikes", "lookalikes", alike, names)
+    return found + _by_trial(diagnosis) + _leftover(diagnosis)
+
+
+def _titled(
+    title: str, name: str, rows: Sequence[Sequence[str]], header: Sequence[str]
+) -> list[Block]:
+    """Return a table under its title; [] without rows."""
+    return [Block("heading", title), table(name, header, rows)] if rows else []
+
+
+def _task(findings: Findings) -> list[Block]:
+    words = f"Adopted: {', '.join(findings.effects) or 'none'}."
+    parameters = Block("folded", "Parameters", blocks=parameter_table(findings))
+    return [Block("text", words), _channels(findings), parameters]
+
+
+# tables
+
+
+def _candidates(findings: Findings) -> list[Block]:
+    """Return the candidates with their trials; of many, a part and the number left out."""
+    best, now = findings.standing.incumbent, findings.standing
+    kept, left = few(findings.history, MOST_DRAWN)
+    rows = [
+        {
+            "candidate": (c := tried.candidate).id,
+            "from": c.base or "-",
+            "iter.": str(c.iteration),
+            "alpha": f"{c.alpha:g}",
+            "damping": figure(c.damping, 2) if c.base else "-",
+            "predicted utility": figure(tried.promised),
+            "real utility": figure(tried.utility),
+            "std. error": spread(tried.standard_error),
+            "verdict ": now.verdict(tried),
+            "trials ": " ".join(t.id for t in tried.trials) or "none",
+        }
+        for tried in kept
+    ]
+    strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
+    made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
+    status = rendered(NextCommand("status"), findings.folder)
+    more = [Block("text", f"{left} more"), Block("command", status, "c-status")] * bool(left)
+    why = legend("", [t.candidate.iteration for t in kept])
+    told = (why, now.less_in_log.sentence if now.less_in_log else "")
+    return [made, *(Block("soft", f"{begun(words)}.") for words in told if words), *more]
+
+
+def _terms(findings: Findings) -> Block:
+    """Return the compared utilities by terms of the reward."""
+    task, runs = findings.task, [run for _, run in compared(findings)]
+    each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
+    rows = [
+        (words, *(figure(float(np.mean([terms[name] for terms in own]))) for own in each))
+        for name, words in TERMS.items()
+        if each and name in each[0][0]
+    ]
+    rows.append(("utility", *(figure(run.utility) for run in runs)))
+    return table("terms", ("term of the reward ", *(run.candidate.id for run in runs)), rows)
+
+
+def error_table(findings: Findings) -> list[Block]:
+    """Return by state the rms errors from target and prediction, and the rms bias."""
+    task, runs = findings.task, [run for _, run in compared(findings)]
+    if findings.best is None:
+        return []
+    columns = {f"off target, {r.candidate.id}": rms(off_target(findings, r)) for r in runs}
+    columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
+    columns |= {f"bias in 1 s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
+    rows = [
+        (name, shown(unit), *(figure(or_zero(value, *values), 3) for value in values))
+        for (name, unit), *values in zip(
+            task.model.states.items(), *(c.tolist() for c in columns.values()), strict=True
+        )
+    ]
+    return [table("errors", ("state", "unit", *columns), rows)]
+
+
+def forecast_table(findings: Findings) -> list[Block]:
+    """Return the rms prediction error at the horizon `ahead_s` in the best run and every log.
+
+    Unlike the errors of the diagnosis, these are not held out. A trial has a row for each model.
+    """
+    run = findings.lately
+    trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
+    if not trials:
+        return []
+    planners = [(findings.plain, findings.crude)]
+    if findings.better is not None:
+        planners.append((findings.better.name, findings.better.planner))
+    states, ahead = findings.task.model.states, findings.ahead_s
+    rows = [
+        (t.id or t.candidate, words, *(figure(v, 3) for v in forecast_error(p, t, ahead).tolist()))
+        for t in trials
+        for words, p in planners
+    ]
+    header = ("trial", "model ", *(labelled(name, shown(unit)) for name, unit in states.items()))
+    return _titled(f"Prediction error {ahead:.3g} s ahead, rms", "forecasts", rows, header)
+
+
+def _effects(diagnosis: Diagnosis, adopted: Collection[str]) -> list[Block]:
+    """Return the ranked effects with their parameters and 95 % intervals."""
+    beside, rows = weighed_beside(diagnosis), []
+    for r in diagnosis.ranking:
+        nats = figure(r.evidence, 3)
+        texts = {name: _interval(value) for name, value in r.params.items()}
+        values = [
+            f"{name} = {text if text == UNKNOWN else with_unit(text, r.params[name].unit)}"
+            for name, text in texts.items()
+        ]
+        rows.append(
+            (
+                r.effect + " (adopted since)" * (r.effect in adopted),
+                *((nats, "") if r.effect in beside else ("", nats)),
+                figure(r.gap_after, 3),
+                percent(r.shrinkage) if not r.shrinkage < 0 else "none, it grows",
+                "; ".join(values) or "-",
+            )
+        )
+    evidence = ("evidence [nats]", "evidence alone [nats]")
+    header = ("effect", *evidence, "gap after", "gap closed", "parameters, 95 % ")
+    strong = {i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects}
+    made = table("effects", header, rows, strong)
+    return [Block("heading", "Effects that were compared"), made] if rows else []
+
+
+def _by_trial(diagnosis: Diagnosis) -> list[Block]:
+    """Whether every trial asks for the same value, all other values held."""
+    found, units = diagnosis.per_trial, dict[tuple[str, str], str]()
+    for row in diagnosis.ranking:
+        units |= {(row.effect, name): e.unit for name, e in row.params.items()}
+    rows = []
+    for p in found:
+        own = diagnosis.parameters.get(p.quantity)
+        unit = own.unit if own else units.get((p.effect, p.quantity), "")
+        value = Estimate(p.value, p.std, unit=unit).text
+        rows.append((p.effect, p.quantity, p.trial, value, "yes" if p.agrees else "no"))
+    header = ("effect", "quantity ", "trial ", "value", "agrees")
+    strong = [i for i, p in enumerate(found) if not p.agrees]
+    each = table("per-trial", header, rows, strong)
+    return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))] * bool(found)
+
+
+def _leftover(diagnosis: Diagnosis) -> list[Block]:
+    """Return the residuals that a flexible model finds and no known effect explains."""
+    rows = [
+        (
+            left.channel,
+            with_unit(figure(left.size, 3), left.unit),
+            "-" if left.region is None else left.region.told,
+            "-" if left.region is None else percent(left.region.share),
+            figure(left.evidence, 3),
+        )
+        for left in diagnosis.leftover
+        if math.isfinite(left.size)
+    ]
+    header = ("channel", "missing rate, rms", "mostly where ", "share there", "evidence [nats]")
+    return _titled("What no known effect explains", "leftover", rows, header)
+
+
+def parameter_table(findings: Findings) -> list[Block]:
+    """Return the model's parameters: in model.py, current, and as diagnosed."""
+    estimated = _estimated(findings.diagnosis)
+    rests = findings.diagnosis.conditions if findings.diagnosis else {}
+    rows = []
+    for name, param in findings.task.model.params.items():
+        bounded = param.low is not None or param.high is not None
+        limits = _range(param.low, param.high) if bounded else "none" if param.std else "constant"
+        found = _interval(estimated[name]) if name in estimated else "-"
+        if name in rests and name in estimated:
+            found += f", given {listed(rests[name])}"
+        written = figure(findings.nominal.get(name))
+        rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
+    if not rows:
+        return [Block("text", "The model has no parameters.")]
+    header = ("parameter", "in model.py", "now", "diagnosed, 95 %", "unit", "bounds")
+    return [table("parameters", header, rows)]
+
+
+def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
+    """Return the parameters that a diagnosis calibrated, or claimed as an effect."""
+    if diagnosis is None:
+        return {}
+    found = dict(diagnosis.parameters)
+    then = {} if diagnosis.made is None else diagnosis.made.nominal
+    for row in diagnosis.ranking:
+        name = row.effect.removeprefix("parameter:")
+        if row.claimed and name in then and "d" in row.params and name not in found:
+            found[name] = row.params["d"].moved(then[name])
+    return found
+
+
+def _interval(v: Estimate) -> str:
+    """Return a value and its 95 % interval as text; `UNKNOWN` if the interval is too wide."""
+    if v.interval is None:
+        return figure(v.value)
+    low, high = v.interval
+    value = or_zero(v.value, low, high)
+    known = low <= v.value <= high and v.known
+    low, high = extent(low, high)
+    return f"{figure(value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
+
+
+def _channels(findings: Findings) -> Block:
+    """Return states and inputs with units, weights, limits and latency."""
+    task, reward, rows = findings.task, findings.task.reward, []
+    assert task.latency is not None
+    for i, (name, unit) in enumerate(task.model.states.items()):
+        weight = f"{reward.state[i]:g}"
+        weight += f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
+        rows.append((name, "state", shown(unit), weight, "-", "-"))
+    for j, (name, unit) in enumerate(task.model.inputs.items()):
+        weight = f"{reward.input[j]:g}, change {reward.input_change[j]:g}"
+        delay = f"{task.latency[j]:g} s" if task.latency[j] else "-"
+        rows.append((name, "input", shown(unit), weight, _range(task.low[j], task.high[j]), delay))
+    return table("channels", ("name", "kind", "unit", "weight", "limits", "latency"), rows)
+
+
+def _range(low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        low, high = extent(low, high)
+    a = "−∞" if low is None or not math.isfinite(low) else f"{low:g}"
+    b = "∞" if high is None or not math.isfinite(high) else f"{high:g}"
+    return f"{a} to {b}"
