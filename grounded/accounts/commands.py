@@ -30,6 +30,7 @@ from grounded.accounts.motion import (
     Ahead,
     Fit,
     basis,
+    known_states,
 )
 from grounded.accounts.reported import names_of, tables
 from grounded.findings import Finding, Quantity, found
@@ -98,7 +99,7 @@ def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
     few = 2 * sum(early is not None for early in each.values()) < len(each)  # a swing that sticks
     some = {k: e for k, e in each.items() if e and (not few or e.gain > 2 * MARGIN)}
     if some:
-        early, known = next(iter(some.values())), _known(trials[min(some)], shown)
+        early, known = next(iter(some.values())), known_states(trials[min(some)], shown)
         raise UnusableTrials(trials, list(some), early.finding(model, known))
 
 
@@ -115,7 +116,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
     least, every = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
     if reach <= least or not np.isfinite(trial.inputs).all():
         return None
-    seen = _known(trial, shown)
+    seen = known_states(trial, shown)
     trial, known = _with_differences(model, trial, seen)
     ones, steps = np.ones(model.m), trial.steps - reach
 
@@ -159,10 +160,6 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
     return Early(k * trial.dt, state, *errors, gain=before.score - fits[k].score)
 
 
-def _known(trial: Trial, shown: Sequence[int]) -> list[int]:
-    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
-
-
 def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Trial, list[int]]:
     """Fill in unmeasured velocities by central differences of their positions."""
     states, w = np.array(trial.states), max(1, round(0.04 / trial.dt))
@@ -204,7 +201,7 @@ def how_inputs_act(
         fewer: how many times fewer delays and moments to predict from are tried.
     """
     known = trial.until(max(trial.known_steps, 0))
-    some = _known(known, shown)
+    some = known_states(known, shown)
     if not some or not np.isfinite(known.inputs).all():
         return (UNKNOWN,) * model.m
     found = list[tuple[Array, Array]]()

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +29,6 @@ FEWEST_STRETCHES = 8  # stretches that a trial must hold
 NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
 ZERO_RATE = 1e-4  # of a rate, or of its largest derivative: treated as zero
 STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
-DEGREES = 180 / np.pi
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,7 @@ class Row:
         return frozenset((self.i, *self.by))
 
 
-@dataclass(frozen=True)
-class Gap:
+class Gap(NamedTuple):
     """The difference between a row's prediction and its own sensor.
 
     Args:
@@ -231,8 +231,7 @@ def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
         yield from (some[a:b] for a, b in stretches(np.asarray(good)) if b - a > 4)
 
 
-@dataclass(frozen=True)
-class Turned:
+class Turned(NamedTuple):
     """The rates of states i and j rotate with heading k."""
 
     i: int
@@ -247,19 +246,13 @@ def turned(model: Model) -> Turned | None:
     f_x, f_u = model.system.linearise(x, u, model.values, short)
     rates = (model.system.step(x, u, model.values, short) - x) / short
     slopes = (f_x - np.eye(n)) / short
-    free = [i for i in range(n) if np.abs(f_u[:, i]).max() < 1e-9 and np.abs(rates[:, i]).max() > 0]
-    for i in free:
-        for j in free:
-            for k in range(n):
-                if k in (i, j) or i == j:
-                    continue
-                if _near(slopes[:, i, k], -rates[:, j]) and _near(slopes[:, j, k], rates[:, i]):
-                    return Turned(i, j, k)
+    moves = np.abs(rates).max(axis=0)
+    free = np.flatnonzero((np.abs(f_u).max(axis=(0, 2)) < 1e-9) & (moves > 0)).tolist()
+    for i, j, k in ((i, j, k) for i, j in permutations(free, 2) for k in range(n)):
+        off = np.abs([slopes[:, i, k] + rates[:, j], slopes[:, j, k] - rates[:, i]]).max(axis=1)
+        if k not in (i, j) and (off < 1e-3 * np.maximum(moves[[j, i]], 1e-9)).all():
+            return Turned(i, j, k)
     return None
-
-
-def _near(a: Array, b: Array) -> bool:
-    return bool(np.abs(a - b).max() < 1e-3 * max(float(np.abs(b).max()), 1e-9))
 
 
 def away(model: Model, trials: Sequence[Trial], rows: Sequence[Row], plane: Turned) -> float:
@@ -270,33 +263,3 @@ def away(model: Model, trials: Sequence[Trial], rows: Sequence[Row], plane: Turn
             m, s = (one[:, plane.i] + 1j * one[:, plane.j] for one in (moved, said))
             total += complex((m * s.conj()).sum())
     return float(np.angle(total))
-
-
-def folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> dict[int, list[int]]:
-    """Return the angles in degrees that were unwrapped as radians, with the trials.
-
-    Resampled as radians, 350 degrees become 350 - 56 x 2 pi: steps of more than pi degrees are
-    lost, and dividing the trial by 57.3 does not restore them. But for whole turns, such an angle
-    turns 57.3 times as far as its row says.
-
-    Args:
-        model: however crude.
-        trials: of this model's states.
-        rows: its kinematic rows.
-    """
-    found = dict[int, list[int]]()
-    for row in (row for row in rows if model.angle_mask[row.i]):
-        for k, trial in enumerate(trials):
-            steps = per_step(model, trial, [row])
-            moved, said = (
-                np.concatenate([[0.0], *(z[n][:, row.i] for z in steps)]) for n in (0, 1)
-            )
-            off, plain = (
-                float(np.sqrt((wrapped((moved - by * said)[:, None], [True]) ** 2).mean()))
-                for by in (DEGREES, 1.0)
-            )
-            fast = (np.abs(DEGREES * said) > np.pi).mean() > 0.01
-            fast &= bool(np.nanmax(np.abs(np.diff(trial.states[:, row.i]))) <= np.pi + 1e-6)
-            if len(moved) > 20 and fast and off < min(0.8, plain / 2):  # 1.8 by chance
-                found.setdefault(row.i, []).append(k)
-    return found

@@ -64,6 +64,11 @@ def starts_from(model: Model, states: Array, shown: Sequence[int]) -> Array:
     return x
 
 
+def known_states(trial: Trial, shown: Sequence[int]) -> list[int]:
+    """Return which of the states with a sensor have a value in a trial."""
+    return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
+
+
 def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
     """Return how far ahead to predict [s]: until most states move by more than their noise."""
     noise = np.maximum(white_noise(trial.states[:, list(shown)]), TINY)
@@ -160,8 +165,9 @@ class Ahead:
 
     @property
     def enough(self) -> bool:
-        """Whether there are enough samples."""
-        return len(self.at) >= FEWEST_SAMPLES and bool(self.shown)
+        """Whether there are enough samples, and all commands are known."""
+        sent = bool(np.isfinite(self.sent).all())
+        return sent and len(self.at) >= FEWEST_SAMPLES and bool(self.shown)
 
     @property
     def moved(self) -> Array:

@@ -51,13 +51,6 @@ def scaled(model: Model, names: Iterable[str], factor: float, unit: str = "") ->
     return found("log.unit", *names, times=size, size=large, negative=negative, **facts)
 
 
-def folded(model: Model, i: int) -> Finding:
-    """Return that an angle in degrees was unwrapped as if it were in radians."""
-    names = names_of(model, [i])
-    unit = model.states[names[0]]
-    return found("log.unit", *names, folded=unit, tables=tables(model, names), by=np.pi / 180)
-
-
 def reported(model: Model, told: Told, column: int | None = None) -> list[Finding]:
     """Return an account, and those that explain the trials as well.
 

@@ -11,7 +11,7 @@ What is certain is corrected in the trials passed on; what can't be is refused, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +20,7 @@ from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials, put_right
 from grounded.accounts.judge import Verdict, judge
-from grounded.accounts.kinematics import folded, gaps, kinematic_rows
-from grounded.accounts.reported import folded as is_folded
+from grounded.accounts.kinematics import gaps
 from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_inputs, judge_signal, signal_of
 from grounded.accounts.table import Told
@@ -115,7 +114,6 @@ def refuse(model: Model, trials: Sequence[Trial], verdict: Verdict) -> None:
     Raises:
         UnusableTrials: with the trials, the account, its evidence and the remedy.
     """
-    stop_at_folded(model, trials, verdict.folded)
     stops = [one for one in verdict.told if not (one.certain or one.account.kind == "offset")]
     if stops:
         odd = stops[0].trials
@@ -140,25 +138,6 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
             kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
             mended = {} if which else keys(model, account, k)
             yield put_right(name, said, kind, mended, scale=account.factor)
-
-
-def stop_at_folded(
-    model: Model, trials: Sequence[Trial], lost: Mapping[int, Sequence[int]] | None = None
-) -> None:
-    """Raise an error for an angle in degrees that was unwrapped as if it were in radians.
-
-    Args:
-        model: however crude.
-        trials: of this model's states.
-        lost: such angles with their trials, if already known.
-
-    Raises:
-        UnusableTrials: with the scale with which to ingest the log again.
-    """
-    if lost is None:
-        lost = folded(model, trials, kinematic_rows(model, range(model.n)))
-    for i, some in lost.items():
-        raise UnusableTrials(trials, some, is_folded(model, i))
 
 
 def _unexplained(

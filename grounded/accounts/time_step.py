@@ -19,13 +19,11 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-MISSED = 0.05  # part of a state's change in a step, rms, from which a step is too long
-FINE = 0.01  # the same for a step that is short enough
-MOVES = 1e-6  # of a state's range: smaller changes in a step are not judged
+# share of a state's change in a step, rms, that a step may miss; the same of finer ones; and of its
+# spread, in a single step
+MISSED, FINE, MISSES = 0.05, 0.01, 0.1
 USUAL = 0.95  # share of the samples that is compared, those with the smallest differences
 ROWS = 5_000  # samples that are compared
-MISSES = 0.1  # of a spread in other trials: error of one step against two half steps
-BEYOND = 5.0  # times as large as any sample of most other trials
 PARTS = (2, 4, 8, 16, 32, 64)
 
 
@@ -109,7 +107,7 @@ def _missed(model: Model, x: Array, one: Array, finer: Array) -> Array:
         off[:, ~known] = change[:, ~known] = 0.0
         usual = ~(off > np.nanquantile(off, USUAL, axis=0))
         off, change = (np.nanmean(np.where(usual, y, np.nan), axis=0) ** 0.5 for y in (off, change))
-        least = MOVES * np.nanmax(np.abs(x), axis=0) + 1e-12
+        least = 1e-6 * np.nanmax(np.abs(x), axis=0) + 1e-12  # of a state that stands still
         return np.nan_to_num(np.where(change > least, off / change, 0.0), posinf=0.0)
 
 
@@ -118,35 +116,31 @@ def judge_resolution(
 ) -> Iterator[tuple[int, int, Finding]]:
     """Yield (trial, number of steps to keep, finding) of each trial that is to be cut.
 
-    A policy that fails can whirl an arm up to speeds far beyond those of the manoeuvre. There the
-    integrator misses by more than the body moves in sound trials, whatever effect is added to the
-    model, and one such trial outweighs all others. What came before is kept.
+    A policy that fails can whirl an arm up to speeds at which the integrator misses by more than
+    the body moves in sound trials, and one such trial outweighs all others.
 
     Args:
         model: however crude; only one given by its derivative is integrated here.
         trials: in the model's units.
         shown: indices of the states with a sensor; the others are taken as 0.
     """
+    hidden, bad = [i for i in range(model.n) if i not in shown], list[Array]()
     if model.derivative is None or len(trials) < 2:
         return
-    size, reach = np.array([_extent(t) for t in trials]).swapaxes(0, 1)
-    for k, trial in enumerate(trials):
-        others = [j for j in range(len(trials)) if j != k]
-        usual, far = np.median(size[others], axis=0), np.median(reach[others], axis=0)
-        # the difference of one step from two half steps at each sample
+    reach = np.array([np.abs(np.nan_to_num(t.states)).max(axis=0) for t in trials])
+    usual = np.median([np.nan_to_num(t.states).std(axis=0) for t in trials], axis=0)
+    for trial in trials:
         x = np.array(trial.states[:-1])
-        x[:, [i for i in range(model.n) if i not in shown]] = 0.0
+        x[:, hidden] = 0.0
         once, twice = (after_a_step(model, x, trial.inputs, trial.dt, parts) for parts in (1, 2))
-        missed = np.abs(model.difference(once, twice))
-        known = np.isfinite(missed).all(axis=1)
-        beyond = np.abs(trial.states[:-1]) > BEYOND * far
-        bad = known & (missed > MISSES * usual).any(axis=1) & beyond[:, shown].any(axis=1)
-        if not bad.any():
-            continue
-        keep = int(np.argmax(bad))
-        worst = max(shown, key=lambda i: missed[keep, i] / max(usual[i], 1e-300))
-        name = model.state_names[worst]
-        unit = model.states[name]
+        missed = np.abs(model.difference(once, twice)) / np.where(usual > 0, usual, np.inf)
+        bad.append(np.nan_to_num(missed[:, list(shown)]).max(axis=1) > MISSES)
+    odd = [k for k, one in enumerate(bad) if one.any()]
+    for k in odd if 2 * len(odd) < len(trials) else ():
+        keep, trial = int(np.argmax(bad[k])), trials[k]
+        far = np.median(np.delete(reach, k, axis=0), axis=0)
+        worst = max(shown, key=lambda i: reach[k, i] / max(far[i], 1e-300))
+        name, unit = list(model.states.items())[worst]
         said = told.found(
             "sensor.unresolved",
             name,
@@ -158,12 +152,3 @@ def judge_resolution(
         )
         share = 1 - keep / len(trial.inputs)
         yield k, keep, Finding(name, said, "unresolved", share=share, corrected=True)
-
-
-def _extent(trial: Trial) -> tuple[Array, Array]:
-    """Return spread and largest size of each state (n,), infinite if it was not measured."""
-    spread, reach = np.full((2, trial.states.shape[1]), np.inf)
-    seen = np.flatnonzero(np.isfinite(trial.states).any(axis=0))
-    spread[seen] = np.nanstd(trial.states[:, seen], axis=0)
-    reach[seen] = np.nanmax(np.abs(trial.states[:, seen]), axis=0)
-    return spread, reach

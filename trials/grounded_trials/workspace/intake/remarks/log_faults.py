@@ -60,14 +60,12 @@ def column_faults(workspace: Folder, known: Trial) -> list[Finding]:
         known: the trial up to its last known step.
     """
     from grounded.accounts.judge import judge
-    from grounded.accounts.reported import folded
 
     model = workspace.base_model
     if known.steps < 2:
         return []
     verdict = judge(model, [replace(known, id="")], range(model.n))
-    lost = [folded(model, i) for i in verdict.folded]
-    return [*lost, *(one for told in verdict.told for one in _told(workspace, known, told))]
+    return [one for told in verdict.told for one in _told(workspace, known, told)]
 
 
 def _told(workspace: Folder, known: Trial, told: Told) -> Iterator[Finding]:
