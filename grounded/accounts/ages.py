@@ -15,24 +15,13 @@ beside a scale: the mean of c w less the distance over the time is c b + k times
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from grounded.accounts.finding import (
-    Finding,
-    a_mean,
-    derived_from,
-    put_right,
-    scaled,
-)
-from grounded.accounts.kinematics import (
-    Row,
-    kinematic_rows,
-    per_step,
-    pieces,
-    turned,
-)
+from grounded.accounts.finding import Finding, put_right, scaled
+from grounded.accounts.kinematics import Row, kinematic_rows, per_step, pieces, turned
 from grounded.accounts.lag import (
     COHERENT,
     LEAST_S,
@@ -47,14 +36,13 @@ from grounded.accounts.lag import (
 from grounded.accounts.signals import quantum
 from grounded.findings import Quantity
 from grounded.findings import found as found_
-from grounded.frozen import Array, median, white_noise, wrapped
+from grounded.frozen import Array, white_noise, wrapped
 from grounded.model import Model
 from grounded.places import Integral, integrals, partner, true_values
 from grounded.result import PREFIX_BELOW
 from grounded.trial import Trial
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
-SMOOTH = 2.0  # time steps: a velocity averaged over less still resolves the motion
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
@@ -63,10 +51,8 @@ FORESEEN = 0.1  # weight of the second later difference above which it is no cau
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
-FINE = 0.02  # of the rms: so small a bias would have been seen
-AS_LATE = 0.15  # of a delay, or AGREE standard deviations: two positions are as late
-AGREE, UNSURE = 2.5, 0.25  # standard deviations; and of a delay: larger ones show none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
+UNSURE = 0.25  # of a delay: a larger uncertainty, or remainder, of two positions shows none
 
 
 class Ages:
@@ -89,11 +75,8 @@ class Ages:
         Args:
             one_message: states that are logged in one message: all of them are late, or none.
         """
-        found = [
-            *self.with_message(self.pairs(), one_message),
-            *self.with_message(self.positions(), one_message),
-        ]
-        return found
+        some = (self.pairs, self.positions)
+        return [one for each in some for one in self.with_message(list(each()), one_message)]
 
     def put(self, i: int, columns: Sequence[Array]) -> None:
         """Replace the samples of one state in all trials."""
@@ -107,57 +90,43 @@ class Ages:
         return [trial.states[:, i] for trial in self.trials]
 
     def pairs(self) -> Iterator[Finding]:
-        """Compare each velocity with its position."""
-        log = true_values(self.names, [n for i, n in enumerate(self.names) if i not in self.shown])
-        for relation in integrals(self.model):
-            if not {relation.i, relation.j} <= {*self.shown}:
-                continue
-            clear = self.clear(relation)
-            if clear and (found := self.derived(relation, clear)):
-                yield from self.late(relation, clear)
-                yield self.filtered(relation, found)
-                continue
-            if clear:
-                yield from self.scale(relation, clear)
-                if {*log.values()}.isdisjoint((relation.i, relation.j)):
-                    yield from self.late(relation, clear)
-            if relation.exact or clear:
-                yield from self.constant(relation)
-            if relation.exact and clear and clear.mean >= SMOOTH * self.dt:
-                yield self.smoothed(relation, clear.mean)
-        # states whose delay was adopted: their true values are the model's memory
+        """Compare each velocity with its position; both may be the true ones behind late logs."""
+        hidden = [name for i, name in enumerate(self.names) if i not in self.shown]
+        log = true_values(self.names, hidden)
         for one in integrals(self.model):
             relation = replace(one, i=log.get(one.i, one.i), j=log.get(one.j, one.j))
-            if not one.exact or {one.i, one.j}.isdisjoint(log):
+            pair, adopted = {relation.i, relation.j}, not {one.i, one.j}.isdisjoint(log)
+            if not pair <= {*self.shown} or (adopted and not one.exact):
                 continue
-            if not {relation.i, relation.j} <= {*self.shown} or not (clear := self.clear(relation)):
-                continue
-            if found := self.derived(relation, clear):
+            lag = lag_of(self.model, relation, self.trials)
+            clear = lag if lag is not None and lag.coherence > COHERENT else None
+            if clear and (found := self.derived(relation, clear)):
+                if not adopted:
+                    yield from self.late(relation, clear)
                 yield self.filtered(relation, found)
-            elif {one.i, one.j} <= {*log} and clear.filtered and clear.delay > 0:
-                yield self.in_time(relation.j, clear, self.names[relation.i], rate=True)
-            elif not clear.filtered and clear.mean >= SMOOTH * self.dt:
-                yield self.smoothed(relation, clear.mean)
+            elif adopted:
+                if clear and {one.i, one.j} <= {*log} and clear.filtered and clear.delay > 0:
+                    yield self.in_time(relation.j, clear, self.names[relation.i], rate=True)
+            else:
+                if clear:
+                    yield from self.scale(relation, clear)
+                    if pair.isdisjoint(log.values()):
+                        yield from self.late(relation, clear)
+                if relation.exact or clear:
+                    yield from self.constant(relation)
 
-    def clear(self, relation: Integral) -> Lag | None:
-        """Return the lag of a velocity behind the rate of its position; None if they differ."""
-        lag = lag_of(self.model, relation, self.trials)
-        return lag if lag is not None and lag.coherence > COHERENT else None
-
-    def with_message(self, findings: Iterator[Finding], names: Sequence[str]) -> Iterator[Finding]:
+    def with_message(self, found: Sequence[Finding], names: Sequence[str]) -> Iterator[Finding]:
         """Correct all states of a message by the delay of one of them, the most certain one."""
-        found = list(findings)
         yield from found
         late = [f for f in found if f.kind == "delay" and f.corrected and f.signal in names]
         if not late or self.in_step & {*names}:
             return
         one = min(late, key=lambda f: f.std_s)
-        for i in self.shown:
-            name = self.names[i]
-            if name in names and name not in {f.signal for f in late}:
-                self.put(i, [earlier(x, one.delay_s / self.dt) for x in self.column(i)])
-                said = found_("sensor.late", name, message=one.signal)
-                yield replace(one, signal=name, said=said)
+        others = {*names} - {f.signal for f in late}
+        for i in (i for i in self.shown if self.names[i] in others):
+            self.put(i, [earlier(x, one.delay_s / self.dt) for x in self.column(i)])
+            said = found_("sensor.late", self.names[i], message=one.signal)
+            yield replace(one, signal=self.names[i], said=said)
 
     def scale(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Report a scale, which may be that of either sensor; equal ones rule effects out."""
@@ -214,44 +183,37 @@ class Ages:
         keys = {"delay_s": float(f"{d:.3g}")}
         return put_right(name, said, "delay", keys, delay_s=d, std_s=lag.std)
 
-    def smoothed(self, relation: Integral, over: float) -> Finding:
-        """Drop a velocity that is a mean over a time [s], as a difference of its position is.
-
-        It adds nothing to the position, and around a stop it is wrong for that time.
-        """
-        q, w = (self.names[k] for k in (relation.i, relation.j))
-        self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
-        self.shown.remove(relation.j)
-        return a_mean(w, q, over)
-
     def derived(self, relation: Integral, lag: Lag) -> Derived | None:
-        """Return how a late velocity, no plain mean, follows from its position, if it does."""
-        mean = lag.mean >= SMOOTH * self.dt
-        if mean or not relation.exact or lag.sign < 0 or lag.delay < 0.5 * self.dt:
+        """Return how a late velocity follows from its position, if it does."""
+        if not relation.exact or lag.sign < 0 or lag.delay < 0.5 * self.dt:
             return None  # a difference over one step is half a step late
         return derived(self.model, relation, self.trials, self.dt)
 
     def filtered(self, relation: Integral, found: Derived) -> Finding:
-        """Drop a velocity that a filter computes from its position: neither is a delay or scale."""
+        """Drop a velocity that is computed from its position, to which it adds nothing.
+
+        Around a stop it is wrong for as long as it averages.
+        """
         q, w = (self.names[k] for k in (relation.i, relation.j))
         if abs(found.gain - 1) + SURELY * found.gain_std < SAME:
             self.rule_out(q, w)
-        return replace(self.smoothed(relation, found.over), said=derived_from(w, q, found.age))
+        self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
+        self.shown.remove(relation.j)
+        said = found_("sensor.derived", w, of=q, age=found.age)
+        return Finding(w, said, "smoothed", corrected=True, source=q)
 
     def constant(self, relation: Integral) -> Iterator[Finding]:
         """Report a constant bias: of the velocity's sensor, or a drift of the position.
 
-        If there is none, both causes are ruled out, since only together could they cancel.
+        If there is none, and one would have been seen, both causes are ruled out, since only
+        together could they cancel.
         """
-        found = bias_of(self.model, relation, self.trials)
+        bias, std, rms = bias_of(self.model, relation, self.trials)
         q, w = (self.names[k] for k in (relation.i, relation.j))
-        if found is None:
-            return
-        if found.refuted:
+        if abs(bias) < SURELY * std and REPORTED_FROM * std < 2 * SAME * rms:
             self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
-        elif found.found:
-            size = Quantity(abs(found.value), self.model.states[w])
-            way = "more" if found.value > 0 else "less"
+        elif abs(bias) > max(REPORTED_FROM * std, SAME * rms):
+            size, way = Quantity(abs(bias), self.model.states[w]), "more" if bias > 0 else "less"
             yield Finding(w, found_("sensor.scale", w, size=size, way=way, of=q), "offset")
 
     def positions(self) -> Iterator[Finding]:
@@ -314,21 +276,18 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
     return late if np.isfinite(late) and abs(late) < dt else 0.0
 
 
-@dataclass(frozen=True)
-class Derived:
+class Derived(NamedTuple):
     """The weights of past differences of a position in a velocity, summarised.
 
     Args:
         gain: their sum.
         gain_std: its standard deviation.
         age: their mean age [s].
-        over: length of the plain mean with the same variance of ages [s].
     """
 
     gain: float
     gain_std: float
     age: float
-    over: float
 
 
 def derived(
@@ -345,102 +304,68 @@ def derived(
     Returns:
         None if it has another scale, is not explained by the position's past, or averages less.
     """
-    dt, logs = trials[0].dt, list[tuple[Array, Array, Array]]()
-    counts = quantum([piece[:, 0] for piece in pieces(trials, (relation.i, relation.j))])
-    for _, moved, w in _rates(model, relation, trials):
-        way = np.concatenate([[0.0], np.cumsum(moved)])
-        logs.append((moved / dt, w, white_noise(way[:, None])))
-    floor = counts / np.sqrt(12)  # of an encoder, at rest on one count mostly
-    tried = (_weighed(logs, dt, least, past, floor) for past in PASTS)
+    dt, logs = trials[0].dt, list(_rates(model, relation, trials))
+    ways = [np.concatenate([[0.0], np.cumsum(moved)])[:, None] for _, moved, _ in logs]
+    # an encoder is at rest on one count mostly
+    floor = quantum([piece[:, 0] for piece, *_ in logs]) / np.sqrt(12)
+    noise = float(np.max([floor, np.median([white_noise(way) for way in ways])]))
+    tried = (_weighed(logs, dt, least, past, noise) for past in PASTS)
     return next((found for found in tried if found is not None), None)
 
 
 def _weighed(
-    logs: Sequence[tuple[Array, Array, Array]], dt: float, least: float, past: int, floor: float
+    logs: Sequence[tuple[Array, Array, Array]], dt: float, least: float, past: int, noise: float
 ) -> Derived | None:
-    """Return the same from the weights of `past` differences; `floor`: least noise of a log."""
-    rows, said, seen = list[Array](), list[Array](), list[Array]()
-    for rate, velocity, own in logs:
-        if len(rate) >= past + LATER:
-            windows = np.lib.stride_tricks.sliding_window_view(rate, past + LATER)
-            rows.append(windows[:, ::-1])
-            said.append(velocity[past : past + len(windows)])
-            seen.append(own)
-    count = sum(map(len, said))
-    if count < SAMPLES_PER_WEIGHT * (past + LATER):
+    """Return the same from the weights of `past` differences; `noise` is the position's."""
+    length = past + LATER
+    long = [(moved / dt, w) for _, moved, w in logs if len(moved) >= length]
+    rows = [np.lib.stride_tricks.sliding_window_view(rate, length)[:, ::-1] for rate, _ in long]
+    count = sum(map(len, rows))
+    if count < SAMPLES_PER_WEIGHT * length:
         return None
-    a, w = np.concatenate(rows), np.concatenate(said)
+    a = np.concatenate(rows)
+    w = np.concatenate([w[past : past + len(r)] for (_, w), r in zip(long, rows, strict=True)])
     weights, _, rank, _ = np.linalg.lstsq(a, w, rcond=None)
     rest = w - a @ weights
-    if rank < a.shape[1] or not float(rest @ rest) < UNEXPLAINED**2 * float(w @ w):
-        return None
+    left = float(np.sqrt(rest @ rest / count))
     # the velocity must carry the position's noise as its weights would
-    noise = max(float(median(np.concatenate(seen))), floor)
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
-    if not np.sqrt(rest @ rest / count) < CARRIED * passed:
-        return None
-    covariance = np.linalg.inv(a.T @ a) * float(rest @ rest) / count
+    explained = left < min(UNEXPLAINED * float(np.sqrt(w @ w / count)), CARRIED * passed)
     gain = float(weights.sum())
-    if abs(gain - 1) > OFF or abs(float(weights[0])) > FORESEEN:
+    if rank < length or not explained or abs(gain - 1) > OFF or abs(weights[0]) > FORESEEN:
         return None
-    ages = (np.arange(past + LATER) - LATER + 0.5) * dt
+    covariance = np.linalg.inv(a.T @ a) * left**2
+    ages = (np.arange(length) - LATER + 0.5) * dt
     age = float(weights @ ages) / gain
     apart = (ages - age) ** 2 + dt**2 / 12  # each difference is itself a mean over a step
-    wide = 12 * float(weights @ apart)
-    std = 12 * float(np.sqrt(apart @ covariance @ apart))
-    if wide - SURELY * std < least**2:
+    wide, std = 12 * float(weights @ apart), 12 * float(np.sqrt(apart @ covariance @ apart))
+    if wide - SURELY * std < least**2:  # of the plain mean with this variance of ages
         return None
-    return Derived(gain, float(np.sqrt(covariance.sum())), age, float(np.sqrt(wide)))
+    return Derived(gain, float(np.sqrt(covariance.sum())), age)
 
 
-@dataclass(frozen=True)
-class Bias:
-    """The bias of a logged velocity against the rate of its position.
+def bias_of(
+    model: Model, relation: Integral, trials: Sequence[Trial]
+) -> tuple[float, float, float]:
+    """Return the bias of a logged velocity against its position, its std, and the velocity's rms.
 
-    Args:
-        value: the bias, in the velocity's unit; positive if the velocity is too large.
-        std: its standard deviation.
-        rms: rms of the velocity itself.
-    """
-
-    value: float
-    std: float
-    rms: float
-
-    @property
-    def found(self) -> bool:
-        """Whether the bias is significant and large enough to report."""
-        return abs(self.value) > max(REPORTED_FROM * self.std, SAME * self.rms)
-
-    @property
-    def refuted(self) -> bool:
-        """Whether the trials rule a bias out: none is seen, and one would have been."""
-        return abs(self.value) < SURELY * self.std and REPORTED_FROM * self.std < FINE * self.rms
-
-
-def bias_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Bias | None:
-    """Return the bias of a logged velocity against its position; None with too little data.
-
-    It is fitted over stretches, beside a scale: the velocity's mean less the position's rate.
+    It is fitted over stretches, beside a scale: the velocity's mean less the position's rate. NaN
+    with too little data.
     """
     dt, whole = trials[0].dt, list(_rates(model, relation, trials))
-    steps, rows = sum(len(moved) for _, moved, _ in whole), list[tuple[float, float, float]]()
+    steps, rows = sum(len(moved) for _, moved, _ in whole), list[tuple[float, float, int]]()
     for _, moved, w in whole:
-        rate, off = moved / dt, 0.5 * (w[1:] + w[:-1]) - moved / dt
-        parts = max(1, min(-(-STRETCHES * len(rate) // steps), len(rate) // SHORTEST))
-        for some in np.array_split(np.arange(len(rate)), parts):
-            rows.append((float(off[some].mean()), float(rate[some].mean()), float(len(some))))
-    if len(rows) < STRETCHES // 2:
-        return None
-    off, rates, counts = np.array(rows).T
-    design = np.stack([np.ones_like(rates), rates], axis=1)
-    inverse = np.linalg.pinv(design.T @ (counts[:, None] * design), hermitian=True)
-    fitted = inverse @ (design.T @ (counts * off))
-    left = float(counts @ (off - design @ fitted) ** 2)
-    std = (left / (len(rows) - 2) * float(inverse[0, 0])) ** 0.5
-    every = np.concatenate([w for *_, w in whole])
-    rms = float(np.sqrt((every**2).mean())) / abs(relation.c)
-    return Bias(float(fitted[0]) / relation.c, std / abs(relation.c), rms)
+        off = 0.5 * (w[1:] + w[:-1]) - moved / dt
+        parts = max(1, min(-(-STRETCHES * len(off) // steps), len(off) // SHORTEST))
+        for some in np.array_split(np.arange(len(off)), parts):
+            rows.append((float(moved[some].mean()) / dt, float(off[some].mean()), len(some)))
+    if len(rows) < STRETCHES // 2 or not np.ptp([rate for rate, *_ in rows]):
+        return np.nan, np.nan, np.nan
+    rates, offs, counts = np.array(rows).T
+    (_, bias), spread = np.polyfit(rates, offs, 1, w=np.sqrt(counts), cov=True)
+    rms = float(np.sqrt(np.mean(np.concatenate([w for *_, w in whole]) ** 2)))
+    c = relation.c
+    return float(bias) / c, float(np.sqrt(spread[1, 1])) / abs(c), rms / abs(c)
 
 
 # --- a plane --------------------------------------------------------------------------------------
@@ -450,9 +375,9 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     """Return the delay that both positions of a plane share behind velocities and heading, or None.
 
     The velocity S of a position that is late by d is off by -d S'. A slipping wheel acts along the
-    path as well, a side slip or a tracked point ahead across it, a drift by a constant: the delay
-    is estimated beside these, and none may remain of it. If the sideways velocity is not measured,
-    it must show both along and across the path; and on each position on its own.
+    path as well, a side slip or a tracked point ahead across it, a drift by a constant: beside
+    these, none may remain of the delay. If the sideways velocity is not measured, it must show both
+    along and across the path.
 
     Args:
         model: however crude.
@@ -461,26 +386,14 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     """
     dt, columns, units = trials[0].dt, [row.i for row in both], list(model.states.values())
     ways = [(z[:, columns], s[:, columns]) for t in trials for z, s in per_step(model, t, both)]
-    every, *each = (
-        lag_between([(said[:, k], moved[:, k]) for k in some for moved, said in ways], dt)
-        for some in ((0, 1), (0,), (1,))
-    )
-    if every is None or every.sign < 0 or every.coherence < COHERENT:
+    lag = lag_between([(said[:, k], moved[:, k]) for k in (0, 1) for moved, said in ways], dt)
+    if lag is None or lag.sign < 0 or lag.coherence < COHERENT:
         return None
-    if every.delay < max(REPORTED_FROM * every.std, 0.5 * dt):
-        return None
-    one, other = each
-    if one is not None and other is not None:
-        sure = AGREE * float(np.hypot(one.std, other.std))
-        if abs(one.delay - other.delay) > max(sure, AS_LATE * every.delay):
-            return None
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
-    if any(std > UNSURE * late for late, std in _left(ways, 0.0, dt, apart=apart)):
-        return None  # beside a drift nothing shows it
-    for left, std in _left(ways, every.delay / dt, dt, apart=apart):
-        if std > UNSURE * every.delay or abs(left) > max(AGREE * std, AS_LATE * every.delay):
-            return None
-    return every
+    least = max(REPORTED_FROM * lag.std, 0.5 * dt)
+    left = _left(ways, lag.delay / dt, dt, apart=apart) if lag.delay >= least else [(0.0, np.inf)]
+    sure = all(max(std, abs(late) - SURELY * std) < UNSURE * lag.delay for late, std in left)
+    return lag if sure else None
 
 
 def _left(
@@ -488,40 +401,35 @@ def _left(
 ) -> list[tuple[float, float]]:
     """Return the delay [s] that remains after shifting positions, with its standard deviation.
 
+    The plane is one of complex numbers here.
+
     Args:
         ways: displacements of each piece, measured and by the other sensors (T, 2).
         steps: by which the positions are shifted earlier.
         dt: time step [s].
         apart: estimate the delay along the path and across it separately.
     """
-    h = max(3, round(SMOOTH_S / dt))
+    h, rows = max(3, round(SMOOTH_S / dt)), list[Array]()
     window = np.hanning(2 * h + 3)[1:-1]
-    window /= window.sum()
-    rests, designs = [np.empty(0)], [np.empty((0, 6 if apart else 5))]
+    window /= window.sum() * dt
     for moved, said in ways:
-        at = np.arange(len(moved)) + steps
-        early = np.stack([at_samples(moved[:, k], at) for k in (0, 1)], axis=1)
-        known = np.isfinite(early).all(axis=1)
+        early = at_samples(moved @ [1, 1j], np.arange(len(moved)) + steps)
+        known = np.isfinite(early)
         if known.sum() < 3 * len(window):
             continue
-        z, s = (
-            np.stack([np.convolve(one[known][:, k], window, "valid") for k in (0, 1)], axis=1) / dt
-            for one in (early, said)
-        )
+        z, s = (np.convolve(one[known], window, "valid") for one in (early, said @ [1, 1j]))
         # a late position, beside slip along and across the path and a point ahead or aside
-        slope, size = np.gradient(s, dt, axis=0), np.maximum(np.hypot(*s.T), 1e-9)[:, None]
+        size = np.maximum(np.abs(s), 1e-9)
         ahead = s / size
-        side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-        along = (slope * ahead).sum(axis=1, keepdims=True) * ahead
-        turn = (slope * side).sum(axis=1, keepdims=True) / size
-        late = [along, slope - along] if apart else [slope]
-        design = np.stack(
-            [*(-one for one in late), turn * side, -turn * ahead, ahead, side], axis=2
-        )
-        for k in (0, 1):
-            rests.append((z - s)[:, k] - (z - s)[:, k].mean())
-            designs.append(design[:, k] - design[:, k].mean(axis=0))
-    rest, design = np.concatenate(rests), np.concatenate(designs)
+        slope = np.gradient(s, dt) * ahead.conj()
+        turn, side = slope.imag / size, 1j * ahead
+        late = [slope.real * ahead, slope.imag * side] if apart else [slope * ahead]
+        columns = [z - s, *(-one for one in late), turn * side, -turn * ahead, ahead, side]
+        centred = np.stack(columns, axis=1)
+        centred -= centred.mean(axis=0)
+        rows += [centred.real, centred.imag]
+    every = np.concatenate(rows) if rows else np.zeros((0, 2))
+    rest, design = every[:, 0], every[:, 1:]
     if len(rest) < 16 or np.linalg.matrix_rank(design) < design.shape[1]:
         return [(0.0, np.inf)]
     spread = np.linalg.inv(design.T @ design)

@@ -28,16 +28,16 @@ from grounded.accounts.motion import (
     plainly_missed,
 )
 from grounded.accounts.table import Account, Term, Told, accounts, versions
-from grounded.frozen import white_noise
+from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 
-BAD, MENDED = 0.4, 0.35  # share of a row's motion that is unexplained: examined, and mended
+BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
-OF_A_UNIT, OF_TEN = 0.015, 0.1  # tolerance of a unit's ratio; of one above ten
+OF_A_UNIT = 0.02  # tolerance of a unit's ratio
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
-NEAR_NATS = 2.5  # [nats] within which accounts of rows are compared by the motion
+NEAR_NATS = 3 * MARGIN  # [nats] within which accounts of rows are compared by the motion
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -154,7 +154,7 @@ class _ByRows:
         self.sound = [k for k, one in enumerate(self.each) if not _bad(one)]
         self.plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
         self.units = list(model.states.values())
-        sizes = [np.nanstd(trials[k].states, axis=0) for k in self.sound]
+        sizes = [_spread(trials[k].states) for k in self.sound]
         self.usual = np.median(sizes, axis=0) if sizes else None
 
     def told(self) -> list[Told]:
@@ -217,10 +217,9 @@ class _ByRows:
         not by a mere current; a hull's speed sideways, one of several in the rate of a position, is
         often noise alone.
         """
-        dead = np.ones(self.model.n, bool)
-        for x in (trial.states for trial in trials):
-            size = np.fmax(np.abs(np.nanmean(x, axis=0)), np.nanstd(x, axis=0))
-            dead &= size <= NOISE_ALONE * white_noise(x)
+        size = np.array([_spread(trial.states, about=0.0) for trial in trials])
+        noise = np.array([white_noise(trial.states) for trial in trials])
+        dead = np.all(size <= NOISE_ALONE * noise + 1e-299, axis=0)
         for row in (row for row, gap in before.items() if gap.share > HALF_ERROR):
             alone = len(row.by) == 1 or self.units[row.i] in ("rad", "deg")
             for j in row.by if alone and before[row].varying > BAD else ():
@@ -275,8 +274,17 @@ class _ByRows:
         some = [k for k in account.touched if k < self.model.n]
         if self.usual is None or account.kind in ("pace", "dead"):
             return 0.0
-        size = np.nanstd(mended.states, axis=0)[some] + 1e-300
+        size = _spread(mended.states)[some]
         return float(np.minimum(np.abs(np.log(size / self.usual[some])), NEAR_NATS).sum())
+
+
+def _spread(x: Array, about: float | None = None) -> Array:
+    """Return the standard deviation of some states (n,), or their rms; about 0 without samples."""
+    known = [z[np.isfinite(z)] for z in x.T]
+    each = [z - (z.mean() if about is None else about) for z in known if len(z)]
+    found = np.zeros(x.shape[1])
+    found[[len(z) > 0 for z in known]] = [np.sqrt((z**2).mean()) for z in each]
+    return found + 1e-300
 
 
 def _nats(gap: Gap) -> float:
@@ -285,17 +293,14 @@ def _nats(gap: Gap) -> float:
 
 def _agrees(before: Gap, after: Gap) -> bool:
     """Check whether a row that an account touches is mended, or stays good."""
-    bad = before.share > BAD
-    most = min(MENDED, before.share / 3) if bad else max(MENDED, before.share)
-    return bool(after.share < most)
+    return after.share <= (BAD if before.share > BAD else max(BAD, before.share))
 
 
 def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
     """Check whether all rows together are right in size, where an account names a unit."""
     power = sum(gap.power for gap in after.values())
     ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
-    least = OF_TEN if abs(np.log(account.factor)) > np.log(10.0) else OF_A_UNIT
-    return account.kind != "unit" or bool(abs(np.log(max(ratio, 1e-9))) < least)
+    return account.kind != "unit" or bool(abs(np.log(max(ratio, 1e-9))) < OF_A_UNIT)
 
 
 # --- by motion ------------------------------------------------------------------------------------
@@ -337,7 +342,7 @@ def _by_motion(
 def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     """Return the trials that are predicted: some, and those of another size than the others."""
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
-    size = np.nan_to_num([np.nanstd(t.states[:, list(shown)], axis=0) for t in trials]) + 1e-300
+    size = np.array([_spread(t.states[:, list(shown)]) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
     return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(UNLIKE_OTHERS))[:TRIALS]})
 
@@ -390,8 +395,7 @@ class _Seen:
         """Return whether no kinematic row contradicts an account."""
         entered = [row for row in self.gaps if row.states & account.touched]
         after = gaps(self.model, account.mended(self.trial), entered)
-        most = {row: max(MENDED, self.gaps[row].share) for row in entered}
-        return all(row in after and after[row].share <= most[row] for row in entered)
+        return all(row in after and _agrees(self.gaps[row], after[row]) for row in entered)
 
 
 def _compared(

@@ -6,9 +6,7 @@ standard deviation of d is used; the spread over the other windows is added to i
 bounded from both sides (Frisch): noise in a makes <a b> / <a a> too small, noise in b makes
 <b b> / <a b> too large. A first-order filter is distinguished from a delay by a = b + tau b'. It is
 chosen if it fits better than any delay, or as well and without a difference in scale, since the
-attenuation of fast motion by a filter looks like a scale error beside a delay. Besides being
-delayed, b may be smoothed: for a mean over T, a = b - T^2 / 24 b''. Noise in b makes this T too
-short; noise in a does not affect it.
+attenuation of fast motion by a filter looks like a scale error beside a delay.
 """
 
 from __future__ import annotations
@@ -23,19 +21,16 @@ from grounded.frozen import Array
 
 Pairs = Sequence[tuple[Array, Array]]
 
-LARGEST_DELAY_S = 0.3  # [s] the largest delay tried, or LARGEST_DELAY_STEPS steps if that is more
-LARGEST_DELAY_STEPS = 6
+LARGEST_DELAY_S, LARGEST_DELAY_STEPS = 0.3, 6  # the larger of both is tried
 WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
 SHORTEST = 24  # samples in the shortest pair used
 COHERENT = 0.9  # coherence below which a window is ignored
 BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
 REPORTED_FROM = 5.0  # standard deviations above which a delay or a bias is reported
 LEAST_S = 0.0005  # [s] the smallest delay reported
-SAME, ROUNDED = 0.01, 0.003  # scale error that matters, and that discretisation may cause
+SAME = 0.01  # scale error that matters
 SURELY = 3.0  # standard deviations by which the scale must be certain
-FILTER = 0.9  # of the misfit of a delay: below it the signal counts as filtered
-EVEN, PLAIN = 1.05, 1 / 3  # or below EVEN, if its scale is also nearer to 1 by PLAIN
-TOLD = 0.1  # of the size of a: with a smaller remainder, smoothing explains b
+FILTER, PLAIN = 0.9, 1 / 3  # of a delay's misfit, and of its scale: what a filter leaves
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,6 @@ class Lag:
         high: upper bound of the scale.
         coherence: share of both signals that agrees, 0 to 1.
         scale_std: standard deviation of the scale.
-        mean: b is the mean of a over this time [s], centred `delay` ago; 0 if not significant.
         slow: the scale of slow motion, from the widest window with enough samples.
     """
 
@@ -63,7 +57,6 @@ class Lag:
     high: float
     coherence: float
     scale_std: float = np.inf
-    mean: float = 0.0
     slow: float = np.nan
 
     @property
@@ -84,7 +77,7 @@ class Lag:
     def one_size(self) -> bool:
         """Whether both have one sign and one size: within SAME for certain, and perhaps equal."""
         off, sure = max(1 - self.low, self.high - 1), SURELY * self.scale_std
-        return self.sign > 0 and off < max(ROUNDED, sure) and off + sure < SAME
+        return self.sign > 0 and off < max(SAME / 3, sure) and off + sure < SAME
 
 
 def lag_between(pairs: Pairs, dt: float) -> Lag | None:
@@ -98,24 +91,17 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         None if there is too little data.
     """
     longest = max((len(a) for a, _ in pairs), default=0)
-    reach = _reach_of(longest, dt)
+    most = int(np.ceil(max(LARGEST_DELAY_S / dt, LARGEST_DELAY_STEPS)))
+    reach = max(3, min(most, longest // 8))
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
-    every = [(p, one) for p in found if (one := _measured(p, reach, dt)) is not None]
+    every = [(p, one) for p in found if (one := _measured(p, dt)) is not None]
     clear = [(p, one) for p, one in every if one.coherence > COHERENT]
     if not clear:
         return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
     best = min((one for _, one in clear), key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
-    told = [one for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter too much
-    sure = bool(told) and min(told, key=lambda lag: lag.std).mean > 0
-    slow = told[-1].scale if told else np.nan
-    std = float(np.hypot(best.std, apart))
-    return replace(best, std=std, mean=best.mean * sure, slow=slow)
-
-
-def _reach_of(steps: int, dt: float) -> int:
-    """Return the largest shift [samples] tried for a signal of `steps` steps."""
-    return max(3, min(int(np.ceil(max(LARGEST_DELAY_S / dt, LARGEST_DELAY_STEPS))), steps // 8))
+    told = [one.scale for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter a lot
+    return replace(best, std=float(np.hypot(best.std, apart)), slow=told[-1] if told else np.nan)
 
 
 @dataclass(frozen=True)
@@ -129,56 +115,49 @@ class _Pieces:
 
     def moved(self, by: float) -> Array:
         """Return b from `by` samples later, at the samples of a (N,), each piece minus its mean."""
-        at = self.reach + by
-        if at == int(at):
-            return _centred([b[int(at) : int(at) + len(a)] for a, b in self.sides])
-        return _centred([at_samples(b, np.arange(len(a)) + at) for a, b in self.sides])
+        pairs = zip(self.a, self.b, strict=True)
+        return _centred([at_samples(b, np.arange(len(a)) + self.reach + by) for a, b in pairs])
 
-    @property
-    def groups(self) -> tuple[Any, Any]:
-        """Two groupings of the samples (N,): by stretches of time, and by position in the trial."""
+    def scatter(self, force: Array) -> float:
+        """Return the standard deviation of the sum of `force` (N,) from the scatter of its parts.
+
+        Parts are stretches of time, or of one place in every piece: the larger one counts.
+        """
         lengths = [len(a) for a in self.a]
         total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
-        return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+        place = np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+        return max(float(np.linalg.norm(np.bincount(group, force))) for group in (total, place))
 
     @property
     def windows(self) -> int:
         """Number of windows that do not overlap."""
         return sum(len(a) for a in self.a) // (2 * self.half + 3)
 
-    @property
-    def sides(self) -> list[tuple[Array, Array]]:
-        return list(zip(self.a, self.b, strict=True))
-
 
 def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
     window = np.hanning(2 * h + 3)[1:-1]
     window /= window.sum()
-    found: tuple[list[Array], list[Array]] = ([], [])
-    for a, b in pairs:
-        if len(a) >= max(SHORTEST, 2 * (h + reach) + 4):
-            found[0].append(np.convolve(a, window, "valid")[reach:-reach])
-            found[1].append(np.convolve(b, window, "valid"))
-    return _Pieces(*found, reach, h)
+    long = [(a, b) for a, b in pairs if len(a) >= max(SHORTEST, 2 * (h + reach) + 4)]
+    a, b = ([np.convolve(pair[k], window, "valid") for pair in long] for k in (0, 1))
+    return _Pieces([one[reach:-reach] for one in a], b, reach, h)
 
 
 def _centred(columns: Sequence[Array]) -> Array:
     return np.concatenate([x - x.mean() for x in columns])
 
 
-def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
+def _measured(pieces: _Pieces, dt: float) -> Lag | None:
+    """Return the lag of pieces that are smoothed over one window."""
     if not pieces.a:
         return None
-    a = _centred(pieces.a)
-    h = pieces.half
+    a, h, reach = _centred(pieces.a), pieces.half, pieces.reach
     grid = np.arange(0.0, reach, h)
     grid = np.concatenate([-grid[:0:-1], grid])
-    shared = np.zeros(len(grid))
-    for k, by in enumerate(grid):
-        b = pieces.moved(by)
-        shared[k] = _dot(a, b) ** 2 / max(_dot(b, b), 1e-300)
+    shifted = [pieces.moved(by) for by in grid]
+    shared = np.array([_dot(a, b) ** 2 / max(_dot(b, b), 1e-300) for b in shifted])
     if not shared.max() > 0:
         return None
+    # the best of the grid, the nearest of equal ones, refined by Gauss-Newton
     d = float(grid[int(np.argmax(shared - 1e-6 * shared.max() * np.abs(grid) / reach))])
     for _ in range(8):
         b, slope = pieces.moved(d), 0.5 * (pieces.moved(d + 1) - pieces.moved(d - 1))
@@ -189,30 +168,21 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
         if abs(step) < 1e-4:
             break
     rest, pull = a - s * b, s * slope
-    force = max(_scatter(rest * pull, group) for group in pieces.groups)
-    std = force / max(_dot(pull, pull), 1e-300)
+    std = pieces.scatter(rest * pull) / max(_dot(pull, pull), 1e-300)
     behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
-    mean = _mean(pieces, a, b, d) * dt if behind is None else 0.0
     if behind is not None:
         d, b = behind  # the scale is that of the filter's input
         s = _dot(a, b) / max(_dot(b, b), 1e-300)
         rest = a - s * b
     both = abs(_dot(a, b))
     low, high = both / _dot(a, a), _dot(b, b) / max(both, 1e-300)
-    size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
+    scale_std = pieces.scatter(rest * b) / max(_dot(b, b), 1e-300) / max(s * s, 1e-300)
     sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
-    scale_std = size_std / max(s * s, 1e-300)
-    return Lag(d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std, mean)
+    return Lag(d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std)
 
 
 def _dot(a: Array, b: Array) -> float:
     return float((a * b).sum())  # on one thread
-
-
-def _scatter(force: Array, group: Any) -> float:
-    """Return the standard deviation of a sum from the scatter of its parts."""
-    parts = np.bincount(group, force)
-    return float(np.sqrt((parts**2).sum()))
 
 
 def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[float, Array] | None:
@@ -222,21 +192,8 @@ def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[flo
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
     rest = float(((a - columns @ [s, both]) ** 2).sum())
     off, plain = (abs(np.log(max(abs(size), 1e-300))) for size in (scale, s))
-    better = rest < FILTER * misfit or (rest < EVEN * misfit and plain < PLAIN * off)
+    better = rest < (1 / FILTER if plain < PLAIN * off else FILTER) * misfit
     return (float(both / s), b + both / s * slope) if better and both / s > 0 else None
-
-
-def _mean(pieces: _Pieces, a: Array, b: Array, d: float) -> float:
-    """Return the length [samples] over which b averages a; 0 if it is not significant."""
-    curve = pieces.moved(d + 1) - 2 * b + pieces.moved(d - 1)
-    bent = curve - _dot(curve, b) / max(_dot(b, b), 1e-300) * b
-    size = max(_dot(bent, bent), 1e-300)
-    scale, part = _dot(a, b) / max(_dot(b, b), 1e-300), _dot(a, bent) / size
-    s = scale - part * _dot(curve, b) / max(_dot(b, b), 1e-300)
-    rest = a - s * b - part * curve
-    std = max(_scatter(rest * bent, group) for group in pieces.groups) / size
-    sure = -np.sign(s) * part > REPORTED_FROM * std and _dot(rest, rest) < TOLD**2 * _dot(a, a)
-    return float(np.sqrt(24 * -part / s)) if sure else 0.0
 
 
 def at_samples(x: Array, at: Any) -> Array:
