@@ -16,11 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from grounded.accounts.finding import Finding, put_right, scaled
+from grounded.accounts.finding import Finding
 from grounded.accounts.kinematics import Row, kinematic_rows, per_step, pieces, turned
 from grounded.accounts.lag import (
     COHERENT,
@@ -34,6 +34,7 @@ from grounded.accounts.lag import (
     lag_between,
 )
 from grounded.accounts.signals import quantum
+from grounded.accounts.table import RPM
 from grounded.findings import Quantity
 from grounded.findings import found as found_
 from grounded.frozen import Array, white_noise, wrapped
@@ -132,7 +133,9 @@ class Ages:
         """Report a scale, which may be that of either sensor; equal ones rule effects out."""
         q, w = (self.names[k] for k in (relation.i, relation.j))
         if lag.off(OFF):
-            yield scaled(w, q, lag.scale, self.model.states[w])
+            rpm = self.model.states[w] == "rad/s" and abs(lag.scale * RPM - 1) < OFF
+            said = found_("sensor.scale", w, share=lag.scale, of=q, rpm=rpm)
+            yield Finding(w, said, "scale", scale=lag.scale)
         elif relation.exact and lag.one_size:
             self.rule_out(q, w)
 
@@ -175,13 +178,13 @@ class Ages:
             rate: whether it lags behind the derivative of that.
         """
         d, name = float(abs(lag.delay)), self.names[i]
+        follows: dict[str, Any] = {"of": of, "derivative": rate}
+        times: dict[str, Any] = {"delay_s": d, "std_s": lag.std, "corrected": True}
         if lag.filtered:
-            said = found_("sensor.late", name, tau=d, of=of, derivative=rate)
-            return put_right(name, said, "lag", {}, delay_s=d, std_s=lag.std)
+            return Finding(name, found_("sensor.late", name, tau=d, **follows), "lag", **times)
         self.put(i, [earlier(x, d / self.dt) for x in self.column(i)])
-        said = found_("sensor.late", name, by=_size(d, lag), of=of, derivative=rate)
-        keys = {"delay_s": float(f"{d:.3g}")}
-        return put_right(name, said, "delay", keys, delay_s=d, std_s=lag.std)
+        said = found_("sensor.late", name, by=_size(d, lag), **follows)
+        return Finding(name, said, "delay", keys={"delay_s": float(f"{d:.3g}")}, **times)
 
     def derived(self, relation: Integral, lag: Lag) -> Derived | None:
         """Return how a late velocity follows from its position, if it does."""

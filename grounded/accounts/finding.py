@@ -15,9 +15,7 @@ from grounded.findings import finding as told
 from grounded.result import Document
 from grounded.trial import Trial
 
-RPM = 9.549296585513721  # revolutions per minute in one radian per second
 SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
-ALIKE = 0.02  # relative tolerance within which a factor counts as that of a unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,25 +76,6 @@ class Finding(Document):
         return {**super().to_json(), "finding": self.finding, **some}
 
 
-def put_right(
-    name: str,
-    said: told.Finding,
-    kind: str,
-    keys: Mapping[str, Any],
-    *,
-    delay_s: float = 0.0,
-    std_s: float = float("nan"),
-    scale: float = 1.0,
-) -> Finding:
-    """Return a finding for which the trials were corrected."""
-    return Finding(name, said, kind, delay_s, std_s, scale, corrected=True, keys=keys)
-
-
-def filters_of(findings: Iterable[Finding]) -> dict[str, float]:
-    """Return the time constants of corrected sensor filters by state [s]."""
-    return {f.signal: f.delay_s for f in findings if f.corrected and f.kind == "lag"}
-
-
 def in_the_log(findings: Iterable[Finding]) -> list[Finding]:
     """Return the corrected findings of degrees and signs: the logs themselves are still wrong."""
     return [one for one in findings if one.corrected and one.kind in ("degrees", "sign")]
@@ -143,24 +122,6 @@ def late_as_positions(
             yield Finding(one.signal, said, "delay", d, corrected=True, source=position)
 
 
-def a_mean(name: str, position: str, over: float) -> Finding:
-    """Return the finding of a velocity that is a difference of its position over a time [s]."""
-    said = told.found("sensor.derived", name, over=over, of=position)
-    return Finding(name, said, "smoothed", corrected=True, source=position)
-
-
-def derived_from(name: str, position: str, age: float) -> told.Finding:
-    """Return what is found of a velocity that a filter computes from its position."""
-    return told.found("sensor.derived", name, of=position, age=age)
-
-
-def scaled(name: str, position: str, size: float, unit: str) -> Finding:
-    """Return the finding of a velocity that is `size` times the rate of its position."""
-    rpm = unit == "rad/s" and abs(size * RPM - 1) < ALIKE
-    said = told.found("sensor.scale", name, share=size, of=position, rpm=rpm)
-    return Finding(name, said, "scale", scale=size)
-
-
 @dataclass(frozen=True, eq=False)
 class Preflight:
     """The findings of all checks, and the corrected trials."""
@@ -173,7 +134,7 @@ class Preflight:
     @property
     def filters(self) -> dict[str, float]:
         """Time constants of filtering sensors by state [s]."""
-        return filters_of(self.findings)
+        return {f.signal: f.delay_s for f in self.findings if f.corrected and f.kind == "lag"}
 
     @property
     def left_out(self) -> frozenset[str]:

@@ -35,7 +35,7 @@ from grounded.trial import Trial
 
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
-OF_A_UNIT = 0.02  # tolerance of a unit's ratio
+OF_A_UNIT = 0.018  # tolerance of a unit's ratio, of the logarithm of its factor
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
 NEAR_NATS = 3 * MARGIN  # [nats] within which accounts of rows are compared by the motion
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
@@ -300,7 +300,8 @@ def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
     """Check whether all rows together are right in size, where an account names a unit."""
     power = sum(gap.power for gap in after.values())
     ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
-    return account.kind != "unit" or bool(abs(np.log(max(ratio, 1e-9))) < OF_A_UNIT)
+    off, size = abs(np.log(max(ratio, 1e-9))), abs(np.log(abs(account.factor)))
+    return account.kind != "unit" or bool(off < OF_A_UNIT * size)
 
 
 # --- by motion ------------------------------------------------------------------------------------

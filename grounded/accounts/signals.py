@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding
-from grounded.accounts.lag import LEAST_S, REPORTED_FROM, Lag, lag_between
+from grounded.accounts.lag import LEAST_S, REPORTED_FROM, lag_between
 from grounded.accounts.table import OVER
 from grounded.findings import Quantity, found
 from grounded.frozen import Array, white_noise
@@ -26,15 +26,14 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 STUCK = 8  # equal samples before a jump
-JUMP = 3.0  # the jump, relative to the change that follows
 UNMOVED, SMALL_RATE = 8.0, 0.03  # range of noise, and share of the largest rate, that are rest
 HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
 COARSE = 0.7  # of the rms change from sample to sample: a larger quantum is reported
 CLIPPED = 0.02  # share of samples above which clipping is reported
+FEWEST = 20  # changes from sample to sample that are needed
 FULL_TURNS = (2 * np.pi, 360.0)
-OFTEN = 0.1  # share of the time above which it is reported
-COPY = 0.99  # coherence of two identical inputs: two motors of one vehicle have 0.96
-MAYBE = 0.5  # correlation of two inputs that may be copies
+OFTEN = 0.1  # share of the time above which commands at their limits are reported
+COPY, MAYBE = 0.99, 0.5  # coherence, and correlation, of two identical inputs
 PERCENT_FROM = 20.0  # times the limit: a value in percent exceeds it by more
 ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
@@ -49,7 +48,7 @@ class Signal:
         angle: whether its differences wrap.
         columns: its samples in each trial (T + 1,), NaN where missing.
         dt: time step [s].
-        rests: for a velocity, where it and its position are at rest, in each trial (T + 1,).
+        moves: where it is not known to be at rest, in each trial (T + 1,).
     """
 
     name: str
@@ -57,18 +56,25 @@ class Signal:
     angle: bool
     columns: Sequence[Array]
     dt: float
-    rests: Sequence[Any] = ()
+    moves: Sequence[Any]
+
+    @property
+    def changes(self) -> Array:
+        """The sizes of all changes from sample to sample, without zeros."""
+        d = np.concatenate([np.abs(np.diff(x)) for x in self.columns])
+        return np.asarray(d[np.isfinite(d) & (d > 0)])
+
+    def told(
+        self, kind: str, part: float = np.nan, /, *, mended: bool = False, **facts: Any
+    ) -> Finding:
+        """Return a finding on its samples."""
+        said = found("sensor.samples", self.name, **facts)
+        return Finding(self.name, said, kind, share=part, corrected=mended)
 
     def without(self, gone: Sequence[Any]) -> Signal:
         """Return the signal with some samples missing."""
         pairs = zip(self.columns, gone, strict=True)
         return replace(self, columns=[np.where(g, np.nan, x) for x, g in pairs])
-
-    def moving(self) -> list[Any]:
-        """Return where it is not known to be at rest, in each trial (T + 1,)."""
-        if len(self.rests):
-            return [~np.asarray(rest) for rest in self.rests]
-        return [np.ones(len(x), bool) for x in self.columns]
 
 
 Found = tuple[Finding, Signal]
@@ -76,25 +82,22 @@ Found = tuple[Finding, Signal]
 
 def signal_of(model: Model, trials: Sequence[Trial], i: int, shown: Sequence[int]) -> Signal:
     """Return state i of some trials; the states `shown` have sensors."""
-    name, dt, rests = model.state_names[i], trials[0].dt, list[Any]()
+    name, units = model.state_names[i], list(model.states.values())
+    places = [one.i for one in integrals(model) if one.j == i and one.i in shown]
+    if not places and units[i].endswith("/s"):
+        places = [k for k in shown if not units[k].endswith("/s")]
+    moves = [~_at_rest(trial.states, i, places) for trial in trials]
     columns = [trial.states[:, i] for trial in trials]
-    for one in integrals(model):
-        if one.j == i and one.i in shown:
-            rests = at_rest([t.states[:, one.i] for t in trials], [one.c * w for w in columns], dt)
-    if not rests and model.states[name].endswith("/s"):
-        places = [k for k in shown if not list(model.states.values())[k].endswith("/s")]
-        rests = [_unmoved(trial.states, i, places) for trial in trials] if places else []
-    return Signal(name, model.states[name], bool(model.angle_mask[i]), columns, dt, rests)
+    return Signal(name, units[i], bool(model.angle_mask[i]), columns, trials[0].dt, moves)
 
 
 def judge_signal(signal: Signal) -> tuple[list[Finding], Signal]:
     """Return the findings of a signal, and the corrected signal."""
     findings = [one for note in (_missing, _quantised, _clipped) if (one := note(signal))]
     for look in (_wrapped, _dropouts, _held, _stuck):
-        found = look(signal)
-        if found is not None:
-            findings.append(found[0])
-            signal = found[1]
+        if seen := look(signal):
+            findings.append(seen[0])
+            signal = seen[1]
     return findings, signal
 
 
@@ -104,159 +107,112 @@ def runs(x: Array) -> tuple[Any, Any]:
     return edges[:-1], np.diff(edges)
 
 
-def at_rest(position: Sequence[Array], velocity: Sequence[Array], dt: float) -> list[Any]:
-    """Return where the position (T,) of each trial is exactly constant and its velocity agrees.
-
-    Such data is valid: an encoder stays on one count while a joint sticks, and a filtered
-    difference of it decays to 0. It is not at rest if the velocity implies more than half of a
-    typical change of the position in that time.
-    """
-    usual, found = _changes(position), []
-    count = float(np.median(usual)) if usual.size else 0.0
-    for q, w in zip(position, velocity, strict=True):
-        rest = np.zeros(len(q), bool)
-        for start, length in zip(*runs(q), strict=True):
-            if length >= STUCK:
-                stay = slice(start, start + length)
-                rest[stay] = np.abs(w[stay]) * length * dt <= 0.5 * count
-        found.append(rest)
-    return found
-
-
-def _unmoved(x: Array, i: int, places: Sequence[int]) -> Any:
+def _at_rest(x: Array, i: int, places: Sequence[int]) -> Any:
     """Return where velocity i of a trial (T + 1, n) keeps a value near 0 and no position moves.
 
-    The wheels of a rover at a wall stand still, whatever its camera's noise.
+    Such data is valid: an encoder stays on one count while a joint sticks, and the wheels of a
+    rover at a wall stand still, whatever its camera's noise.
     """
     rest, own = np.zeros(len(x), bool), x[:, i]
     least = UNMOVED * white_noise(x[:, places])
     small = SMALL_RATE * float(np.nanmax(np.abs(own), initial=0.0))
     for start, length in zip(*runs(own), strict=True):
         stay = slice(start, start + length)
-        if length >= STUCK and abs(own[start]) <= small:
+        if places and length >= STUCK and abs(own[start]) <= small:
             rest[stay] = bool((np.ptp(x[stay][:, places], axis=0) <= least).all())
     return rest
-
-
-def _changes(columns: Sequence[Array]) -> Any:
-    """Return the sizes of all nonzero changes from sample to sample."""
-    d = np.concatenate([np.abs(np.diff(x)) for x in columns])
-    return d[np.isfinite(d) & (d > 0)]
-
-
-def _wrapped(s: Signal) -> Found | None:
-    """Find jumps by a full turn, in radians or degrees, in an angle that should be in radians."""
-    if s.unit != "rad":
-        return None
-    for turn in FULL_TURNS:
-        jumps = [np.abs(np.abs(np.diff(x)) - turn) < 0.1 * turn for x in s.columns]
-        count, usual = sum(int(j.sum()) for j in jumps), _changes(s.columns)
-        degrees = turn == 360.0
-        if count == 0 or np.quantile(usual, 0.9) > 0.2 * turn or (s.angle and not degrees):
-            continue
-        whole = []
-        for x in s.columns:
-            steps = np.diff(x)
-            off = np.where(np.abs(np.abs(steps) - turn) < 0.1 * turn, np.sign(steps), 0.0)
-            whole.append((x - turn * np.concatenate([[0.0], np.cumsum(off)])) * (2 * np.pi / turn))
-        said = found("sensor.samples", s.name, degrees=degrees, count=count)
-        keys: dict[str, Any] = {"scale": 0.017453293} if degrees else {}
-        kind, scale = ("degrees", 180 / np.pi) if degrees else ("wrapped", 1.0)
-        keys["unwrap"] = True
-        finding = Finding(s.name, said, kind, scale=scale, corrected=True, keys=keys)
-        return finding, replace(s, columns=whole)
-    return None
 
 
 def _share(gone: Sequence[Any]) -> float:
     return float(np.concatenate(list(gone)).mean())
 
 
+def _wrapped(s: Signal) -> Found | None:
+    """Find jumps by a full turn, in radians or degrees, in an angle that should be in radians."""
+    for turn in FULL_TURNS if s.unit == "rad" else ():
+        steps = [np.diff(x) for x in s.columns]
+        jumps = [np.sign(d) * (np.abs(np.abs(d) - turn) < 0.1 * turn) for d in steps]
+        jumps = [np.nan_to_num(k) for k in jumps]
+        count, degrees = int(sum(np.abs(k).sum() for k in jumps)), turn == 360.0
+        if not count or np.quantile(s.changes, 0.9) > 0.2 * turn or (s.angle and not degrees):
+            continue
+        whole = [
+            (x - turn * np.concatenate([[0.0], np.cumsum(k)])) * (2 * np.pi / turn)
+            for x, k in zip(s.columns, jumps, strict=True)
+        ]
+        one = s.told("degrees" if degrees else "wrapped", mended=True, degrees=degrees, count=count)
+        keys: dict[str, Any] = {"scale": 0.017453293} if degrees else {}
+        scale = 180 / np.pi if degrees else 1.0
+        return replace(one, scale=scale, keys=keys | {"unwrap": True}), replace(s, columns=whole)
+    return None
+
+
 def _dropouts(s: Signal) -> Found | None:
     """Find a fixed value that the signal jumps to for single samples."""
-    usual = _changes(s.columns)
-    if usual.size < 20:
+    if s.changes.size < FEWEST:
         return None
-    far, values = 10 * float(np.quantile(usual, 0.9)), []
+    far, values = 10 * float(np.quantile(s.changes, 0.9)), []
     for x in s.columns:
         there = (np.abs(x[1:-1] - x[:-2]) > far) & (np.abs(x[1:-1] - x[2:]) > far)
-        near = np.abs(x[2:] - x[:-2]) < far
-        values += list(x[1:-1][there & near])
+        values += list(x[1:-1][there & (np.abs(x[2:] - x[:-2]) < far)])
     known, counts = np.unique(values, return_counts=True)
     if not len(known) or counts.max() < 3:
         return None
     value = float(known[np.argmax(counts)])
-    gone = []
-    for x in s.columns:
-        before, after = np.roll(x, 1), np.roll(x, -1)
-        gone.append((x == value) & ((np.abs(x - before) > far) | (np.abs(x - after) > far)))
+    gone = [
+        (x == value) & ((np.abs(x - np.roll(x, 1)) > far) | (np.abs(x - np.roll(x, -1)) > far))
+        for x in s.columns
+    ]
     share = _share(gone)
-    said = found("sensor.samples", s.name, low=f"{value:g}", share=share)
-    return Finding(s.name, said, "dropout", share=share, corrected=True), s.without(gone)
+    return s.told("dropout", share, mended=True, low=f"{value:g}", share=share), s.without(gone)
 
 
 def _held(s: Signal) -> Found | None:
     """Find a signal that repeats every value: the sensor or its topic is slower than the log."""
-    lengths, sizes = [], _changes(s.columns)
+    lengths, gone = list[int](), list[Any]()
     for x in s.columns:
         start, length = runs(x)
-        moves = np.abs(np.diff(x[start], append=np.nan))
-        lengths += list(length[np.isfinite(moves)])
-    if len(lengths) < 20 or sizes.size == 0:
+        lengths += list(length[np.isfinite(np.diff(x[start], append=np.nan))])
+        gone.append(np.isfinite(x) & ~np.isin(np.arange(len(x)), start))
+    if len(lengths) < FEWEST or not s.changes.size:
         return None
-    coarse = float(np.quantile(sizes, 0.5)) < 2.5 * float(sizes.min())  # coarse quantisation
+    coarse = np.quantile(s.changes, 0.5) < 2.5 * s.changes.min()  # coarse quantisation
     if coarse or np.mean(np.array(lengths) >= 2) < HELD:
         return None
-    each = float(np.median(lengths))
-    gone = []
-    for x in s.columns:
-        old = np.ones(len(x), bool)
-        old[runs(x)[0]] = False
-        gone.append(old & np.isfinite(x))
-    said = found("sensor.samples", s.name, every=each * s.dt)
-    one = Finding(s.name, said, "held", share=_share(gone), corrected=True, mend=said)
-    return one, s.without(gone)
+    one = s.told("held", _share(gone), mended=True, every=float(np.median(lengths)) * s.dt)
+    return replace(one, mend=one.said), s.without(gone)
 
 
 def _stuck(s: Signal) -> Found | None:
     """Find a value that stays exactly constant and then jumps to the true one."""
-    usual = _changes(s.columns)
-    if usual.size < 20:
+    if s.changes.size < FEWEST:
         return None
-    far, gone, longest = 2 * float(np.median(usual)), [], 0
-    for x, moves in zip(s.columns, s.moving(), strict=True):
-        flat, (starts, lengths) = np.zeros(len(x), bool), runs(x)
-        long = lengths >= STUCK
-        for start, length in zip(starts[long], lengths[long], strict=True):
+    far, gone, longest = 2 * float(np.median(s.changes)), [], 0
+    for x, moves in zip(s.columns, s.moves, strict=True):
+        flat = np.zeros(len(x), bool)
+        for start, length in zip(*runs(x), strict=True):
             end = start + length
+            if length < STUCK or not start or end >= len(x) or moves[start:end].sum() < STUCK:
+                continue
             onward = abs(x[end + 1] - x[end]) if end + 1 < len(x) else np.inf
-            jumps = end < len(x) and abs(x[end] - x[start]) > max(far, JUMP * onward)
-            moved = start > 0 and x[start - 1] != x[start]
-            if jumps and moved and moves[start:end].sum() >= STUCK:
+            if abs(x[end] - x[start]) > max(far, 3 * onward):
                 flat[start + 1 : end] = True
                 longest = max(longest, int(length))
         gone.append(flat)
     if not longest:
         return None
-    said = found("sensor.samples", s.name, stuck=longest * s.dt)
-    return Finding(s.name, said, "stuck", share=_share(gone), corrected=True), s.without(gone)
+    return s.told("stuck", _share(gone), mended=True, stuck=longest * s.dt), s.without(gone)
 
 
 def _missing(s: Signal) -> Finding | None:
     """Find missing samples before the last one that is there."""
     last = [np.flatnonzero(np.isfinite(x))[-1:] for x in s.columns]
     gone = [~np.isfinite(x[: k[0] + 1]) for x, k in zip(s.columns, last, strict=True) if len(k)]
-    if not gone:
+    if not any(g.any() for g in gone):
         return None
-    share = _share(gone)
-    if share == 0:
-        return None
-    longest = 0
-    for g in gone:
-        start, length = runs(g.astype(float))
-        longest = max([longest, *length[g[start]]])
-    said = found("sensor.samples", s.name, gap=longest * s.dt, share=share)
-    return Finding(s.name, said, "missing", share=share)
+    lost = [length[g[start]] for g in gone for start, length in [runs(g.astype(float))]]
+    share, longest = _share(gone), float(np.concatenate(lost).max())
+    return s.told("missing", share, gap=longest * s.dt, share=share)
 
 
 def quantum(columns: Sequence[Array]) -> float:
@@ -274,29 +230,24 @@ def quantum(columns: Sequence[Array]) -> float:
 
 def _quantised(s: Signal) -> Finding | None:
     """Find a quantisation as coarse as the changes between samples."""
-    step = quantum(s.columns)
-    d = np.concatenate([np.diff(x) for x in s.columns])
-    rms = float(np.sqrt(np.nanmean(d**2))) if np.isfinite(d).any() else 0.0
-    if step == 0 or step < COARSE * rms:
+    step, d = quantum(s.columns), np.concatenate([np.diff(x) for x in s.columns])
+    if not step or step < COARSE * np.sqrt(np.mean(d[np.isfinite(d)] ** 2)):
         return None
-    said = found("sensor.samples", s.name, step=Quantity(step, s.unit))
-    return Finding(s.name, said, "quantised")
+    return s.told("quantised", step=Quantity(step, s.unit))
 
 
 def _clipped(s: Signal) -> Finding | None:
     """Find an extreme value that is reached at speed and held for several samples, repeatedly."""
     values = np.concatenate([x[np.isfinite(x)] for x in s.columns])
-    usual = _changes(s.columns)
-    if values.size < 50 or usual.size < 20 or quantum(s.columns):
+    if s.changes.size < FEWEST or quantum(s.columns):
         return None
     for limit, side in ((values.max(), "above"), (values.min(), "below")):
-        stays, samples = 0, 0
-        for x, moves in zip(s.columns, s.moving(), strict=True):
+        stays = list[int]()
+        for x, moves in zip(s.columns, s.moves, strict=True):
             start, length = runs(x)
-            at = (x[start] == limit) & (length >= 3) & (start > 0) & moves[start]
-            stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
-        share = samples / values.size
-        if stays >= 3 and share > CLIPPED:
+            stays += list(length[(x[start] == limit) & (length >= 3) & (start > 0) & moves[start]])
+        share = sum(stays) / values.size
+        if len(stays) >= 3 and share > CLIPPED:
             at = f"{limit:.4g} {s.unit}"
             said = found("sensor.limits", s.name, side=side, limit=at, share=share)
             return Finding(s.name, said, "saturated", share=share)
@@ -372,27 +323,22 @@ def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Fin
     names = trials[0].input_names
     columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
     fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
-    for j, name in enumerate(names):
+    for j in np.flatnonzero(fixed):
         values = sorted({float(x[0]) for x in columns[j]})
-        if fixed[j] and len(values) > 1:
+        if len(values) > 1:
             shown = tuple(f"{v:.4g}" for v in values[:6])
-            yield Finding(name, found("sensor.same", name, values=shown), "constant")
+            yield Finding(names[j], found("sensor.same", names[j], values=shown), "constant")
     if isinstance(subject, Task):
         yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
     longest = max(trials, key=lambda trial: trial.steps).inputs
-    moving = [j for j in range(len(names)) if not fixed[j] and np.ptp(longest[:, j]) > 0]
+    moving = [j for j in range(len(names)) if np.ptp(longest[:, j]) > 0]
     close = np.abs(np.corrcoef(longest, rowvar=False)) if len(moving) > 1 else np.zeros((0, 0))
-    for i, j in (pair for pair in combinations(moving, 2) if close[pair] > MAYBE):
-        lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
+    for pair in (pair for pair in combinations(moving, 2) if close[pair] > MAYBE):
+        lag = lag_between(list(zip(*(columns[j] for j in pair), strict=True)), trials[0].dt)
         if lag is not None and lag.coherence > COPY and 0.9 < lag.sign * lag.low < 1.1:
-            yield _copy(names[i], names[j], lag)
-
-
-def _copy(first: str, second: str, lag: Lag) -> Finding:
-    """Return the finding of two inputs with one signal, perhaps a command and its measurement."""
-    if lag.delay < 0:
-        first, second = second, first
-    d = abs(lag.delay)
-    late = d if d > max(REPORTED_FROM * lag.std, LEAST_S) else None
-    said = found("sensor.same", second, of=first, late=late)
-    return Finding(second, said, "copy", d, lag.std, lag.low)
+            # perhaps a command and its measurement
+            first, second = (names[j] for j in (pair if lag.delay >= 0 else pair[::-1]))
+            d = abs(lag.delay)
+            late = d if d > max(REPORTED_FROM * lag.std, LEAST_S) else None
+            said = found("sensor.same", second, of=first, late=late)
+            yield Finding(second, said, "copy", d, lag.std, lag.low)

@@ -18,7 +18,7 @@ import numpy as np
 
 from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
-from grounded.accounts.finding import Finding, Preflight, UnusableTrials, put_right
+from grounded.accounts.finding import Finding, Preflight, UnusableTrials
 from grounded.accounts.judge import Verdict, judge
 from grounded.accounts.kinematics import gaps
 from grounded.accounts.reported import keys, names_of, reported
@@ -137,7 +137,7 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
             kind = "degrees" if account.kind == "unit" else "sign"
             kind = "scale" if kind == "degrees" and k >= model.n and account.unit != "deg" else kind
             mended = {} if which else keys(model, account, k)
-            yield put_right(name, said, kind, mended, scale=account.factor)
+            yield Finding(name, said, kind, scale=account.factor, corrected=True, keys=mended)
 
 
 def _unexplained(

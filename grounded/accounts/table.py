@@ -218,6 +218,8 @@ def accounts(
     columns = _Columns(model, range(model.n) if shown is None else shown, related)
     for group, terms in columns.groups().items():
         yield from _units(columns.units, group, terms, model.n, inputs)
+    for factor in (1e3, 1e-3):  # time stamps in ms, or taken for ms
+        yield Account("pace", tuple(range(model.n)), factor, unit="ms", price=1.0, terms=ROWS)
     yield from columns.signs()
     yield from columns.exchanges()
     if plane:  # headings from another zero, or counted the other way

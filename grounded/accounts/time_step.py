@@ -124,7 +124,7 @@ def judge_resolution(
         trials: in the model's units.
         shown: indices of the states with a sensor; the others are taken as 0.
     """
-    hidden, bad = [i for i in range(model.n) if i not in shown], list[Array]()
+    hidden, missed = [i for i in range(model.n) if i not in shown], list[Array]()
     if model.derivative is None or len(trials) < 2:
         return
     reach = np.array([np.abs(np.nan_to_num(t.states)).max(axis=0) for t in trials])
@@ -133,13 +133,14 @@ def judge_resolution(
         x = np.array(trial.states[:-1])
         x[:, hidden] = 0.0
         once, twice = (after_a_step(model, x, trial.inputs, trial.dt, parts) for parts in (1, 2))
-        missed = np.abs(model.difference(once, twice)) / np.where(usual > 0, usual, np.inf)
-        bad.append(np.nan_to_num(missed[:, list(shown)]).max(axis=1) > MISSES)
-    odd = [k for k, one in enumerate(bad) if one.any()]
+        off = np.abs(model.difference(once, twice)) / np.where(usual > 0, usual, np.inf)
+        off[:, hidden] = 0.0
+        missed.append(np.nan_to_num(off))
+    odd = [k for k, one in enumerate(missed) if one.max(initial=0.0) > MISSES]
     for k in odd if 2 * len(odd) < len(trials) else ():
-        keep, trial = int(np.argmax(bad[k])), trials[k]
+        keep, trial = int(np.argmax(missed[k].max(axis=1) > MISSES)), trials[k]
         far = np.median(np.delete(reach, k, axis=0), axis=0)
-        worst = max(shown, key=lambda i: reach[k, i] / max(far[i], 1e-300))
+        worst = int(np.argmax(missed[k][keep]))
         name, unit = list(model.states.items())[worst]
         said = told.found(
             "sensor.unresolved",

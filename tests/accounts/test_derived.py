@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from grounded import Model, Trial
-from grounded.accounts.finding import (
-    a_mean,
-    late_as_positions,
-    late_effects,
-    put_right,
-)
+from grounded.accounts.finding import Finding, late_as_positions, late_effects
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.telling import instrument_lines
 from grounded.effects import Scales, Site, wrap
@@ -78,18 +73,18 @@ def test_a_rate_filtered_from_positions_is_not_used_once_its_filter_is_adopted()
 
 
 def test_a_delay_of_a_position_is_told_of_the_speed_from_it_unless_it_is_adopted():
-    seen = [a_mean("v", "x", 0.04)]
+    said = found("sensor.derived", "v", of="x", age=0.02)
+    seen = [Finding("v", said, "smoothed", corrected=True, source="x")]
     (late,) = late_as_positions(seen, {"sensor_delay:x": 0.03, "sensor_delay:beam": 0.5}, ())
     assert (late.signal, late.delay_s, late.source) == ("v", 0.03, "x")
     (line,) = instrument_lines([*seen, late])
-    assert line.startswith("v: is a mean over") and "older by another 0.03 s" in line
+    assert line.startswith("v: is a filtered derivative") and "older by another 0.03 s" in line
     assert not [*late_as_positions(seen, {"sensor_delay:x": 0.03}, ("sensor_delay:v",))]
     assert not [*late_as_positions(seen, {"sensor_delay:x+v": 0.03}, ())]  # v's own delay
     assert not [*late_as_positions(seen, {}, ())]
-    own = put_right(
-        "v", found("sensor.late", "v", by=Quantity(0.02, "s"), of="x"), "delay", {}, delay_s=0.02
-    )
+    said = found("sensor.late", "v", by=Quantity(0.02, "s"), of="x")
+    own = Finding("v", said, "delay", delay_s=0.02, corrected=True)
     both = late_effects([own, *seen, late])
     assert both["sensor_delay:v"]["d"] == pytest.approx(0.05)
     (line,) = instrument_lines([own, *seen, late])
-    assert "0.0200 s later" in line and "mean over" in line and "another 0.03 s" in line
+    assert "0.0200 s later" in line and "filtered derivative" in line and "another 0.03 s" in line

@@ -178,22 +178,6 @@ def test_speeds_and_positions_in_another_unit_are_named_with_it(unit, factor, na
         assert one.facts["by"] == pytest.approx(1 / factor, rel=1e-5)
 
 
-def folded(x: Array) -> Array:
-    """Return states whose heading was in degrees and was unwrapped as radians."""
-    y = np.array(x)
-    steps = np.rad2deg(np.diff(x[:, 2], prepend=0.0))
-    y[:, 2] = np.cumsum(steps - 2 * np.pi * np.rint(steps / (2 * np.pi)))
-    return y
-
-
-def test_a_heading_folded_as_radians_is_told_to_be_in_degrees():
-    with pytest.raises(UnusableTrials) as error:
-        preflight(BOAT, logged(BOAT, folded))
-    (one,) = error.value.findings
-    assert (one.code, one.about) == ("log.unit", ("psi",))
-    assert one.facts["by"] == pytest.approx(np.pi / 180)
-
-
 def test_what_no_single_change_mends_is_stated():
     def other(x: Array) -> Array:
         y = np.array(x)

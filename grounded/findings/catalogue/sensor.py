@@ -13,9 +13,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "derived": Entry(
         "note",
-        "is [[a mean over {over:.2g} s, as from differences of {of}]][[a filtered derivative of "
-        "{of}, {age:.2g} s behind it on average]]; left out of the diagnosis: it tells nothing "
-        "more than {of}",
+        "is a filtered derivative of {of}, {age:.2g} s behind it on average; left out of the "
+        "diagnosis: it tells nothing more than {of}",
     ),
     "scale": Entry(
         "warn",
