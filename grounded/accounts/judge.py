@@ -34,6 +34,7 @@ from grounded.places import integrals
 from grounded.trial import Trial
 
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
+BETTER = 3.0  # factor by which its share must fall to be mended
 ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT = 0.018  # tolerance of a unit's ratio, of the logarithm of its factor
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
@@ -293,7 +294,7 @@ def _nats(gap: Gap) -> float:
 
 def _agrees(before: Gap, after: Gap) -> bool:
     """Check whether a row that an account touches is mended, or stays good."""
-    return after.share <= (BAD if before.share > BAD else max(BAD, before.share))
+    return after.share <= (before.share / BETTER if before.share > BAD else BAD)
 
 
 def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
