@@ -5,8 +5,8 @@
 
 with the cost added up on the way. The lanes share the trajectory's data and differ in alpha; with
 fewer runs than lanes, one is repeated and not stored. K, zbar and k may be null, z and u too: then
-the cost is all that is wanted. A run by itself has room in its vectors: what is done for every
-state or input alike is done for four at once, and so are sines and exponentials of the model.
+the cost is all that is wanted. A run by itself has room in its vectors: sines and exponentials of
+the model are computed for four angles at once.
 """
 
 from __future__ import annotations
@@ -16,11 +16,9 @@ import math
 from grounded.compile.emit.llvm_batch import Words, start_table
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer, splat
-from grounded.compile.emit.llvm_transpose import transposed
 from grounded.compile.kernel_words import ROLLOUT, Layout
 
-Piece = tuple[int, int]  # of a row of numbers: the first, and how many
-BLOCK = 4  # numbers of a row that are taken at once
+CHAINS = 4  # partial sums of a sum
 
 
 def wrap(f: Writer, d: str, width: int) -> str:
@@ -72,162 +70,97 @@ def single_rollout(d: Dynamics, layout: Layout) -> str:
 
 
 class _Rollout:
-    """The parts of the kernel; lanes' data live in small arrays on the stack, [entries][lanes].
-
-    What is done for each entry alike is done for some at once where there is only one lane.
-    """
+    """The parts of the kernel; lanes' data live in small arrays on the stack, [entries][lanes]."""
 
     def __init__(self, f: Writer, d: Dynamics, layout: Layout, lanes: int) -> None:
         self.f, self.layout, self.words, self.lanes = f, layout, Words(f, ROLLOUT), lanes
         self.step = StepWriter(f, d, lanes, start_table(f, self.words, d))
-        self.wide = BLOCK if lanes == 1 else 1
         self.z, self.u = f.room(layout.nz * lanes), f.room(layout.m * lanes)
         self.step.x = self.z  # the state comes first in z
         self.alpha = f.load(self.words.pointer("alphas"), 0, lanes)
-        self.costs = {width: f.room(width) for width in {lanes, self.wide * lanes}}
+        self.total = f.room(lanes)
         start = self.words.pointer("start")
         for i in range(layout.nz):
-            f.store(f.load_all(start, i, lanes), self.z, i * lanes, lanes)
-        for width, room in self.costs.items():
-            f.store(splat(0.0, width), room, 0, width)
+            self._keep(self._given(start, i), self.z, i)
+        f.store(splat(0.0, lanes), self.total, 0, lanes)
 
-    def _cut(self, size: int) -> list[Piece]:
-        """Entries 0 .. size - 1 in blocks, and what is left one by one."""
-        whole = size - size % self.wide
-        blocks = [(at, self.wide) for at in range(0, whole, self.wide)]
-        return [*blocks, *((at, 1) for at in range(whole, size))]
+    def _own(self, base: str, i: int) -> str:
+        """An entry of the lanes' data."""
+        return self.f.load(base, i * self.lanes, self.lanes)
 
-    def _inputs(self) -> list[Piece]:
-        """The inputs in blocks whose last values lie side by side, too."""
-        depths = self.layout.depths
-        return (
-            self._cut(len(depths)) if set(depths) == {1} else [(j, 1) for j in range(len(depths))]
-        )
+    def _given(self, row: str, i: int) -> str:
+        """An entry of what all lanes are given."""
+        return self.f.load_all(row, i, self.lanes)
 
-    def _own(self, base: str, piece: Piece) -> str:
-        """Entries of the lanes' data."""
-        at, count = piece
-        return self.f.load(base, at * self.lanes, count * self.lanes)
+    def _keep(self, value: str, base: str, i: int) -> None:
+        self.f.store(value, base, i * self.lanes, self.lanes)
 
-    def _given(self, row: str, piece: Piece) -> str:
-        """Entries of what all lanes are given."""
-        at, count = piece
-        return self.f.load(row, at, count) if count > 1 else self.f.load_all(row, at, self.lanes)
+    def _sum(self, factors: list[tuple[str, str]]) -> str:
+        """The sum of products, in chains that don't wait for each other."""
+        f, sums = self.f, [""] * CHAINS
+        for i, (a, b) in enumerate(factors):
+            old = sums[i % CHAINS]
+            sums[i % CHAINS] = f.fma(a, b, old, self.lanes) if old else f.mul(a, b, self.lanes)
+        parts = [value for value in sums if value]
+        while len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=False)
+            parts = [f.add(a, b, self.lanes) for a, b in pairs] + parts[len(parts) // 2 * 2 :]
+        return parts[0]
 
-    def _keep(self, value: str, base: str, piece: Piece) -> None:
-        self.f.store(value, base, piece[0] * self.lanes, piece[1] * self.lanes)
+    def _add_cost(self, terms: list[tuple[str, str]]) -> None:
+        """Adds the sum of weight * error^2."""
+        f, lanes = self.f, self.lanes
+        cost = self._sum([(f.mul(weight, e, lanes), e) for weight, e in terms])
+        self._keep(f.add(self._own(self.total, 0), cost, lanes), self.total, 0)
 
-    def _add_cost(self, terms: list[tuple[str, str, int]]) -> None:
-        """Adds weight * error^2, of so many numbers at once."""
-        f = self.f
-        for width, room in self.costs.items():
-            total = f.load(room, 0, width)
-            for weight, error, count in terms:
-                if count == width:
-                    total = f.fma(f.mul(weight, error, width), error, total, width)
-            f.store(total, room, 0, width)
-
-    def _difference(self, row: str, piece: Piece) -> str:
-        """What z has more than another one, angles wrapped."""
-        f, (at, count) = self.f, piece
-        width = count * self.lanes
-        e = f.sub(self._own(self.z, piece), self._given(row, piece), width)
-        angles = [i < self.layout.n and self.layout.angles[i] for i in range(at, at + count)]
-        if not any(angles):
-            return e
-        wrapped = wrap(f, e, width)
-        if all(angles):
-            return wrapped
-        bits = ", ".join(f"i1 {int(angle)}" for angle in angles)
-        return f.select(f"<{bits}>", wrapped, e, width)
+    def _difference(self, row: str, i: int) -> str:
+        """What z has more than another one, an angle wrapped."""
+        e = self.f.sub(self._own(self.z, i), self._given(row, i), self.lanes)
+        angle = i < self.layout.n and self.layout.angles[i]
+        return wrap(self.f, e, self.lanes) if angle else e
 
     def _tracking(self, t: str) -> None:
         n = self.layout.n
         target, weight = self.words.row("target", t, n), self.words.row("weight", t, n)
-        self._add_cost(
-            [
-                (self._given(weight, piece), self._difference(target, piece), piece[1] * self.lanes)
-                for piece in self._cut(n)
-            ]
-        )
+        self._add_cost([(self._given(weight, i), self._difference(target, i)) for i in range(n)])
 
     def control(self, t: str) -> None:
         """The inputs of step t and the cost of being there."""
-        f, layout = self.f, self.layout
+        f, m = self.f, self.layout.m
         self._tracking(t)
-        ubar = self.words.row("ubar", t, layout.m)
-        for piece in self._inputs():
-            self._keep(self._given(ubar, piece), self.u, piece)
+        ubar = self.words.row("ubar", t, m)
+        for j in range(m):
+            self._keep(self._given(ubar, j), self.u, j)
         with f.when(f.emit(f"icmp ne ptr {self.words.pointer('k')}, null")):
-            k = self.words.row("k", t, layout.m)
-            for piece in self._inputs():
-                width = piece[1] * self.lanes
-                alpha = f.spread(self.alpha, width) if self.lanes == 1 else self.alpha
-                u = f.fma(alpha, self._given(k, piece), self._own(self.u, piece), width)
-                self._keep(u, self.u, piece)
+            k = self.words.row("k", t, m)
+            for j in range(m):
+                u = f.fma(self.alpha, self._given(k, j), self._own(self.u, j), self.lanes)
+                self._keep(u, self.u, j)
         with f.when(f.emit(f"icmp ne ptr {self.words.pointer('K')}, null")):
             self._feedback(t)
         self._clip(t)
 
     def _feedback(self, t: str) -> None:
-        f, layout = self.f, self.layout
-        zbar, K = self.words.row("zbar", t, layout.nz), self.words.row("K", t, layout.m * layout.nz)
-        dz = [(piece, self._difference(zbar, piece)) for piece in self._cut(layout.nz)]
-        for piece in self._inputs():
-            at, count = piece
-            rows = [self._row(f.at(K, j * layout.nz), dz) for j in range(at, at + count)]
-            width = count * self.lanes
-            u = f.add(self._own(self.u, piece), self._sums(rows), width)
-            self._keep(u, self.u, piece)
-
-    def _row(self, row: str, dz: list[tuple[Piece, str]]) -> dict[int, str]:
-        """A row of K times dz: sums of so many numbers at once."""
-        f, found = self.f, dict[int, str]()
-        for width in self.costs:
-            terms = [(piece, e) for piece, e in dz if piece[1] * self.lanes == width]
-            sums = [""] * 4  # short chains
-            for i, (piece, e) in enumerate(terms):
-                gain, old = self._given(row, piece), sums[i % 4]
-                sums[i % 4] = f.fma(gain, e, old, width) if old else f.mul(gain, e, width)
-            if terms:
-                found[width] = self._total([value for value in sums if value], width)
-        return found
-
-    def _sums(self, rows: list[dict[int, str]]) -> str:
-        """The sums of rows, as lanes of a vector if they are several."""
-        f, one, count = self.f, self.lanes, len(rows)
-        wide, parts = self.wide * one, list[str]()
-        if wide > one and wide in rows[0]:
-            whole = [row[wide] for row in rows]
-            alone = [f.lane(whole[0], i, wide) for i in range(wide)] if count == 1 else []
-            parts += alone or transposed(f, whole)
-        if one in rows[0]:
-            rest = [row[one] for row in rows]
-            parts.append(f.vector_of(rest) if count > 1 else rest[0])
-        return self._total(parts, count * one)
-
-    def _total(self, parts: list[str], width: int) -> str:
-        """Sum by pairs."""
-        while len(parts) > 1:
-            pairs = zip(parts[::2], parts[1::2], strict=False)
-            parts = [self.f.add(a, b, width) for a, b in pairs] + parts[len(parts) // 2 * 2 :]
-        return parts[0]
+        f, m, nz = self.f, self.layout.m, self.layout.nz
+        zbar, K = self.words.row("zbar", t, nz), self.words.row("K", t, m * nz)
+        dz = [self._difference(zbar, i) for i in range(nz)]
+        for j in range(m):
+            more = self._sum([(self._given(K, j * nz + i), e) for i, e in enumerate(dz)])
+            self._keep(f.add(self._own(self.u, j), more, self.lanes), self.u, j)
 
     def _clip(self, t: str) -> None:
-        f, layout, terms = self.f, self.layout, []
+        f, layout, lanes, terms = self.f, self.layout, self.lanes, []
         target = self.words.row("input_target", t, layout.m)
-        for piece in self._inputs():
-            at, count = piece
-            width, slot = count * self.lanes, (layout.slot(at), count)
-            u = self._own(self.u, piece)
+        for j in range(layout.m):
             low, high, R, S = (
-                self._given(self.words.pointer(name), piece) for name in ("low", "high", "R", "S")
+                self._given(self.words.pointer(name), j) for name in ("low", "high", "R", "S")
             )
-            u = f.select(f.compare("olt", u, low, width), low, u, width)
-            u = f.select(f.compare("ogt", u, high, width), high, u, width)
-            self._keep(u, self.u, piece)
-            terms.append((R, f.sub(u, self._given(target, piece), width), width))
-            terms.append((S, f.sub(u, self._own(self.z, slot), width), width))
+            u = self._own(self.u, j)
+            u = f.select(f.compare("olt", u, low, lanes), low, u, lanes)
+            u = f.select(f.compare("ogt", u, high, lanes), high, u, lanes)
+            self._keep(u, self.u, j)
+            terms.append((R, f.sub(u, self._given(target, j), lanes)))
+            terms.append((S, f.sub(u, self._own(self.z, layout.slot(j)), lanes)))
         self._add_cost(terms)
 
     def save(self, t: str, last: bool = False) -> None:
@@ -244,35 +177,29 @@ class _Rollout:
 
     def _copy(self, lane: str, to: str, size: int) -> None:
         """The entries of one lane."""
-        for at, count in self._cut(size):
-            self.f.store(self.f.load(lane, at * self.lanes, count), to, at, count)
+        for i in range(size):
+            self.f.store(self.f.load(lane, i * self.lanes), to, i)
 
     def advance(self, t: str) -> None:
         """From z_t to z_{t+1}."""
         f, layout, step, lanes = self.f, self.layout, self.step, self.lanes
-        z = [self._own(self.z, (i, 1)) for i in range(layout.nz)]
-        u = [self._own(self.u, (j, 1)) for j in range(layout.m)]
+        z = [self._own(self.z, i) for i in range(layout.nz)]
+        u = [self._own(self.u, j) for j in range(layout.m)]
         shift = self.words.row("shift", t, layout.m)
         for j, value in enumerate(received(f, self.words, layout, z, u, lanes)):
-            f.store(f.sub(value, f.load_all(shift, j, lanes), lanes), step.u, j * lanes, lanes)
+            self._keep(f.sub(value, self._given(shift, j), lanes), step.u, j)
         for j, depth in enumerate(layout.depths):
             for i in range(depth):
                 later = z[layout.slot(j, i - 1)] if i else u[j]
-                f.store(later, self.z, layout.slot(j, i) * lanes, lanes)
-        bias, values = self.words.row("bias", t, layout.n), step.step()
-        for at, count in self._cut(layout.n):
-            value = f.vector_of(values[at : at + count]) if count > 1 else values[at]
-            x = f.add(value, self._given(bias, (at, count)), count * lanes)
-            self._keep(x, self.z, (at, count))
+                self._keep(later, self.z, layout.slot(j, i))
+        bias = self.words.row("bias", t, layout.n)
+        for i, value in enumerate(step.step()):
+            self._keep(f.add(value, self._given(bias, i), lanes), self.z, i)
 
     def finish(self) -> None:
         """The end state and its cost."""
-        f, H, lanes = self.f, self.words.integer("H"), self.lanes
+        f, H = self.f, self.words.integer("H")
         self._tracking(H)
         self.save(H, last=True)
-        total, wide = self.costs[lanes], self.wide * lanes
-        if wide > lanes:
-            parts = [f.load(self.costs[wide], i) for i in range(wide)]
-            f.store(self._total([f.load(total), *parts], 1), total)
         with f.loop(self.words.integer("runs")) as run:
-            f.store(f.load(total, run), self.words.pointer("cost"), run)
+            f.store(f.load(self.total, run), self.words.pointer("cost"), run)
