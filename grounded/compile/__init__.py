@@ -48,7 +48,7 @@ __all__ = [
     "deepest",
     "system_of",
 ]
-MAX_COMPILED = 30_000  # operations of a model and its derivatives, about 7 s of compiling
+MAX_COMPILED = 30_000  # operations that kernels are written with, about 7 s of compiling
 MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 
 

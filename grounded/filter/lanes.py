@@ -99,8 +99,7 @@ class Pass:
             first, self.runs = f.integer("mul", group, self.W), []
             for lane in range(self.W):
                 i = f.integer("add", first, lane)
-                beyond = f.emit(f"icmp sgt i64 {i}, {last}")
-                self.runs.append(f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}"))
+                self.runs.append(f.pick(f.compare_integers("sgt", i, last), last, i))
             yield
 
     def _places(self, name: str, t: str, size: int) -> list[str]:
@@ -130,7 +129,7 @@ class Pass:
 
     def wanted(self, name: str) -> str:
         """Whether an output that may be missing is there."""
-        return self.f.emit(f"icmp ne ptr {self.base[name]}, null")
+        return self.f.given(self.base[name])
 
     def sandwich(self, A: str, P: str, spare: str, *, transposed: bool) -> None:
         """P <- A P A', or A' P A, the mean of what stands above and below the diagonal."""

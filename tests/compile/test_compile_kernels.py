@@ -175,7 +175,7 @@ def test_too_many_operations_are_not_compiled(monkeypatch):
     import grounded.compile as package
 
     monkeypatch.setattr(package, "MAX_COMPILED", 20)
-    monkeypatch.setattr("grounded.compile.run.compiled.UNCOUNTED_OPERATIONS", 0)
+    monkeypatch.setattr("grounded.compile.run.compiled.UNCOUNTED", 0)
     assert problem("car").system.how == "compiled steps"
     monkeypatch.setattr(package, "MAX_STEPS", 20)
     task = problem("car")
@@ -206,7 +206,7 @@ def test_derivatives_too_long_to_be_written_out_are_exact_all_the_same(monkeypat
             for mine, theirs in zip(system.sensitivities(*at), expected, strict=True):
                 np.testing.assert_allclose(mine, theirs, **TIGHT)
 
-    monkeypatch.setattr("grounded.compile.run.compiled.UNCOUNTED_OPERATIONS", 0)
+    monkeypatch.setattr("grounded.compile.run.compiled.UNCOUNTED", 0)
     monkeypatch.setattr(Variant, "entries", too_long)
     system = problem("car").system
     assert system.how == "compiled steps" and "more than 10 operations" in system.note

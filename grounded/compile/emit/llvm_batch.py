@@ -23,9 +23,12 @@ class Words:
     def _address(self, name: str) -> str:
         return self.f.at("%words", self.names.index(name), "i64")
 
+    def _load(self, kind: str, name: str) -> str:
+        return self.f.emit(f"load {kind}, ptr {self._address(name)}, align 8")
+
     def pointer(self, name: str) -> str:
         """An array."""
-        return self.f.emit(f"load ptr, ptr {self._address(name)}, align 8")
+        return self._load("ptr", name)
 
     def row(self, name: str, t: str, size: int) -> str:
         """The address of row t of an array of rows."""
@@ -33,20 +36,19 @@ class Words:
 
     def integer(self, name: str) -> str:
         """An i64."""
-        return self.f.emit(f"load i64, ptr {self._address(name)}, align 8")
+        return self._load("i64", name)
 
     def double(self, name: str) -> str:
         """A double."""
-        return self.f.emit(f"load double, ptr {self._address(name)}, align 8")
+        return self._load("double", name)
 
     def set(self, name: str, value: str) -> None:
-        """Change a word: a double."""
-        self.f.do(f"store double {value}, ptr {self._address(name)}, align 8")
+        """Change a word, to a value after its type."""
+        self.f.do(f"store {value}, ptr {self._address(name)}, align 8")
 
     def move(self, name: str, by: str) -> None:
         """Move an array's address on, by a number of bytes."""
-        moved = self.f.integer("add", self.integer(name), by)
-        self.f.do(f"store i64 {moved}, ptr {self._address(name)}, align 8")
+        self.set(name, f"i64 {self.f.integer('add', self.integer(name), by)}")
 
 
 def start_table(f: Writer, words: Words, d: Dynamics) -> str:
@@ -72,8 +74,7 @@ def gather_rows(
     last, index = f.integer("sub", count, 1), list[str]()
     for lane in range(width):
         i = f.integer("add", first, lane)
-        beyond = f.emit(f"icmp sgt i64 {i}, {last}")
-        index.append(f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}"))
+        index.append(f.pick(f.compare_integers("sgt", i, last), last, i))
     for base, size, out in arrays:
         rows = [f.at(base, f.integer("mul", i, size)) for i in index]
         for j, column in enumerate(columns_of(f, rows, size)):
@@ -95,8 +96,7 @@ def _each_sample(
         gather_rows(f, arrays, first, count, width)
         compute()
         left = f.integer("sub", count, first)
-        full = f.emit(f"icmp sgt i64 {left}, {width}")
-        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
+        with f.loop(f.pick(f.compare_integers("sgt", left, width), width, left)) as lane:
             scatter(f.integer("add", first, lane), lane)
 
 
@@ -126,7 +126,7 @@ def march_kernel(d: Dynamics) -> str:
     sizes = {"x": d.n, "out": d.n, "u": d.m}
     bytes_of = {name: f.integer("mul", rows, size) for name, size in sizes.items()}
     with f.loop(words.integer("steps")) as t:
-        words.set("dt", f.load(lengths, t))
+        words.set("dt", f"double {f.load(lengths, t)}")
         f.do("call void @step(ptr %words)")
         for name, size in bytes_of.items():
             words.move(name, size)

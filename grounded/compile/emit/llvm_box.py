@@ -66,7 +66,7 @@ def factored(f: Writer, H: list[list[str]]) -> tuple[Lower, list[str], str]:
                 continue
             positive = f.compare("ogt", value, ZERO)
             finite = f.compare("olt", value, number(float("inf")))
-            good = f.emit(f"and i1 {good}, {f.emit(f'and i1 {positive}, {finite}')}")
+            good = f.both(good, positive, finite)
             inverse.append(f.div(ONE, value))
     return L, inverse, good
 
@@ -136,19 +136,17 @@ class _Box:
 
     def free_set(self, floor: str) -> None:
         """Marks the free inputs; leaves the loop when their gradient is small."""
-        f, busy = self.f, "false"
+        f, busy = self.f, list[str]()
         for i in range(self.m):
             k, g = f.load("%k", i), f.load(self.gradient, i)
             low, high = f.load("%low", i), f.load("%high", i)
-            at_low = f.emit(f"and i1 {f.compare('ole', k, low)}, {f.compare('ogt', g, ZERO)}")
-            at_high = f.emit(f"and i1 {f.compare('oge', k, high)}, {f.compare('olt', g, ZERO)}")
-            held = f.emit(f"or i1 {at_low}, {at_high}")
-            held = f.emit(f"or i1 {held}, {f.compare('oge', low, high)}")
+            at_low = f.both(f.compare("ole", k, low), f.compare("ogt", g, ZERO))
+            at_high = f.both(f.compare("oge", k, high), f.compare("olt", g, ZERO))
+            held = f.any(at_low, at_high, f.compare("oge", low, high))
             f.store(f.select(held, ZERO, ONE), "%free", i)
             f.store(f.select(held, ZERO, g), self.step, i)
-            large = f.compare("ogt", f.call("fabs", [f.load(self.step, i)]), floor)
-            busy = f.emit(f"or i1 {busy}, {large}")
-        f.break_if(f.emit(f"xor i1 {busy}, true"))
+            busy.append(f.compare("ogt", f.call("fabs", [f.load(self.step, i)]), floor))
+        f.break_if(f.negated(f.any(*busy)))
 
     def search(self, value: str) -> None:
         """Moves k along the projected path; leaves the outer loop when it stays."""
@@ -176,13 +174,13 @@ class _Box:
         self._accept(f.compare("ogt", f.load(moved), ZERO))
 
     def _accept(self, found: str) -> None:
-        f, changed = self.f, "false"
+        f, changed = self.f, list[str]()
         for i in range(self.m):
             old = f.load("%k", i)
             new = f.select(found, f.load(self.trial, i), old)
-            changed = f.emit(f"or i1 {changed}, {f.compare('one', new, old)}")
+            changed.append(f.compare("one", new, old))
             f.store(new, "%k", i)
-        f.break_if(f.emit(f"xor i1 {changed}, true"))
+        f.break_if(f.negated(f.any(*changed)))
 
 
 def _box(m: int) -> str:

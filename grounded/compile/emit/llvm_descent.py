@@ -90,9 +90,8 @@ class _Descent:
     def _other(self, pair: tuple[str, str]) -> str:
         """The one of two arrays that is not the current one."""
         f = self.f
-        turn = f.emit(f"icmp eq i64 {f.index(self.swapped, 0)}, 0")
         first, second = (self.words.pointer(name) for name in pair)
-        return f.emit(f"select i1 {turn}, ptr {second}, ptr {first}")
+        return f.pick(f.compare_integers("eq", f.index(self.swapped, 0), 0), second, first, "ptr")
 
     def first(self) -> None:
         """The first rollout, by the words it came with, to z0, u0."""
@@ -104,21 +103,18 @@ class _Descent:
         for place, value in ((COST, cost), (COUNT, ZERO), (FAILED_AT, number(-1.0)), (TURN, ZERO)):
             f.store(value, self.result, place)
         finite = f.compare("olt", f.call("fabs", [cost]), INFINITY)
-        f.return_if(f.emit(f"xor i1 {finite}, true"), self._end("not finite"))
+        f.return_if(f.negated(finite), self._end("not finite"))
         for name in ("k", "K"):
             self._set("rollout", ROLLOUT, name, f"ptr {self.words.pointer(name)}")
         self._current()
 
     def _current(self) -> None:
         """Tells both kernels which trajectory they are about."""
-        f = self.f
-        turn = f.emit(f"icmp eq i64 {f.index(self.swapped, 0)}, 0")
         for pair, rollout, sweep in (
-            (("z0", "z1"), "zbar", "z_run"),
-            (("u0", "u1"), "ubar", "u_run"),
+            (("z1", "z0"), "zbar", "z_run"),
+            (("u1", "u0"), "ubar", "u_run"),
         ):
-            first, second = (self.words.pointer(name) for name in pair)
-            value = f.emit(f"select i1 {turn}, ptr {first}, ptr {second}")
+            value = self._other(pair)
             self._set("rollout", ROLLOUT, rollout, f"ptr {value}")
             self._set("sweep", SWEEP, sweep, f"ptr {value}")
 
@@ -130,24 +126,20 @@ class _Descent:
             for j in range(self.m):
                 f.store(self._mul(mu, f.load(self.words.pointer("scale"), j)), damping, j)
             failed = f.emit(f"call i64 @sweep(ptr {self.words.pointer('sweep')})")
-            through = f.emit(f"icmp slt i64 {failed}, 0")
-            good = f.emit(f"and i1 {through}, {self._finite_gains()}")
-            f.break_if(good)
-            f.store(self._failed_at(failed, through), self.result, FAILED_AT)
+            through = f.compare_integers("slt", failed, 0)
+            f.break_if(f.both(through, self._finite_gains()))
+            f.store(f.as_double(f.pick(through, 0, failed)), self.result, FAILED_AT)
             f.return_if(f.compare("oge", mu, number(CEILING)), self._end("not finite"))
             f.store(self._larger(self._mul(mu, number(GROWTH)), number(FLOOR)), self.mu)
 
-    def _failed_at(self, failed: str, through: str) -> str:
-        step = self.f.emit(f"select i1 {through}, i64 0, i64 {failed}")
-        return self.f.emit(f"sitofp i64 {step} to double")
-
     def _finite_gains(self) -> str:
         """Whether the first step's K is finite: what goes wrong on the way ends there."""
-        f, K = self.f, self.words.pointer("K")
-        with f.fold(self.m * self.nz, 1, ZERO) as total:
-            value = f.load(K, total.i)
-            total.set(f.add(total.value, f.sub(value, value)))
-        return f.compare("oeq", total.result, ZERO)
+        f, K, total = self.f, self.words.pointer("K"), self.f.room(1)
+        f.store(ZERO, total)
+        with f.loop(self.m * self.nz) as i:
+            value = f.load(K, i)
+            f.store(f.add(f.load(total), f.sub(value, value)), total)
+        return f.compare("oeq", f.load(total), ZERO)
 
     def _promises(self) -> tuple[str, str]:
         expected = self.words.pointer("expected")
@@ -160,9 +152,9 @@ class _Descent:
         least = self._add(self._mul(self.words.double("tolerance"), cost), number(NO_CHANGE))
         small = f.compare("ole", f.neg(self._add(d1, d2)), least)
         free = f.compare("olt", f.load(self.mu), number(LARGE_MU))  # or mu makes it small
-        f.return_if(f.emit(f"and i1 {small}, {free}"), self._end("converged"))
+        f.return_if(f.both(small, free), self._end("converged"))
         f.return_if(small, self._end("no improvement"))
-        most = f.emit(f"sitofp i64 {self.words.integer('max_iterations')} to double")
+        most = f.as_double(self.words.integer("max_iterations"))
         used = f.compare("oge", f.load(self.result, COUNT), most)
         f.return_if(used, self._end("max iterations"))
 
@@ -182,10 +174,10 @@ class _Descent:
         f, halvings = self.f, self.words.integer("halvings")
         f.store(ONE, self.fresh)
         blocks = f.integer("sdiv", f.integer("add", halvings, LANES - 1), LANES)
-        with f.when(f.emit(f"icmp sgt i64 {blocks}, 0")), f.loop(blocks) as block:
+        with f.when(f.compare_integers("sgt", blocks, 0)), f.loop(blocks) as block:
             for lane in range(LANES):
                 place = f.integer("add", f.integer("mul", block, LANES), lane)
-                within = f.emit(f"icmp slt i64 {place}, {halvings}")
+                within = f.compare_integers("slt", place, halvings)
                 shorter = self._mul(f.load(self.fresh), number(0.5))
                 f.store(shorter, self.fresh)
                 f.store(f.select(within, shorter, ZERO), alphas, lane)
@@ -206,7 +198,7 @@ class _Descent:
         cost = f.load(self.words.pointer("costs"), lane)
         change = f.emit(f"fsub double {cost}, {f.load(self.result, COST)}")
         enough = f.compare("ole", change, self._mul(self.words.double("accept"), promised))
-        enough = f.emit(f"and i1 {enough}, {f.compare('ogt', alpha, ZERO)}")
+        enough = f.both(enough, f.compare("ogt", alpha, ZERO))
         f.store(f.select(enough, alpha, f.load(self.taken)), self.taken)
 
     def line(self) -> None:
@@ -226,10 +218,10 @@ class _Descent:
         higher = self._larger(self._mul(mu, number(GROWTH)), number(SEARCH_FLOOR))
         f.store(f.select(found, lower, higher), self.mu)
         turn = f.index(self.swapped, 0)
-        turn = f.emit(f"select i1 {found}, i64 {f.integer('xor', turn, 1)}, i64 {turn}")
+        turn = f.pick(found, f.integer("xor", turn, 1), turn)
         f.do(f"store i64 {turn}, ptr {self.swapped}, align 8")
-        f.store(f.emit(f"sitofp i64 {turn} to double"), self.result, TURN)
+        f.store(f.as_double(turn), self.result, TURN)
         self._current()
         beyond = f.compare("ogt", f.load(self.mu), number(CEILING))
-        stuck = f.emit(f"and i1 {beyond}, {f.emit(f'xor i1 {found}, true')}")
+        stuck = f.both(beyond, f.negated(found))
         f.return_if(stuck, self._end("no improvement"))

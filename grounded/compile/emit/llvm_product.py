@@ -13,12 +13,11 @@ from collections.abc import Callable, Sequence, Set
 from grounded.compile.emit.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.emit.llvm_rollout import received
 from grounded.compile.emit.llvm_step import Dynamics
-from grounded.compile.emit.llvm_text import Writer, integers, number, splat, vector
+from grounded.compile.emit.llvm_text import Writer, number, splat, vector
 from grounded.compile.emit.llvm_transpose import transposed
 from grounded.compile.kernel_words import Layout
 
-Row = Callable[[int | str], list[str]]  # row r of a matrix, or some of its pieces: vectors
-UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
+Row = Callable[[int], list[str]]  # row r of a matrix, or some of its pieces: vectors
 
 
 def pieces(size: int, width: int) -> range:
@@ -31,14 +30,7 @@ def pieces(size: int, width: int) -> range:
 
 def pieces_of(f: Writer, base: str, stride: int, cut: Sequence[int], size: int) -> Row:
     """Loads vectors of `size` doubles of a matrix's rows, from where each of `cut` says."""
-
-    def row(r: int | str) -> list[str]:
-        if isinstance(r, int):
-            return [f.load(base, r * stride + at, size) for at in cut]
-        start = f.at(base, f.integer("mul", r, stride))
-        return [f.load(start, at, size) for at in cut]
-
-    return row
+    return lambda r: [f.load(base, r * stride + at, size) for at in cut]
 
 
 def chosen(f: Writer, row: list[str], places: list[int | None], size: int) -> str:
@@ -105,17 +97,15 @@ class Linearised:
         self.soa = f.room((nz + m) * width)  # [z, u] of W steps
         self.shift = f.room(m * width)  # of the received inputs
         self.xu, self.following = f.room((n + m) * width), f.room(n * width)
-        self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
-        self.sums_room = f.room((n + m) * width)
+        self.jac = f.room(len(d.places) * width)
         self.now = ""
-        f.store(splat(0.0, width), self.jac, len(d.places) * width, width)
 
     def begins(self, t: str) -> str:
         """Whether t is the last step of a block, whose Jacobians are not there yet."""
         f = self.f
-        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', self.words.integer('H'), 1)}")
-        edge = f.emit(f"icmp eq i64 {f.integer('and', t, self.width - 1)}, {self.width - 1}")
-        return f.emit(f"or i1 {last}, {edge}")
+        last = f.compare_integers("eq", t, f.integer("sub", self.words.integer("H"), 1))
+        edge = f.integer("and", t, self.width - 1)
+        return f.any(last, f.compare_integers("eq", edge, self.width - 1))
 
     def linearise(self, t: str) -> None:
         """The Jacobians of the W steps of the block of t."""
@@ -145,7 +135,7 @@ class Linearised:
         """Rows c of [A B]'X for some of the c, below nz a moving entry of z, nz + j for u_j.
 
         Args:
-            row: pieces of X(r, :), vectors of `size` doubles; a large model takes one at a time.
+            row: pieces of X(r, :), vectors of `size` doubles.
             size: see `row`.
             some: the c.
         """
@@ -177,8 +167,6 @@ class Linearised:
     def _sums(self, row: Row, size: int, columns: Set[int]) -> dict[int, list[str]]:
         """For some columns c of the model's Jacobian, the sums over r of J(r, c) X(r, :)."""
         f, d = self.f, self.d
-        if len(d.places) > UNROLLED:
-            return self._looped_sums(row, size, columns)
         sums, known = dict[int, list[str]](), dict[int, list[str]]()
         for e, (r, c) in enumerate(d.places):
             if c not in columns:
@@ -198,36 +186,3 @@ class Linearised:
                 sums[c] = [f.mul(a, x, size) for x in values]
         nothing = [splat(0.0, size)] * len(row(0))
         return {c: sums.get(c, nothing) for c in columns}
-
-    def _looped_sums(self, row: Row, size: int, columns: Set[int]) -> dict[int, list[str]]:
-        """The same for large models, by tables of indices."""
-        f, start = self.f, min(columns)
-        count = max(columns) + 1 - start
-        with f.loop(count) as i:
-            c = f.integer("add", i, start)
-            first = f.index("@column_first", c)
-            entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
-            with f.fold(entries, size, splat(0.0, size)) as total:
-                q = f.integer("add", first, total.i)
-                a = f.load_all(self.now, f.index("@column_entry", q), size)
-                (value,) = row(f.index("@column_row", q))
-                total.set(f.fma(a, value, total.value, size))
-            f.store(total.result, self.sums_room, f.integer("mul", i, size), size)
-        return {c: [f.load(self.sums_room, (c - start) * size, size)] for c in columns}
-
-
-def sweep_tables(d: Dynamics, width: int) -> str:
-    """For large models: which entries each column of the Jacobian has, at least the zero one."""
-    if len(d.places) <= UNROLLED:
-        return ""
-    first, rows, entries = [0], [], []
-    for c in range(d.n + d.m):
-        column = [(r, e) for e, (r, c2) in enumerate(d.places) if c2 == c] or [(0, len(d.places))]
-        rows += [r for r, _ in column]
-        entries += [e for _, e in column]
-        first.append(len(rows))
-    return (
-        integers("column_first", first)
-        + integers("column_row", rows)
-        + integers("column_entry", [e * width for e in entries])
-    )

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from grounded.compile.emit.llvm_batch import Words
 from grounded.compile.emit.llvm_box import ONE, ZERO, Lower, clipped, factored, loaded, solved
 from grounded.compile.emit.llvm_product import (
-    UNROLLED,
     Linearised,
     chosen,
     pieces,
@@ -71,8 +70,6 @@ class _Sweep:
         self.cut, self.wide = pieces(nz, size), pieces(len(self.moving) + m, size)
         self.P, self.C = size * len(self.cut), size * len(self.wide)
         self.along = Linearised(f, d, layout, width, self.words)
-        self.large = len(d.places) > UNROLLED
-        self.together = 1 if self.large else 2  # pieces that share what is read of the Jacobian
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
         self.T, self.U = f.room(self.P * self.C), f.room(m * self.C)  # V [A B]; rows of B'T
         self.F = f.room(m * self.P)  # rows of Q_uz
@@ -111,23 +108,16 @@ class _Sweep:
         order = [*self.moving, *range(layout.nz, layout.nz + layout.m)]
         slopes = list[str]()
 
-        def gradient(r: int | str) -> list[str]:
-            return [f.load_all(self.v, r, size)]
-
         for some in self._grouped(self.cut):
             row = pieces_of(f, self.V, self.P, some, size)
-            both = not (slopes or self.large)
+            with_v, both = (lambda r, row=row: [*row(r), f.load_all(self.v, r, size)]), not slopes
             for first, block in self._blocks(order):
-                together = (lambda r, row=row: row(r) + gradient(r)) if both else row
-                found = self.along.columns(together, size, block)
+                found = self.along.columns(with_v if both else row, size, block)
                 if both:
                     slopes += [self._first_lane(line[-1]) for line in found]
                 found += [[splat(0.0, size)] * len(some)] * (-len(found) % size)
                 for i, at in enumerate(some):
                     self._turned([line[i] for line in found], at, first)
-        if self.large:
-            found = self.along.columns(gradient, size, order)
-            slopes = [self._first_lane(line[0]) for line in found]
         return slopes
 
     def _first_lane(self, value: str) -> str:
@@ -145,12 +135,11 @@ class _Sweep:
                     self.f.store(column, self.T, (at + i) * C + first + begin, size)
 
     def _grouped(self, cut: Sequence[int]) -> list[Sequence[int]]:
-        return [cut[i : i + self.together] for i in range(0, len(cut), self.together)]
+        """Pieces that share what is read of the Jacobian."""
+        return [cut[i : i + 2] for i in range(0, len(cut), 2)]
 
     def _blocks(self, columns: list[int]) -> list[tuple[int, list[int]]]:
         """Columns that are summed up at once, as registers allow, after the place of the first."""
-        if self.large:
-            return [(0, columns)]
         return [(i, columns[i : i + self.size]) for i in range(0, len(columns), self.size)]
 
     def _over_z(self, row: list[str], at: int) -> str:
@@ -211,22 +200,14 @@ class _Sweep:
         self._gradient(self._state_cost(t), dict(zip(self.moving, slopes, strict=False)))
         for some in self._grouped(self.cut):
             K = [pieces_of(f, self.K, P, some, size)(j) for j in range(m)]
-            if self.large:
-                with f.loop(self.layout.nz) as i:
-                    self._add(f.at(self.V, f.integer("mul", i, P)), f.at(self.F, i), some, K)
-                continue
             for c in range(self.layout.nz):
-                self._add(f.at(self.V, c * P), f.at(self.F, c), some, K)
-
-    def _add(self, row: str, column: str, some: Sequence[int], K: list[list[str]]) -> None:
-        """A row of V in some pieces, plus a row of F'K."""
-        f, size = self.f, self.size
-        values = [f.load(row, at, size) for at in some]
-        for j, gains in enumerate(K):
-            factor = f.load_all(column, j * self.P, size)
-            values = [f.fma(factor, k, a, size) for k, a in zip(gains, values, strict=True)]
-        for at, value in zip(some, values, strict=True):
-            f.store(value, row, at, size)
+                row = f.at(self.V, c * P)
+                values = [f.load(row, at, size) for at in some]
+                for j, gains in enumerate(K):
+                    factor = f.load_all(self.F, j * P + c, size)
+                    values = [f.fma(factor, k, a, size) for k, a in zip(gains, values, strict=True)]
+                for at, value in zip(some, values, strict=True):
+                    f.store(value, row, at, size)
 
     def _gradient(self, cost: list[tuple[str, str] | None], slopes: dict[int, str]) -> None:
         """The value's gradient v, from the products of [A B] with the one of the next step."""
@@ -268,9 +249,8 @@ class _Sweep:
         self.g = [f.load(self.g_u, i) for i in range(m)]
         self.usual, infinity = (L, inverse, solved(f, self.g, L, inverse, 1)), number(float("inf"))
         for value in self.g:
-            finite = f.compare("olt", f.call("fabs", [value]), infinity)
-            good = f.emit(f"and i1 {good}, {finite}")
-        f.return_if(f.emit(f"xor i1 {good}, true"), f"i64 {t}")
+            good = f.both(good, f.compare("olt", f.call("fabs", [value]), infinity))
+        f.return_if(f.negated(good), f"i64 {t}")
 
     def gains(self, t: str) -> None:
         """Gains k and K of step t inside the limits; the promise d1, d2."""
@@ -289,16 +269,17 @@ class _Sweep:
             [f.sub(f.load(self.words.pointer(name), i), f.load(u, i)) for i in range(m)]
             for name in ("low", "high")
         )
-        broken = "false"
-        for value, lowest, highest in zip(k, low, high, strict=True):
-            outside = f.compare("une", clipped(f, value, lowest, highest), value)
-            broken = f.emit(f"or i1 {broken}, {outside}")
-        with f.unless([*L.values(), *inverse, *k], broken) as values:
+        limits = zip(k, low, high, strict=True)
+        broken = f.any(*(f.compare("une", clipped(f, *each), each[0]) for each in limits))
+
+        def boxed() -> list[str]:
             rooms = (self.k, k), (self.low, low), (self.high, high), (self.free, [ONE] * m)
             for room, row in (*rooms, (self.H, [value for line in H for value in line])):
                 for i, value in enumerate(row):
                     f.store(value, room, i)
-            values[:] = self._boxed()
+            return self._boxed()
+
+        values = f.either(broken, boxed, lambda: [*L.values(), *inverse, *k])
         below, last = len(L), len(L) + m
         return dict(zip(L, values[:below], strict=True)), values[below:last], values[last:]
 
@@ -343,10 +324,8 @@ class _Sweep:
 
     def _damp(self, damping: list[str]) -> None:
         """F = Q_uz - diag(damping) K: what of it belongs to the value."""
-        f, P, size, damped = self.f, self.P, self.size, "false"
-        for value in damping:
-            damped = f.emit(f"or i1 {damped}, {f.compare('une', value, ZERO)}")
-        with f.when(damped):
+        f, P, size = self.f, self.P, self.size
+        with f.when(f.any(*(f.compare("une", value, ZERO) for value in damping))):
             for j, value in enumerate(damping):
                 less = f.spread(f.neg(value), size)
                 for at in self.cut:

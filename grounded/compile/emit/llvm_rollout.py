@@ -131,12 +131,12 @@ class _Rollout:
         ubar = self.words.row("ubar", t, m)
         for j in range(m):
             self._keep(self._given(ubar, j), self.u, j)
-        with f.when(f.emit(f"icmp ne ptr {self.words.pointer('k')}, null")):
+        with f.when(f.given(self.words.pointer("k"))):
             k = self.words.row("k", t, m)
             for j in range(m):
                 u = f.fma(self.alpha, self._given(k, j), self._own(self.u, j), self.lanes)
                 self._keep(u, self.u, j)
-        with f.when(f.emit(f"icmp ne ptr {self.words.pointer('K')}, null")):
+        with f.when(f.given(self.words.pointer("K"))):
             self._feedback(t)
         self._clip(t)
 
@@ -167,8 +167,7 @@ class _Rollout:
         """Stores z_t and u_t of the runs that were asked for."""
         f, layout, H = self.f, self.layout, self.words.integer("H")
         z, u = self.words.pointer("z"), self.words.pointer("u")
-        wanted = f.emit(f"icmp ne ptr {z}, null")
-        with f.when(wanted), f.loop(self.words.integer("runs")) as run:
+        with f.when(f.given(z)), f.loop(self.words.integer("runs")) as run:
             row = f.integer("add", f.integer("mul", run, f.integer("add", H, 1)), t)
             self._copy(f.at(self.z, run), f.at(z, f.integer("mul", row, layout.nz)), layout.nz)
             if not last:

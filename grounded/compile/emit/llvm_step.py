@@ -22,8 +22,8 @@ from grounded.compile.trace.graph import Graph
 from grounded.compile.trace.tracing import Variant
 
 Place = tuple[int, int]  # row, column of a Jacobian
+WIDEST = 8  # doubles in a vector
 FLAT = 120  # operations of a model whose stages are written out: nothing waits for memory then
-UNROLLED = 2000  # products of the chain rule that are written out; more are a loop over indices
 Rows = tuple[int, ...]
 Group = tuple[Rows, list[int]]  # rows, and the columns that are non-zero in them
 
@@ -80,6 +80,13 @@ class Dynamics:
         """Multiplications of the chain rule that are written out."""
         sums = sum(len(self.rates[r, some[0]]) for rows, some in self.groups for r in rows)
         return max(len(self.stages) - 1, 0) * sums
+
+    @property
+    def operations(self) -> int:
+        """Operations that are written for a step, its Jacobian, and a sweep with it."""
+        live = self.graph.live([*self.outputs, *self.entries.values()])
+        pieces = -(-(self.n + self.m) // WIDEST)  # of a row
+        return len(live) + self.products + 3 * pieces * len(self.places)
 
     @cached_property
     def places(self) -> list[Place]:
@@ -204,15 +211,12 @@ class StepWriter:
                 f.store(value, out, e * w, w)
             return
         self._start([*d.outputs, *d.entries.values()])
-        if d.products > UNROLLED:
-            self._looped_stages(out)
-        else:
-            self._written_stages(out)
+        self._stages(out)
         self._finish()
         for e in range(len(d.rates), len(d.places)):
             f.store(splat(1.0, w), out, e * w, w)
 
-    def _written_stages(self, out: str) -> None:
+    def _stages(self, out: str) -> None:
         """The derivatives of every stage to memory, a zero after them; then the chain."""
         f, d, w = self.f, self.d, self.width
         size = (len(d.entries) + 1) * w
@@ -224,27 +228,6 @@ class StepWriter:
                 f.store(body.value(node), to, e * w, w)
             f.store(splat(0.0, w), to, len(d.entries) * w, w)
         self._chain(kept, out)
-
-    def _looped_stages(self, out: str) -> None:
-        """Each stage and its part of the chain, in small code."""
-        f, d, size = self.f, self.d, len(self.d.rates) * self.width
-        rates = f.room(2 * size)  # K of the stage, and of the one before
-        self._begin_loops(rates, out)
-        with f.loop(len(d.stages)) as stage:
-            body, c_dt, b_dt = self._rates(stage)
-            odd = f.integer("and", stage, 1)
-            old = f.at(rates, f.integer("mul", odd, size))
-            new = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
-            self._looped_chain(body, (c_dt, b_dt), (old, new), out)
-
-    def _begin_loops(self, rates: str, out: str) -> None:
-        """No K yet, and A = I."""
-        f, d, w = self.f, self.d, self.width
-        if d.rates:  # a loop runs at least once: not for rates that depend on nothing
-            with f.loop(len(d.rates)) as rate:
-                at = f.integer("mul", rate, w)
-                f.store(splat(0.0, w), rates, at, w)
-                f.store(f.load_all("@chain_diagonal", rate, w), out, at, w)
 
     def _chain(self, kept: str, out: str) -> None:
         """K = f_x T + own and A += b dt K of all stages, one column of K after the other.
@@ -279,42 +262,6 @@ class StepWriter:
         for r, e in places.items():
             f.store(total[r], out, f.integer("mul", e, w), w)
 
-    def _looped_chain(
-        self, body: Body, steps: tuple[str, str], buffers: tuple[str, str], out: str
-    ) -> None:
-        """The same sums for large models: small code that runs through tables of indices."""
-        f, d, w = self.f, self.d, self.width
-        (c_dt, b_dt), (old, new) = steps, buffers
-        own = f.room((len(d.entries) + 1) * w)  # the last is zero
-        for e, value in enumerate(body.values(list(d.entries.values()))):
-            f.store(value, own, e * w, w)
-        f.store(splat(0.0, w), own, len(d.entries) * w, w)
-        with f.loop(len(d.rates)) as rate:
-            first = f.index("@chain_first", rate)
-            count = f.integer("sub", f.index("@chain_first", f.integer("add", rate, 1)), first)
-            with f.fold(count, w, splat(0.0, w)) as total:
-                q = f.integer("add", first, total.i)
-                left = f.integer("mul", f.index("@chain_left", q), w)
-                right = f.integer("mul", f.index("@chain_right", q), w)
-                total.set(f.fma(f.load(own, left, w), f.load(old, right, w), total.value, w))
-            mine = f.load(own, f.integer("mul", f.index("@chain_own", rate), w), w)
-            value, at = f.fma(c_dt, total.result, mine, w), f.integer("mul", rate, w)
-            f.store(value, new, at, w)
-            f.store(f.fma(b_dt, value, f.load(out, at, w), w), out, at, w)
-
-
-def _chain_tables(d: Dynamics) -> str:
-    """For `_looped_chain`: sums of products by index, at least one a place."""
-    own = {place: e for e, place in enumerate(d.entries)}
-    slot = {place: e for e, place in enumerate(d.rates)}
-    first, left, right = [0], list[int](), list[int]()
-    for (r, c), sums in d.rates.items():
-        left += [own[r, s] for s in sums] or [len(own)]
-        right += [slot[s, c] for s in sums] or [0]
-        first.append(len(left))
-    tables = {"chain_first": first, "chain_left": left, "chain_right": right}
-    return "".join(integers(name, values) for name, values in tables.items())
-
 
 def stage_tables(d: Dynamics) -> str:
     """The stages' c and b as global constants, and of the places of K their own derivatives."""
@@ -324,8 +271,7 @@ def stage_tables(d: Dynamics) -> str:
     columns["chain_diagonal"] = [float(r == c) for r, c in d.rates]
     tables = "".join(doubles(name, values) for name, values in columns.items())
     own = {place: e for e, place in enumerate(d.entries)}
-    tables += integers("chain_own", [own.get(at, len(own)) for at in d.rates])
-    return tables + (_chain_tables(d) if d.products > UNROLLED else "")
+    return tables + integers("chain_own", [own.get(at, len(own)) for at in d.rates])
 
 
 def jacobian_function(d: Dynamics, width: int) -> str:

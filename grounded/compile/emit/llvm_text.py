@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import reduce
 
 F = "double"
 FLAGS = "contract"  # a * b + c may be fused
@@ -32,17 +33,6 @@ def splat(value: float, width: int) -> str:
     if width == 1:
         return number(value)
     return "<" + ", ".join(f"double {number(value)}" for _ in range(width)) + ">"
-
-
-class Fold:
-    """A loop's number of the turn and carried value; afterwards, the result."""
-
-    def __init__(self, i: str, value: str) -> None:
-        self.i, self.value, self.result = i, value, ""
-
-    def set(self, value: str) -> None:
-        """The value that the next turn starts with."""
-        self.result = value
 
 
 class Writer:
@@ -191,6 +181,36 @@ class Writer:
         """An i64 operation: add, sub, mul, sdiv ..."""
         return self.emit(f"{op} i64 {a}, {b}")
 
+    def compare_integers(self, how: str, a: int | str, b: int | str) -> str:
+        """An icmp of i64."""
+        return self.emit(f"icmp {how} i64 {a}, {b}")
+
+    def pick(self, condition: str, a: int | str, b: int | str, kind: str = "i64") -> str:
+        """One of two integers or addresses (`kind` ptr)."""
+        return self.emit(f"select i1 {condition}, {kind} {a}, {kind} {b}")
+
+    def as_double(self, i: str) -> str:
+        """An i64 as a double."""
+        return self.emit(f"sitofp i64 {i} to double")
+
+    # Conditions, one bit each.
+
+    def both(self, *conditions: str) -> str:
+        """Whether all hold."""
+        return reduce(lambda a, b: self.emit(f"and i1 {a}, {b}"), conditions)
+
+    def any(self, *conditions: str) -> str:
+        """Whether one holds."""
+        return reduce(lambda a, b: self.emit(f"or i1 {a}, {b}"), conditions)
+
+    def negated(self, condition: str) -> str:
+        """Whether it does not hold."""
+        return self.emit(f"xor i1 {condition}, true")
+
+    def given(self, address: str) -> str:
+        """Whether an address is not null."""
+        return self.emit(f"icmp ne ptr {address}, null")
+
     # Control.
 
     @contextmanager
@@ -215,20 +235,6 @@ class Writer:
         self.do(f"br i1 %more{tag}, label %loop{tag}, label %exit{tag}")
         self.lines.append(f"exit{tag}:")
 
-    @contextmanager
-    def fold(self, count: int | str, width: int, start: str) -> Iterator[Fold]:
-        """A loop that carries W lanes from turn to turn; its body must `set` the next value."""
-        with self.loop(count) as i:
-            carried = Fold(i, self.name())
-            mark = f"  ; {carried.value}"  # rooms are allocated before: its number may change
-            self.lines.append(mark)
-            yield carried
-        tag = i.removeprefix("%i")
-        self.lines[self.lines.index(mark)] = (
-            f"  {carried.value} = phi {vector(width)} "
-            f"[ {start}, %before{tag} ], [ {carried.result}, %latch{tag} ]"
-        )
-
     def break_if(self, condition: str) -> None:
         """Leaves the innermost loop."""
         self._count += 1
@@ -245,21 +251,6 @@ class Writer:
         yield
         self.do(f"br label %after{tag}")
         self.lines.append(f"after{tag}:")
-
-    @contextmanager
-    def unless(self, usual: list[str], condition: str) -> Iterator[list[str]]:
-        """Values of W = 1 that are `usual`, or where the i1 is true what the block leaves in them.
-
-        The yielded list holds names; the block replaces them by its own, and afterwards they are
-        the names to go on with.
-        """
-        before = self._block()
-        values = list(usual)
-        with self.when(condition):
-            yield values
-            after = self._block()
-        for i, (a, b) in enumerate(zip(usual, list(values), strict=True)):
-            values[i] = self.emit(f"phi double [ {a}, %{before} ], [ {b}, %{after} ]")
 
     def either(
         self,

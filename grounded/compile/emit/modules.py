@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from grounded.compile.emit.llvm_batch import linearise_kernel, march_kernel, step_kernel
 from grounded.compile.emit.llvm_box import box_functions
 from grounded.compile.emit.llvm_descent import descent_kernel
-from grounded.compile.emit.llvm_product import sweep_tables
 from grounded.compile.emit.llvm_riccati import sweep_kernel
 from grounded.compile.emit.llvm_rollout import rollout_kernel, single_rollout
 from grounded.compile.emit.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
@@ -46,6 +45,11 @@ class Source:
         text = _start(d, width) + jacobian_function(d, width) + linearise_kernel(d, width, columns)
         return text if which == "full" else text + step_kernel(d, width) + march_kernel(d)
 
+    @property
+    def operations(self) -> int:
+        """Operations that are written, as far as parameters are left out."""
+        return self._dynamics(sum(self.sizes[:2])).operations
+
     def _dynamics(self, columns: int) -> Dynamics:
         n, m, _ = self.sizes
         return dynamics_of(self.variant, n, m, columns, self.kind, self.integrator)
@@ -55,7 +59,7 @@ class Source:
         text += single_rollout(d, layout)
         if layout.m > MAX_INPUTS or not self.derivatives:
             return text
-        text += sweep_tables(d, width) + box_functions(layout.m) + sweep_kernel(d, layout, width)
+        text += box_functions(layout.m) + sweep_kernel(d, layout, width)
         return text + descent_kernel(layout.m, layout.nz)
 
 

@@ -14,7 +14,7 @@ import struct
 import threading
 from collections.abc import Sequence
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -59,10 +59,13 @@ from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
 
+if TYPE_CHECKING:
+    from grounded.compile.emit.modules import Source
+
 Words = ctypes.c_int64 * len(BATCH)
 RESULTS = BATCH[6:]
 POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
-UNCOUNTED_OPERATIONS = 600  # operations of a model that need not be counted with their derivatives
+UNCOUNTED = 600  # operations of a model, or places of its Jacobian, of which no count is needed
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
 
@@ -110,10 +113,17 @@ class Kernels:
 
     def text(self, which: Layout | str) -> str:
         """Write the LLVM code of a kernel."""
-        from grounded.compile.emit import modules  # only what no cache holds is written
+        return self._source().text(which, jit.lanes())
+
+    def operations(self) -> int:
+        """Count what would be written."""
+        return self._source().operations
+
+    def _source(self) -> Source:
+        from grounded.compile.emit.modules import Source  # only what no cache holds is written
 
         about = (self._variant, self.sizes, self._kind, self._integrator)
-        return modules.Source(*about, self._derivatives).text(which, jit.lanes())
+        return Source(*about, self._derivatives)
 
 
 class CompiledSystem(TracedSystem):
@@ -130,9 +140,10 @@ class CompiledSystem(TracedSystem):
 
     @property
     def operations(self) -> int:
-        """Operations of the model and its derivatives where it is large; 0 says it is small."""
-        large = [v for v in self._variants if len(v.trace.graph.nodes) > UNCOUNTED_OPERATIONS]
-        return max((variant.operations() for variant in large), default=0)
+        """Operations of the kernels where the model is large; 0 says it is small."""
+        places = self.n * (self.n + self.m)
+        large = [v for v in self._variants if max(len(v.trace.graph.nodes), places) > UNCOUNTED]
+        return max((Kernels(variant, self).operations() for variant in large), default=0)
 
     def _compiled(self, p: Array, dt: float) -> Kernels:
         variant = self.variant(p, dt)

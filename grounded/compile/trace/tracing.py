@@ -184,11 +184,6 @@ class Variant:
         leaves = np.array(self._variables(self.sizes[0] + self.sizes[1]))
         return np.array([np.isin(leaves, graph.live([output])) for output in outputs])
 
-    def operations(self) -> int:
-        """Nodes of the values and of their derivatives by state and input."""
-        entries = self.entries(self.sizes[0] + self.sizes[1])
-        return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in entries)]))
-
     def values(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The r outputs at N samples x (N, n), u (N, m): (N, r)."""
         return self.linearised(x, u, p, dt, smoothing, 0)[0]
